@@ -33,9 +33,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _VERSIONS: Final = (__version__, numba.__version__, llvmlite.__version__)
 _CompileResult: Any = numba.core.compiler.CompileResult
+_dumps: Any = numba.core.serialize.dumps
 
 
-class _KernelFiles(NullCache):  # type: ignore[misc]
+class _KernelFiles(NullCache):
     """What a dispatcher of numba asks for compiled variants of its function, and gives them to.
 
     Parameters
@@ -49,7 +50,7 @@ class _KernelFiles(NullCache):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], source: bytes) -> None:
         code = function.__code__
         closure = tuple(cell.cell_contents for cell in function.__closure__ or ())
-        self._made_from = numba.core.serialize.dumps((_VERSIONS, source, code.co_code, closure))
+        self._made_from = _dumps((_VERSIONS, source, code.co_code, closure))
         self._stem = f"{Path(code.co_filename).stem}.{function.__name__}-{code.co_firstlineno}"
         self._where = f"{code.co_filename} {function.__qualname__} {sys.implementation.cache_tag}"
 
@@ -69,9 +70,7 @@ class _KernelFiles(NullCache):  # type: ignore[misc]
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a variant, unless it is bound to this process."""
         if not data.library.has_dynamic_globals and not data.lifted:
-            write_kernel(
-                self._name(sig, data.codegen), self._made_from, numba.core.serialize.dumps(data._reduce())
-            )
+            write_kernel(self._name(sig, data.codegen), self._made_from, _dumps(data._reduce()))
 
     def _name(self, signature: Any, codegen: Any) -> str:
         """Name of a file: another signature, processor or place of the source is another file."""

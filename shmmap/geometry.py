@@ -26,8 +26,15 @@ __all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_box
 
 def _finite(kind: str, **values: float) -> None:
     for name, value in values.items():
-        if not math.isfinite(value):
+        if not _is_finite(value):
             raise BadRequest(f"{kind}: {name} must be a finite number of metres, not {value!r}")
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value) and getattr(value, "shape", ()) == ()
+    except (TypeError, ValueError, OverflowError):
+        return False  # no number at all
 
 
 class ZRange(msgspec.Struct, frozen=True):
@@ -37,7 +44,11 @@ class ZRange(msgspec.Struct, frozen=True):
     max: float
 
     def __post_init__(self) -> None:
-        if math.isnan(self.min) or math.isnan(self.max) or self.min > self.max:
+        try:
+            fits = float(self.min) <= float(self.max)
+        except (TypeError, ValueError, OverflowError):
+            fits = False
+        if not fits:
             raise BadRequest(f"z range: need min <= max, not {self.min!r} and {self.max!r}")
 
     def overlaps(self, z_min: float, z_max: float) -> bool:

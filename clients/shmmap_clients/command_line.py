@@ -146,7 +146,7 @@ def _ended_as_interrupted() -> Iterator[list[int]]:
     Yields a list that holds the signal then; a second signal ends the process at once.
     """
     ended_by: list[int] = []
-    handled: list[int] = []
+    handled: list[signal.Signals] = []
 
     def end(number: int, _frame: FrameType | None) -> None:
         for one in handled:
@@ -163,7 +163,7 @@ def _ended_as_interrupted() -> Iterator[list[int]]:
         yield ended_by
     finally:
         for number in handled:
-            if signal.getsignal(number) is end:
+            if signal.getsignal(number) is end:  # nobody has put another one there
                 signal.signal(number, signal.SIG_DFL)
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import numbers
 from shmmap.cli.program import nothing_found
 from shmmap.errors import BadRequest
-from shmmap.quantities import format_metres
+from shmmap.lacking import no_cell_there as nothing_there
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -24,13 +25,12 @@ __all__ = [
     "add_area_or_ids",
     "add_cells_argument",
     "area_from",
-    "area_text",
     "around",
     "cells_meant",
     "check_cells_argument",
-    "extent_text",
     "moved_by",
     "no_cell_there",
+    "print_near_cells",
     "those_in",
 ]
 
@@ -152,28 +152,6 @@ def _at_height(area: Area, cell: CellInfo) -> bool:
 # --- where there is nothing ---------------------------------------------------------------------------
 
 
-def area_text(area: Area) -> str:
-    """Return an area as a sentence names it: ``"within 40 m of (10, 20)"``."""
-    from shmmap.geometry import Box, Circle
-
-    if isinstance(area, Box):
-        text = f"in {extent_text(area.bounds)}"
-    elif isinstance(area, Circle):
-        text = f"within {format_metres(area.radius)} m of ({format_metres(area.x)}, {format_metres(area.y)})"
-    else:
-        centre = f"({format_metres(area.x)}, {format_metres(area.y)})"
-        text = f"in the square of half-side {format_metres(area.radius)} m about {centre}"
-    if area.z is not None:
-        text += f", z {format_metres(area.z.min)} .. {format_metres(area.z.max)} m"
-    return text
-
-
-def extent_text(box: BoxTuple) -> str:
-    """Return a rectangle: ``"x -60 .. 60 m, y -60 .. 60 m"``."""
-    min_x, min_y, max_x, max_y = map(format_metres, box)
-    return f"x {min_x} .. {max_x} m, y {min_y} .. {max_y} m"
-
-
 def around(boxes: Iterable[BoxTuple]) -> BoxTuple | None:
     """Return the rectangle around rectangles; None where there is none."""
     found = list(boxes)
@@ -199,13 +177,12 @@ def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
 
 def no_cell_there(args: argparse.Namespace, client: Client, area: Area) -> int:
     """Say that no cell of the map touches an area, and where the map is; returns the exit code."""
-    welcome = client.welcome
-    spans = f"the map spans {extent_text(welcome.bounds)}" if welcome.bounds else "the map has no cells"
-    hint = ""
-    if (origin := moved_by(welcome.id_prefix)) is not None:
-        x, y, z = map(format_metres, origin)
-        hint = (
-            "`divide` shifted the points close to the origin: subtract"
-            f" ({x}, {y}, {z}) from coordinates of the cloud"
-        )
-    return nothing_found(args, f"no cell {area_text(area)}; {spans}", hint)
+    return nothing_found(args, *nothing_there(client.welcome, area))
+
+
+def print_near_cells(hint: str) -> None:
+    """Print what `shmmap.lacking.near_cells_hint` returned, on stderr."""
+    if hint:
+        from shmmap.cli.screens.output import print_line  # 5 ms, for complaints alone
+
+        print_line(f"hint: {hint}", file=sys.stderr)

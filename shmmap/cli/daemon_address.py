@@ -7,16 +7,19 @@ import argparse
 import os
 from typing import TYPE_CHECKING, Final
 
-from shmmap.errors import NoSocket
+from shmmap.errors import NoSocket, ShmmapError
 from shmmap.protocol.endpoint import DEFAULT_INSTANCE, endpoint_path, runtime_dirs, socket_path
+from shmmap.segment.names import usual_directory
 
 if TYPE_CHECKING:
     from shmmap.client.client import Client
     from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["connect", "endpoint", "instance", "shm_dir", "snapshot"]
+__all__ = ["connect", "endpoint", "has_lost_socket", "instance", "locate", "shm_dir", "snapshot"]
 
+ASKED_S: Final = 2.0
+"""How long a verb waits that wants to know who has a socket."""
 ANSWER_S: Final = 5.0
 """How long a verb waits for a daemon that is there, to connect and for each answer."""
 
@@ -55,13 +58,84 @@ def _endpoint_setting(args: argparse.Namespace) -> str:
 
 def shm_dir(args: argparse.Namespace) -> str:
     """Return the directory the instance's segments are in."""
-    from shmmap.segment.names import usual_directory
-
     return _setting(args, "shm_dir") or usual_directory(instance(args))
 
 
+def locate(args: argparse.Namespace) -> tuple[str, str]:
+    """Return the instance that the options mean, and the directory of its segments.
+
+    What a socket is named after need not be the instance's name, and its segments may be anywhere: where the
+    statistics of that name are not those of the daemon at this socket, the socket is asked.
+
+    Raises
+    ------
+    NoSocket
+        No daemon has this socket, and the one of that name has another.
+    """
+    named, by_name = _named_socket(args), (instance(args), shm_dir(args))
+    if _is_at(*by_name, named):
+        return by_name
+    found = _asked(args, named) if named else None
+    if found is None and named:  # it does not answer, or this user may not ask: whose statistics name it?
+        places = dict.fromkeys((by_name[1], usual_directory("")))
+        found = next(
+            ((name, place) for place in places for name in _instances(place) if _is_at(name, place, named)),
+            None,
+        )
+    if found is None and named and (other := _endpoint_of(*by_name)):
+        raise NoSocket(
+            f"no daemon has the socket {named}; instance {by_name[0]!r} listens at {other}",
+            hint="name that one with --endpoint or --instance",
+        )
+    return found or by_name
+
+
+def _named_socket(args: argparse.Namespace) -> str:
+    """The socket that the options mean; empty where none of them says so."""
+    found = endpoint(args)
+    return found if found is not None else ""
+
+
+def _is_at(name: str, directory: str, socket: str) -> bool:
+    """Whether there are statistics of a daemon, and it has this socket (any, if empty)."""
+    other = _endpoint_of(name, directory)
+    return other != "" and (not socket or os.path.realpath(other) == os.path.realpath(socket))
+
+
+def _endpoint_of(name: str, directory: str) -> str:
+    """The socket of the daemon with these statistics; empty where there are none, or none for this user.
+
+    That of one in another container, whose paths mean others here, is the one that the name stands for.
+    """
+    from shmmap.statistics.identity import pid_namespace
+    from shmmap.statistics.reader import read_statistics
+
+    try:
+        identity = read_statistics(name, directory).identity
+    except (ShmmapError, OSError):
+        return ""
+    if identity is None or identity.pid_namespace != pid_namespace():
+        return ""
+    return identity.endpoint
+
+
+def _asked(args: argparse.Namespace, socket: str) -> tuple[str, str] | None:
+    """Ask the daemon at a socket for its instance and directory; None where it does not say."""
+    from shmmap.client.discovery import is_served
+
+    if not is_served(socket):
+        return None
+    import shmmap
+
+    try:
+        with shmmap.connect(socket, timeout=ASKED_S, connect_timeout=ASKED_S, name="shmmap") as client:
+            return client.welcome.instance, _setting(args, "shm_dir") or client.welcome.shm_dir
+    except ShmmapError:
+        return None
+
+
 def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
-    """Read the daemon's statistics segment; nobody is asked, so a stopped daemon does not matter.
+    """Read the daemon's statistics segment: a stopped daemon does not matter.
 
     Raises
     ------
@@ -70,7 +144,7 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
     """
     from shmmap.statistics.reader import read_statistics
 
-    name, directory = instance(args), shm_dir(args)
+    name, directory = locate(args)
     found = read_statistics(name, directory)
     if found.identity is None:
         others = ", ".join(_instances(directory))
@@ -81,6 +155,23 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
             else "start one with `shmmap serve MAP`, or say which: --endpoint, or --instance with --shm-dir",
         )
     return found, found.identity
+
+
+def has_lost_socket(found: Snapshot) -> bool:
+    """Whether clients cannot find the socket of a daemon that lives: another program removed it."""
+    from shmmap.statistics.identity import pid_namespace
+
+    if found.identity is None or found.counters.get("sockets_missing", 0):
+        return found.identity is not None
+    if found.identity.pid_namespace != pid_namespace():  # its paths may mean others here
+        return False
+    try:
+        os.lstat(found.identity.endpoint)
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def _instances(directory: str) -> list[str]:

@@ -191,3 +191,19 @@ def add_layer_option(parser: argparse.ArgumentParser, help: str) -> None:  # noq
 def layers_from(args: argparse.Namespace) -> list[str]:
     """Return the layers that were named, else ``points``."""
     return args.layer or ["points"]
+
+
+def add_unit_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add ``--unit`` and ``--vertical-unit`` of clouds that are no metres."""
+    choices = ("auto", "m", "ft", "us-ft")
+    parser.add_argument(
+        "--unit",
+        choices=choices,
+        help="unit of the cloud's coordinates, converted to metres: auto takes what the file says; without "
+        "this option, a file that says feet is refused",
+    )
+    parser.add_argument(
+        "--vertical-unit",
+        choices=choices,
+        help="unit of its heights, where it differs from what --unit and the file say",
+    )

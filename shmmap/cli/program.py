@@ -12,6 +12,7 @@ from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any, Final, NoReturn
 
 from shmmap.errors import CannotWrite, InternalError, ShmmapError
+from shmmap.processes.lost_interrupts import keep_interrupts
 
 __all__ = ["Parser", "add_allow_empty", "complain", "exit_code_of", "join_negative_values", "nothing_found"]
 
@@ -89,6 +90,7 @@ def join_negative_values(words: Sequence[str], options: Container[str] | None = 
 def exit_code_of(name: str, run: Callable[[], int]) -> int:
     """Run a program to its end and return its exit code; its errors are told on stderr."""
     _open_what_is_closed()
+    keep_interrupts()
     try:
         code = run()
         sys.stdout.flush()

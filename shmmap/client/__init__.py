@@ -10,7 +10,9 @@ border of two, it maps and unmaps memory in every round (30 ms).
 
 from __future__ import annotations
 
+import copyreg
 import importlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec  # noqa: F401
@@ -60,6 +62,15 @@ _LATER: Final = {
     "RetentionPolicy": "window.retention",
     "WindowUpdate": "window.state",
 }
+
+
+def _hand_over(cell: Cell) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
+    from shmmap.client.handed_over import hand_over
+
+    return hand_over(cell)
+
+
+copyreg.pickle(Cell, _hand_over)
 
 
 def __getattr__(name: str) -> Any:

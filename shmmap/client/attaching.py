@@ -9,11 +9,13 @@ no lock, and no signal handler runs in it, whose exception Python would have to 
 from __future__ import annotations
 
 import contextlib
+import warnings
 import weakref
 from collections import deque
 from queue import Empty, SimpleQueue
 
 from shmmap.client.cell import Access, Cell
+from shmmap.errors import ShmmapWarning
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import attach
 from shmmap.segment.owned import Owned
@@ -44,6 +46,7 @@ class Attacher:
     def __init__(self) -> None:
         self._cells: dict[tuple[int, str], _Attached] = {}
         self._dropped: deque[weakref.ref[Cell]] = deque()
+        self._named_outside: set[str] = set()
         self._mapped: dict[int, _Mapped] = {}  # the last one of each version, which knows the one before
         self._ended: deque[_Mapped] = deque()
         self._unmapped: list[int] = []
@@ -67,6 +70,11 @@ class Attacher:
         ------
         StaleHandle, SegmentCorrupt, SegmentError, LimitReached
             As `shmmap.segment.attach.attach`.
+
+        Warns
+        -----
+        ShmmapWarning
+            Points of the cell lie outside its box; once a cell.
         """
         key = (handle.version, handle.layer)
         known = self._cells.get(key)
@@ -90,6 +98,14 @@ class Attacher:
         found.key = key
         self._forget_dropped()
         self._cells[key] = found
+        if (outside := attached.outside_points) and cell_id not in self._named_outside:
+            self._named_outside.add(cell_id)
+            warnings.warn(
+                f"{cell.name}: {outside} of the cell's points lie outside its box {cell.box}:"
+                " was the file moved, and the map's metadata not?",
+                ShmmapWarning,
+                stacklevel=2,
+            )
         return cell
 
     def _forget_dropped(self) -> None:

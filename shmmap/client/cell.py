@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment, attach_writable
-from shmmap.segment.layout import ColumnRow, Lattice, SegmentHeader, SourceStamp
+from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
 
 if TYPE_CHECKING:
     import open3d
@@ -116,7 +116,7 @@ class Cell:
         LimitReached
             There is not so much memory.
         """
-        return Cell(self.id, "", self._handle(), self._attached.copy(), None)
+        return Cell(self.id, "", self.handle(), self._attached.copy(), None)
 
     def __copy__(self) -> Cell:
         return self if self._access is not None else self.copy()  # what never changes need not be copied
@@ -124,14 +124,8 @@ class Cell:
     def __deepcopy__(self, memo: dict[int, Any]) -> Cell:
         return self.__copy__()
 
-    def __reduce__(self) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
-        if self._access is None:
-            return _private_cell, (self.id, self._handle(), self._attached.columns, self._attached.raw)
-        from shmmap.client.handed_over import hand_over
-
-        return hand_over(self, self._access, self._handle())
-
-    def _handle(self) -> Handle:
+    def handle(self) -> Handle:
+        """Return the handle it was attached by, with its whole segment's name."""
         return Handle(
             self.name, self.version, self.layer, self.segment, self.offset, self.nbytes, self.points,
             *self.box, self.stale,
@@ -285,8 +279,3 @@ class Cell:
         if self._access is not None:
             segment = attach_writable(segment, self.segment, offset=self.offset, shm_dir=self._access.shm_dir)
         return {row[0]: segment.column(index) for index, row in enumerate(segment.columns)}
-
-
-def _private_cell(cell_id: str, handle: Handle, columns: list[ColumnRow], raw: NDArray[Any]) -> Cell:
-    """Unpickle a copy."""
-    return Cell(cell_id, "", handle, AttachedSegment(columns, raw), None)

@@ -5,20 +5,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from threading import TIMEOUT_MAX
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 import numpy as np
 
 from shmmap import geometry
+from shmmap.client.arguments import heights, names, timeout_s
 from shmmap.client.cell_set import CellSet
 from shmmap.client.discovery import candidates
 from shmmap.client.held import Held, HeldCells
-from shmmap.client.operator_requests import OperatorRequests, several
+from shmmap.client.operator_requests import OperatorRequests
 from shmmap.client.route import sendable
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Intent, Welcome
 
@@ -28,10 +27,32 @@ if TYPE_CHECKING:
     from shmmap.client.points_around import PointsAround
     from shmmap.protocol.live import LiveMapRow
 
-__all__ = ["DEFAULT_WAIT_S", "Client", "connect"]
+__all__ = ["DEFAULT_WAIT_S", "Client", "MapOrigin", "connect"]
 
 DEFAULT_WAIT_S: Final = 5.0
 CONNECT_S: Final = 60.0
+
+
+class MapOrigin(NamedTuple):
+    """How to come back from the map frame to the coordinates of the files that a map was divided from.
+
+    ``(point + (x, y, z)) / unit`` is the point in their coordinate system, in float64.
+
+    Attributes
+    ----------
+    x, y, z : float
+        What `divide` subtracted from each point, metres; 0 where nothing was, or that is not known.
+    crs : str or None
+        Name of the coordinate system, with its EPSG code where the files say it; None where they do not.
+    unit_m : tuple of float
+        Metres of the system's unit, in the plane and in height; (1, 1) unless `divide` converted feet.
+    """
+
+    x: float
+    y: float
+    z: float
+    crs: str | None
+    unit_m: tuple[float, float]
 
 
 class Client(OperatorRequests):
@@ -121,6 +142,12 @@ class Client(OperatorRequests):
         return self._session.map_version
 
     @property
+    def map_origin(self) -> MapOrigin:
+        """Where the map frame lies in the world, as of when the session began."""
+        welcome = self._session.welcome
+        return MapOrigin(*welcome.origin, welcome.crs or None, welcome.unit_m)
+
+    @property
     def session(self) -> Session:
         """What its requests share; for windows."""
         return self._session
@@ -136,10 +163,10 @@ class Client(OperatorRequests):
         layers: str | Sequence[str] = ("points",),
         z: tuple[float, float] | None = None,
         wait: float | None = DEFAULT_WAIT_S,
+        strict: bool | None = False,
     ) -> CellSet:
-        """Cells within ``radius`` metres of a place: `area` with a circle."""
-        heights = geometry.ZRange(*z) if z is not None else None
-        return self.area(geometry.Circle(x, y, radius, heights), layers, wait=wait)
+        """Cells within ``radius`` metres of a place, whole: `area` with a circle."""
+        return self.area(geometry.Circle(x, y, radius, heights(z)), layers, wait=wait, strict=strict)
 
     def area(
         self,
@@ -148,8 +175,12 @@ class Client(OperatorRequests):
         *,
         wait: float | None = DEFAULT_WAIT_S,
         intent: Intent | None = None,
+        strict: bool | None = False,
     ) -> CellSet:
         """Cells that touch an area, in id order.
+
+        An answer that lacks something, cells that failed or are still being loaded after ``wait``, or where
+        the map has no cell, is said as a `ShmmapWarning`.
 
         Parameters
         ----------
@@ -163,9 +194,15 @@ class Client(OperatorRequests):
         intent
             Where this process is and goes: the daemon fetches what it will ask for next, and keeps what is
             near.
+        strict
+            True: raise an error instead of a warning.  None: neither, the program looks at `CellSet.failed`
+            and `CellSet.pending`.
 
         Raises
         ------
+        CellError
+            With ``strict``: that of the first cell that failed; `LoadTimeout` of one that is still being
+            loaded; `UnknownCell` where the map has none.
         NoAnswer
             No reply before the deadline.
         BadRequest
@@ -173,9 +210,10 @@ class Client(OperatorRequests):
         SegmentError
             This user may not read the segments, or the process has no room for more mappings.
         """
-        specs = several(layers)
+        specs = names("layers", layers)
         message, sent = messages.area_to_message(area), sendable(intent)
-        return self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
+        found = self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
+        return found if strict is None else self._judged(found, area, wait, strict)
 
     def points_around(
         self,
@@ -186,6 +224,7 @@ class Client(OperatorRequests):
         layer: str = "points",
         z: tuple[float, float] | None = None,
         wait: float | None = DEFAULT_WAIT_S,
+        strict: bool | None = False,
     ) -> PointsAround:
         """Points within ``radius`` metres of a place, as views of the cells they lie in; nothing is copied.
 
@@ -207,8 +246,7 @@ class Client(OperatorRequests):
         """
         from shmmap.client.points_around import points_around  # windows need it, and few others
 
-        heights = geometry.ZRange(*z) if z is not None else None
-        found = self.area(geometry.Circle(x, y, radius, heights), layer, wait=wait)
+        found = self.area(geometry.Circle(x, y, radius, heights(z)), layer, wait=wait, strict=strict)
         boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
         return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
 
@@ -223,6 +261,7 @@ class Client(OperatorRequests):
         by_name: bool = False,
         populate: bool = False,
         timeout: float | None = None,
+        strict: bool | None = False,
     ) -> CellSet:
         """Cells that touch an area, minus those that are held at their current version.
 
@@ -243,16 +282,19 @@ class Client(OperatorRequests):
 
         Other parameters and errors are those of `area`.
         """
-        specs = several(layers)
+        specs = names("layers", layers)
         message, sent = messages.area_to_message(area), sendable(intent)
         mine = HeldCells(held, by_name=by_name)
-        return self._session.ask_cells(
+        found = self._session.ask_cells(
             lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, sent),
             wait,
             removed=mine.removed,
             populate=populate,
             timeout_s=timeout,
         )
+        if strict is None:
+            return found
+        return self._judged(found, area, wait, strict, new=not mine.named and not mine.packed)
 
     def selected(
         self,
@@ -261,15 +303,33 @@ class Client(OperatorRequests):
         *,
         wait: float | None = DEFAULT_WAIT_S,
         intent: Intent | None = None,
+        strict: bool | None = False,
     ) -> CellSet:
         """Cells by id, in the order asked for, duplicates preserved.
 
         An id is the absolute path of the cell's file, or its base name where that is unique.  Other
         parameters and errors are those of `area`.
         """
-        specs = several(layers)
-        wanted, sent = several(ids), sendable(intent)
-        return self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, sent), wait)
+        specs = names("layers", layers)
+        wanted, sent = names("ids", ids), sendable(intent)
+        found = self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, sent), wait)
+        return found if strict is None else self._judged(found, None, wait, strict)
+
+    def _judged(
+        self,
+        found: CellSet,
+        area: geometry.Area | None,
+        wait: float | None,
+        strict: bool,
+        *,
+        new: bool = True,
+    ) -> CellSet:
+        """Return an answer; what it lacks is said, or raised."""
+        if not found.complete or not any(cell.points for cell in found.cells):
+            from shmmap.lacking import judge
+
+            judge(self, found, area, waited=bool(wait), strict=strict, new=new)
+        return found
 
     def release(self) -> int:
         """Tell the daemon now what this process let go since the last request; returns how many versions.
@@ -331,6 +391,7 @@ class Client(OperatorRequests):
 def connect(
     endpoint: str | os.PathLike[str] | None = None,
     *,
+    instance: str | None = None,
     timeout: float = 5.0,
     connect_timeout: float = CONNECT_S,
     name: str = "",
@@ -341,9 +402,12 @@ def connect(
     Parameters
     ----------
     endpoint
-        The daemon's socket, a path or an ``ipc://`` URL.  Without one: ``SHMMAP_ENDPOINT``, else the socket
-        of the instance ``SHMMAP_INSTANCE`` (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not
-        set in ``$XDG_RUNTIME_DIR/shmmap`` and in ``/run/shmmap``, whichever answers first.
+        The daemon's socket, a path or an ``ipc://`` URL; or an instance's name (a string without slash and
+        point).  Without one: ``SHMMAP_ENDPOINT``, else the socket of the instance ``SHMMAP_INSTANCE``
+        (``default``) in ``SHMMAP_RUNTIME_DIR``, or where that is not set in ``$XDG_RUNTIME_DIR/shmmap``,
+        ``/tmp/shmmap-UID`` and ``/run/shmmap``, whichever answers first.
+    instance
+        Name of the daemon's instance, instead of an endpoint or ``SHMMAP_INSTANCE``.
     timeout
         Seconds a reply may take; what a request lets the daemon wait comes on top.
     connect_timeout
@@ -365,15 +429,12 @@ def connect(
     LimitReached
         This process may not have the descriptors or threads that are needed.
     BadRequest
-        The endpoint cannot be a socket path.
+        The endpoint cannot be a socket path, or another argument makes no sense.
     """
-    for what, seconds in (("timeout", timeout), ("connect_timeout", connect_timeout)):
-        if not 0 < seconds <= TIMEOUT_MAX:
-            raise BadRequest(f"{what} must be a positive number of seconds, not {seconds!r}")
     return Client(
-        candidates(os.fspath(endpoint) if endpoint is not None else None),
-        timeout=timeout,
-        connect_timeout=connect_timeout,
+        candidates(endpoint, instance=instance),
+        timeout=timeout_s("timeout", timeout),
+        connect_timeout=timeout_s("connect_timeout", connect_timeout),
         name=name,
         shm_dir=shm_dir or os.environ.get("SHMMAP_SHM_DIR", ""),
     )

@@ -23,7 +23,7 @@ from shmmap.client.connection_watch import CONNECTION, FILES, ConnectionWatch
 from shmmap.client.discovery import find_socket
 from shmmap.client.orphans import stop_orphans
 from shmmap.client.program_name import program_name
-from shmmap.errors import LimitReached, NoAnswer, ProtocolMismatch, ShmmapError, error_from_wire
+from shmmap.errors import BadRequest, LimitReached, NoAnswer, ProtocolMismatch, ShmmapError, error_from_wire
 from shmmap.protocol.codec import decode_reply, encode, encode_request
 from shmmap.protocol.messages import PROTOCOL_VERSION, ErrorReply, Hello, Reply, Request, Welcome
 from shmmap.segment.process_limits import check_files
@@ -148,7 +148,10 @@ class Connection:
         ShmmapError
             The error with which the daemon refused the request.
         """
-        data = encode_request(message)
+        try:
+            data = encode_request(message)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise BadRequest(f"the request cannot be sent: {error}") from None
         deadline_s = time.monotonic() + timeout_s
         while True:
             if self._greeting:

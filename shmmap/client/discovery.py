@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from shmmap.errors import (
+    BadRequest,
+    ConfigError,
     DaemonUnreachable,
     NoAnswer,
     NoSocket,
@@ -25,39 +27,71 @@ from shmmap.protocol.endpoint import (
     runtime_dirs,
     socket_path,
 )
+from shmmap.segment.names import check_instance
 
-__all__ = ["candidates", "check_socket", "find_socket"]
+__all__ = ["candidates", "check_socket", "find_socket", "is_served"]
 
 _SIGNATURE_BYTES: Final = 10
 _FULL_S: Final = 0.005
 _START_HINT: Final = (
-    "start one with `shmmap serve MAP`, or say which: --endpoint (SHMMAP_ENDPOINT), or --instance with"
-    " --runtime-dir"
+    "start one with `shmmap serve MAP`, or name another: connect(instance=...) or connect(PATH);"
+    " --instance and --endpoint, or SHMMAP_INSTANCE and SHMMAP_ENDPOINT, for programs"
 )
 
 
-def candidates(endpoint: str | None = None, environ: Mapping[str, str] = os.environ) -> list[str]:
+def candidates(
+    endpoint: str | os.PathLike[str] | None = None,
+    environ: Mapping[str, str] = os.environ,
+    *,
+    instance: str | None = None,
+) -> list[str]:
     """Socket paths to try, in order: the one named, else those of the instance.
 
     Parameters
     ----------
     endpoint
-        A socket path or an ``ipc://`` URL; ``SHMMAP_ENDPOINT`` stands in for None.
+        A socket path or an ``ipc://`` URL; a string without slash and point is an instance's name.
+        ``SHMMAP_ENDPOINT`` stands in for None.
     environ
         Without an endpoint, ``SHMMAP_INSTANCE`` names the instance, ``SHMMAP_RUNTIME_DIR`` its directory.
+    instance
+        The instance, instead of an endpoint.
 
     Raises
     ------
     BadRequest
-        If the name cannot be a socket path.
+        If the name cannot be a socket path or an instance's.
     """
-    named = endpoint or environ.get("SHMMAP_ENDPOINT", "")
-    if named:
-        return [endpoint_path(named)]
+    if instance is None and isinstance(endpoint, str) and endpoint and not {"/", ".", "@"} & set(endpoint):
+        endpoint, instance = None, endpoint
+    if instance is None:
+        named = _path_of(endpoint) or environ.get("SHMMAP_ENDPOINT", "")
+        if named:
+            return [endpoint_path(named)]
+    elif endpoint is not None:
+        raise BadRequest("give an endpoint or an instance, not both")
     directory = environ.get("SHMMAP_RUNTIME_DIR", "")
     places = [os.path.abspath(directory)] if directory else runtime_dirs(environ)
-    instance = environ.get("SHMMAP_INSTANCE", "") or DEFAULT_INSTANCE
-    return [socket_path(place, instance) for place in places]
+    name = _checked(environ.get("SHMMAP_INSTANCE", "") or DEFAULT_INSTANCE if instance is None else instance)
+    return [endpoint_path(socket_path(place, name)) for place in places]
+
+
+def _path_of(endpoint: str | os.PathLike[str] | None) -> str:
+    if endpoint is None or isinstance(endpoint, str):
+        return endpoint or ""
+    try:
+        return os.path.abspath(os.fsdecode(endpoint))
+    except TypeError:
+        raise BadRequest(f"an endpoint is a path or an instance's name, not {endpoint!r}") from None
+
+
+def _checked(instance: str) -> str:
+    try:
+        return check_instance(instance)
+    except TypeError:
+        raise BadRequest(f"an instance's name is a string, not {instance!r}") from None
+    except ConfigError as error:
+        raise BadRequest(error.message, hint=error.hint) from None
 
 
 def find_socket(paths: Sequence[str], deadline_s: float) -> str:
@@ -90,7 +124,7 @@ def find_socket(paths: Sequence[str], deadline_s: float) -> str:
     telling = next((refusal for refusal in refusals if not isinstance(refusal, NoSocket)), refusals[0])
     if len(refusals) == 1:
         raise telling
-    raise type(telling)("; ".join(refusal.message for refusal in refusals), hint=telling.hint) from telling
+    raise type(telling)("; ".join(refusal.message for refusal in refusals), hint=telling.hint) from None
 
 
 def check_socket(path: str, deadline_s: float) -> None:
@@ -120,20 +154,20 @@ def check_socket(path: str, deadline_s: float) -> None:
             try:
                 probe.connect(path)
                 break
-            except BlockingIOError as error:  # its queue of connections is full; the kernel tells no more
+            except BlockingIOError:  # its queue of connections is full; the kernel tells no more
                 if time.monotonic() >= deadline_s:
-                    raise _no_answer(path) from error
+                    raise _no_answer(path) from None
                 time.sleep(_FULL_S)
             except OSError as error:
-                raise _refusal(path, error) from error
+                raise _refusal(path, error) from None
         # Every ZMTP peer speaks first: 0xff, eight bytes, 0x7f (https://rfc.zeromq.org/spec/23/)
         heard = b""
         while len(heard) < _SIGNATURE_BYTES:
             probe.settimeout(max(deadline_s - time.monotonic(), 1e-3))
             try:
                 part = probe.recv(_SIGNATURE_BYTES - len(heard))
-            except TimeoutError as error:
-                raise _no_answer(path) from error
+            except TimeoutError:
+                raise _no_answer(path) from None
             except ConnectionError:
                 part = b""
             heard += part
@@ -147,6 +181,25 @@ def check_socket(path: str, deadline_s: float) -> None:
                     f"{path}: what listens there does not speak ZeroMQ",
                     hint="is this the socket of another program?",
                 )
+
+
+def is_served(path: str) -> bool:
+    """Whether a daemon runs that has the request socket ``path``, without connecting to that.
+
+    A service manager may listen there for a daemon that does not run, and would start it; the socket of
+    events is made by daemons alone.
+    """
+    import socket
+
+    events = path.removesuffix(".sock") + ".events.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        try:
+            probe.connect(events)
+        except BlockingIOError:  # it has not got round to accepting
+            return True
+        except OSError:
+            return False
+    return True
 
 
 def _no_answer(path: str) -> NoAnswer:
@@ -196,4 +249,7 @@ def _other_instances(path: str) -> str:
         return ""
     if not others:
         return ""
-    return f"other instances are there: {', '.join(others)}; name one with SHMMAP_INSTANCE"
+    return (
+        f"other instances are there: {', '.join(others)}; name one: connect(instance=...), --instance or"
+        " SHMMAP_INSTANCE"
+    )

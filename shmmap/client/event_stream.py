@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import threading
 import time
 import weakref
@@ -22,11 +23,13 @@ from typing import Final, NoReturn, TypeAlias
 import msgspec
 import zmq
 
+from shmmap.client.arguments import number, timeout_s
 from shmmap.client.connection import Connection
 from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import candidates
 from shmmap.client.turn import closed
-from shmmap.errors import BadRequest, NoAnswer, ProtocolMismatch
+from shmmap.errors import NoAnswer, ProtocolMismatch
+from shmmap.protocol.endpoint import endpoint_path
 from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, decode_event
 
 __all__ = ["EventStream", "Missed"]
@@ -68,7 +71,10 @@ class EventStream:
     Parameters
     ----------
     endpoint
-        Request socket of the daemon, a path or an ``ipc://`` URL; None looks in the usual places.
+        Request socket of the daemon, a path or an ``ipc://`` URL, or an instance's name; None looks in the
+        usual places.
+    instance
+        Name of the daemon's instance, instead of an endpoint.
     since
         Begin with what happened in the last so many seconds, as far as the daemon remembers; None begins now.
     name
@@ -91,16 +97,17 @@ class EventStream:
 
     def __init__(
         self,
-        endpoint: str | None = None,
+        endpoint: str | os.PathLike[str] | None = None,
         *,
+        instance: str | None = None,
         since: float | None = None,
         name: str = "",
         timeout: float = _TIMEOUT_S,
     ) -> None:
-        if since is not None and not since >= 0:
-            raise BadRequest(f"since must be seconds, not negative, it is {since!r}")
-        self._timeout_s = timeout
-        self._connection = Connection(candidates(endpoint), name=name, timeout_s=timeout)
+        if since is not None:
+            since = number("since", since)
+        self._timeout_s = timeout_s("timeout", timeout)
+        self._connection = Connection(candidates(endpoint, instance=instance), name=name, timeout_s=timeout)
         try:
             path = _events_path(self._connection)
             self._watch = ConnectionWatch(self, f"ipc://{path}", _OPTIONS, kind=zmq.SUB)
@@ -155,7 +162,7 @@ class EventStream:
 
         None waits for ever, 0 takes what is there.
         """
-        deadline_s = None if timeout is None else time.monotonic() + timeout
+        deadline_s = None if timeout is None else time.monotonic() + number("timeout", timeout)
         while not self._ready:
             left_ms = math.inf if deadline_s is None else max(0, (deadline_s - time.monotonic()) * 1000)
             with self._using:
@@ -250,4 +257,4 @@ def _events_path(connection: Connection) -> str:
         raise ProtocolMismatch("this daemon publishes no events", hint="update it")
     # in another mount namespace the directory has another name than the daemon knows
     beside = Path(connection.path).parent / Path(path).name
-    return str(beside) if beside.exists() else path
+    return endpoint_path(str(beside) if beside.exists() else path)

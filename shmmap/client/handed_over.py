@@ -17,14 +17,20 @@ import threading
 from collections.abc import Callable
 from functools import cache
 from types import FrameType
-from typing import Any, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
 from shmmap.client.visible import owner_of_segments
 from shmmap.errors import SegmentCorrupt, ShmmapError, StaleHandle
 from shmmap.protocol.messages import Handle
+from shmmap.segment.attach import AttachedSegment
+from shmmap.segment.layout import ColumnRow
 from shmmap.segment.names import retired_name
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["hand_over"]
 
@@ -59,11 +65,18 @@ def _boot() -> str:
         return ""
 
 
-def hand_over(cell: Cell, access: Access, handle: Handle) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
-    """Return what pickle makes an attached cell of: a function, and what it is called with."""
-    published = cell._attached.published
+def hand_over(cell: Cell) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
+    """Return what pickle makes a cell of: a function, and what it is called with."""
+    attached, access = cell._attached, cell._access
+    if access is None:  # a copy
+        return _private, (cell.id, cell.handle(), attached.columns, attached.raw)
+    published = attached.published
     epoch = published.epoch if published is not None else 0
-    return _take, (_boot(), access.shm_dir, access.slot, epoch, cell.id, handle)
+    return _take, (_boot(), access.shm_dir, access.slot, epoch, cell.id, cell.handle())
+
+
+def _private(cell_id: str, handle: Handle, columns: list[ColumnRow], raw: NDArray[np.uint8]) -> Cell:
+    return Cell(cell_id, "", handle, AttachedSegment(columns, raw), None)
 
 
 def _take(boot: str, shm_dir: str, slot: int | None, epoch: int, cell_id: str, handle: Handle) -> Cell:

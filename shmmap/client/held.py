@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shmmap.client.cell import Cell
+from shmmap.errors import BadRequest
 from shmmap.protocol.messages import HeldCell
 
 __all__ = ["Held", "HeldCells"]
@@ -45,8 +46,10 @@ class HeldCells:
                 continue
             if isinstance(one, str):
                 one = HeldCell(one)
-            elif isinstance(one, tuple):
+            elif isinstance(one, tuple) and len(one) == 2:
                 one = HeldCell(one[0], one[1])
+            elif not isinstance(one, HeldCell):
+                raise BadRequest(f"held must be cells, ids, or ids with versions, and {one!r} is none")
             self._order[one.id] = None
             named.append(one)
         versions = [version for some in self._packed.values() for version in some]

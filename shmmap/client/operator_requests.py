@@ -6,10 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from shmmap.client.arguments import names
 from shmmap.client.session import Session
 from shmmap.protocol import messages
 
-__all__ = ["OperatorRequests", "several"]
+__all__ = ["OperatorRequests"]
 
 RELOAD_S: Final = 60.0
 RELOAD_CELL_S: Final = 60e-6
@@ -58,7 +59,7 @@ class OperatorRequests:
         NotPermitted
             The daemon lets only administrators do this.
         """
-        wanted = several(ids) if ids is not None else None
+        wanted = names("ids", ids) if ids is not None else None
         return self._session.ask(lambda n: messages.Evict(n, wanted), messages.Evicted)
 
     def pin(
@@ -73,7 +74,7 @@ class OperatorRequests:
         OverBudget
             All pins together would exceed the budget.
         """
-        wanted, specs = several(ids), several(layers)
+        wanted, specs = names("ids", ids), names("layers", layers)
         return self._session.ask(lambda n: messages.Pin(n, wanted, specs), messages.Pinned)
 
     def unpin(self, ids: str | Iterable[str] | None = None) -> messages.Pinned:
@@ -84,7 +85,7 @@ class OperatorRequests:
         NotPermitted
             The daemon lets only administrators do this.
         """
-        wanted = several(ids) if ids is not None else None
+        wanted = names("ids", ids) if ids is not None else None
         return self._session.ask(lambda n: messages.Unpin(n, wanted), messages.Pinned)
 
     def shutdown(self) -> None:
@@ -96,8 +97,3 @@ class OperatorRequests:
             The daemon lets only administrators do this.
         """
         self._session.ask(messages.Shutdown, messages.Stopping)
-
-
-def several(names: str | Iterable[str]) -> tuple[str, ...]:
-    """Return ids or layers as a tuple; one alone counts as one."""
-    return (names,) if isinstance(names, str) else tuple(names)

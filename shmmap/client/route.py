@@ -55,12 +55,14 @@ def sendable(intent: Intent | None) -> Intent | None:
     BadRequest
         A place of a long route is not two finite numbers.
     """
+    if intent is not None and not isinstance(intent, Intent):
+        raise BadRequest(f"intent must be an Intent, not {intent!r}")
     if intent is None or len(intent.route) <= MOST_PLACES:
         return intent
     try:
         route = np.array(intent.route, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise BadRequest(f"route: two numbers are needed for each place: {error}") from error
+        raise BadRequest(f"route: two numbers are needed for each place: {error}") from None
     if route.ndim != 2 or route.shape[1] != 2 or not np.isfinite(route).all():
         raise BadRequest("route: each place is two finite numbers")
     return msgspec.structs.replace(intent, route=tuple(map(tuple, thinned(route).tolist())))

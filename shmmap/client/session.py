@@ -15,6 +15,7 @@ from typing import Any, Final, NoReturn, TypeVar
 import numpy as np
 
 from shmmap.client.answer import Answer
+from shmmap.client.arguments import number
 from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
 from shmmap.client.cell_set import CellSet
@@ -204,8 +205,10 @@ class Session:
         timeout_s
             Instead of the session's own.
         """
-        if wait_s is not None and not 0 <= wait_s < math.inf:
-            raise BadRequest(f"wait must be a number of seconds, not {wait_s!r}")
+        if wait_s is not None:
+            wait_s = number("wait", wait_s)
+            if wait_s == math.inf:
+                raise BadRequest("wait must be a finite number of seconds")
         quiet_s = wait_s or 0.0
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
         deadline_s = time.monotonic() + all_s

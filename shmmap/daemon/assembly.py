@@ -12,13 +12,15 @@ import signal
 import socket
 import time
 from collections import deque
+from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
 from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.defects import Defects
-from shmmap.daemon.host.instance_names import lock_path, take_away
+from shmmap.daemon.host.instance_lock import InstanceLock
+from shmmap.daemon.host.instance_names import take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
     KEEP_SIGNAL,
@@ -32,6 +34,7 @@ from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
+from shmmap.daemon.prerequisites import make_runtime_dir
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.handshake import Handshake
@@ -46,7 +49,7 @@ from shmmap.daemon.serving_loop import Chore, ServingLoop
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.listener import Connections, Listener
-from shmmap.daemon.transport.socket_file import listen_at, remove_socket
+from shmmap.daemon.transport.socket_file import SocketFile
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
@@ -55,6 +58,8 @@ from shmmap.protocol.events import Epoch
 
 __all__ = ["Service"]
 
+LOOK_S: Final = 1.0
+"""How often it is looked whether sockets have their files."""
 LAST_WORDS_S: Final = 0.2
 """How long the end may take to deliver what was sent last."""
 
@@ -79,6 +84,7 @@ class Service:
         gid: int,
         signals: StartSignals,
         activated: ActivatedSocket | None,
+        lock: InstanceLock | None = None,
     ) -> None:
         self._config = config
         self._memory = memory
@@ -89,11 +95,13 @@ class Service:
         self._gid = gid
         self._signals = signals
         self._activated = activated
+        self._lock = lock
         self._file_watch: FileWatch | None = None
         authorization = Authorization(config.admin_group)
         take_slices(SERVING_SLICE_NS)
         self._connections = Connections()
-        self._listening = contextlib.ExitStack()
+        self._sockets: list[tuple[SocketFile, Listener]] = []
+        self._look_s = 0.0
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
         quota, budget = config.session_quota, cache.ledger.budget_bytes
@@ -110,8 +118,9 @@ class Service:
         )  # fmt: skip
         operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
-            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left
-        )
+            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
+            cache.events.minutes,
+        )  # fmt: skip
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log)
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
@@ -152,6 +161,7 @@ class Service:
         try:
             self._watch_map()
             with contextlib.closing(ServingSignals()) as heard:
+                self._signals.raise_if_stopped()
                 watched.watch(heard.fd, lambda: self._on_signals(heard))
                 self._listen()
                 memory.statistics.set("starting", 0)
@@ -176,22 +186,46 @@ class Service:
 
     def _listen(self) -> None:
         memory = self._memory
-        if self._activated is not None:
-            requests = socket.socket(fileno=self._activated.fd)
-        else:
-            requests = listen_at(self._socket_path, self._gid)
-        self._listening.enter_context(requests)
-        step("daemon.bind")
-        events = self._listening.enter_context(listen_at(events_path(self._socket_path), self._gid))
-        Listener(
-            requests, memory.watched, self._connections, memory.statistics, b"ROUTER", b"DEALER",
+        passed = socket.socket(fileno=self._activated.fd) if self._activated is not None else None
+        requests = SocketFile(self._socket_path, self._gid, passed)
+        listener = Listener(
+            requests.socket, memory.watched, self._connections, memory.statistics, b"ROUTER", b"DEALER",
             MAX_REQUEST_BYTES, self._inbox.hear, self._handshake.hung_up,
-        ).begin()  # fmt: skip
+        )  # fmt: skip
+        self._sockets.append((requests, listener))
+        step("daemon.bind")
+        events = SocketFile(events_path(self._socket_path), self._gid)
         publisher = EventPublisher(
-            events, memory.watched, self._connections, memory.statistics, memory.event_log.standing
+            events.socket, memory.watched, self._connections, memory.statistics, memory.event_log.standing
         )
-        publisher.listener.begin()
+        self._sockets.append((events, publisher.listener))
+        for _file, one in self._sockets:
+            one.begin()
         memory.event_log.send = publisher.send
+
+    def _look_after_sockets(self, now_s: float) -> None:
+        """Make the files of sockets again that another program removed; connections stay as they are."""
+        if now_s < self._look_s:
+            return
+        self._look_s = now_s + LOOK_S
+        missing, before = 0, self._memory.statistics.values["sockets_missing"]
+        for at, (file, listener) in enumerate(self._sockets):
+            if file.is_there:
+                continue
+            try:
+                make_runtime_dir(Path(file.path).parent, self._gid)
+                again = SocketFile(file.path, self._gid)
+            except ShmmapError as error:
+                missing += 1
+                if not before:
+                    log.error("socket removed by another program", path=file.path, error=error)
+                continue
+            log.warning("socket removed by another program, and made again", path=file.path)
+            listener.move_to(again.socket)
+            self._sockets[at] = again, listener
+        if self._lock is not None and not missing:
+            self._lock.restore()
+        self._memory.statistics.set("sockets_missing", missing)
 
     def _end(self) -> None:
         keep = self._signals.keep
@@ -199,13 +233,13 @@ class Service:
         self._tell_epoch("stopping")
         self._memory.event_log.send = nowhere
         self._connections.deliver(LAST_WORDS_S)
-        self._listening.close()
+        for file, _listener in self._sockets:
+            file.close()
         self._reloader.close()
         if self._file_watch is not None:
             self._file_watch.close()
-        if self._activated is None:
-            remove_socket(self._socket_path)
-        remove_socket(events_path(self._socket_path))
+        for file, _listener in self._sockets:
+            file.remove()
 
     def _tell_epoch(self, what: str) -> None:
         cache = self._memory.cache
@@ -222,6 +256,7 @@ class Service:
             self._connections.try_again()
         self._pins.keep(now_s)
         self._live.beat(now_s)
+        self._look_after_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
         version = memory.cache.catalogue.map_version
@@ -266,10 +301,10 @@ class Service:
 
     def _on_signals(self, heard: ServingSignals) -> None:
         for number in heard.take():
-            if number == RELOAD_SIGNAL:
+            if number == RELOAD_SIGNAL and not self._signals.hangup_stops:
                 self._reload()
-            elif number in (*STOP_SIGNALS, KEEP_SIGNAL) and not self._loop.stopping:
-                keep = self._signals.keep = number == KEEP_SIGNAL
+            elif number in (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL) and not self._loop.stopping:
+                keep = self._signals.keep = self._signals.keep or number == KEEP_SIGNAL
                 log.info("stopping", signal=number.name, segments="kept" if keep else "removed")
                 if not keep:
                     for again in STOP_SIGNALS:
@@ -284,8 +319,11 @@ class Service:
         del number, frame
         ignore_signals()  # one after the other they would pile up in here
         directory, instance = self._memory.directory, self._config.instance
-        ours = [events_path(self._socket_path), *([self._socket_path] if self._activated is None else [])]
-        take_away(directory, instance, (*ours, lock_path(self._socket_path)))
+        take_away(directory, instance)
+        for file, _listener in self._sockets:
+            file.remove()
+        if self._lock is not None:
+            self._lock.release()
         os._exit(0)  # the loaders die with this process
 
 

@@ -14,11 +14,13 @@ from typing import Any, Final
 from shmmap.daemon.config_file import KINDS, Setting, read_settings_file
 from shmmap.daemon.config_live import LiveSettings, live_settings
 from shmmap.errors import BadRequest, ConfigError
+from shmmap.formats.coordinate_system import UNITS
 from shmmap.protocol.endpoint import (
     DEFAULT_INSTANCE,
+    EVENTS_LONGER,
     SYSTEM_RUNTIME_DIR,
     endpoint_path,
-    runtime_dirs,
+    fallback_runtime_dir,
     socket_path,
 )
 from shmmap.segment.directory import DEFAULT_SHM_DIR
@@ -40,6 +42,9 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
+    "log_level": (lambda value: value in ("debug", "info", "warning"), "debug, info or warning"),
+    "unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
+    "vertical_unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
     "eviction": (lambda value: value in ("time", "distance", "lru"), "time, distance or lru"),
     "ride_out_s": (lambda value: 0 <= value <= 3600, "seconds, 0 to 3600"),
     "prefetch_share": (
@@ -87,6 +92,9 @@ class DaemonConfig:
         more, for points alone.
     load_timeout_s
         How long loading one cell may take.
+    unit, vertical_unit
+        Of a cloud's coordinates, in the plane and in height: ``auto``, ``m``, ``ft`` or ``us-ft``; empty:
+        metres, and a cloud that says otherwise is refused.
     strict
         Accept only what Autoware's own loader accepts.
     watch
@@ -112,6 +120,8 @@ class DaemonConfig:
         else ``shm_dir``.
     live_group
         Group whose members may map, besides root and the daemon's own user.
+    log_level
+        The least that is logged: ``debug``, ``info`` or ``warning``.
     """
 
     map_path: str = ""
@@ -126,6 +136,8 @@ class DaemonConfig:
     session_quota: float = 0.9
     workers: int = 0
     load_timeout_s: float = 60.0
+    unit: str = ""
+    vertical_unit: str = ""
     strict: bool = False
     watch: bool = False
     cache_dir: str = ""
@@ -137,29 +149,31 @@ class DaemonConfig:
     live_budget_bytes: int = 0
     live_shm_dir: str = ""
     live_group: str = ""
+    log_level: str = "info"
 
     def socket(self) -> str:
         """Path of the request socket."""
         if self.endpoint:
-            return endpoint_path(self.endpoint)
+            return endpoint_path(self.endpoint, longer=_events_longer(self.endpoint))
         given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]  # systemd lists all there are
         directory = self.runtime_dir or given or _default_runtime_dir()
-        return endpoint_path(socket_path(directory, self.instance))
+        return endpoint_path(socket_path(directory, self.instance), longer=EVENTS_LONGER)
 
     def loaders(self) -> int:
         """Most loader processes at a time."""
         return self.workers or min(4, max(1, len(os.sched_getaffinity(0)) - 1))
 
 
+def _events_longer(endpoint: str) -> int:
+    """How much longer the path of the socket of events is."""
+    return EVENTS_LONGER + (0 if endpoint.endswith(".sock") else len(".sock"))
+
+
 def _default_runtime_dir() -> str:
-    candidates = runtime_dirs()
-    if len(candidates) > 1 or os.geteuid() == 0:
-        return candidates[0]
-    raise ConfigError(
-        "no runtime directory: XDG_RUNTIME_DIR is not set and this user may not use " + SYSTEM_RUNTIME_DIR,
-        key="runtime_dir",
-        hint="give --runtime-dir DIR, and the same to clients or SHMMAP_ENDPOINT",
-    )
+    own = os.environ.get("XDG_RUNTIME_DIR", "")
+    if own.startswith("/"):
+        return f"{own}/shmmap"
+    return SYSTEM_RUNTIME_DIR if os.geteuid() == 0 else fallback_runtime_dir()
 
 
 def parse_bytes(text: str) -> int:

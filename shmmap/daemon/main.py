@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import os
 import sys
 import time
@@ -35,6 +36,7 @@ from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.live_events import LiveEvents
+from shmmap.daemon.events.publisher import events_path
 from shmmap.daemon.host.instance_lock import InstanceLock
 from shmmap.daemon.host.instance_names import lock_path, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
@@ -46,6 +48,7 @@ from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.prerequisites import (
     access_of_segments,
+    check_file_size_limit,
     choose_pins,
     give_back_large_tables,
     import_ahead,
@@ -56,6 +59,7 @@ from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.service_manager.more_time import MoreTime
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
 from shmmap.daemon.service_manager.status import ServiceManager, notify
+from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
@@ -92,7 +96,7 @@ def run(config: DaemonConfig) -> int:
     CannotStart
         Something is full, not there yet, or in the way.
     """
-    set_up_logging()
+    set_up_logging(getattr(logging, config.log_level.upper()))
     if not config.map_path and not config.live:
         raise ConfigError(
             "no map is named", key="map_path",
@@ -118,14 +122,14 @@ def run(config: DaemonConfig) -> int:
         if config.map_path:
             origin = find_origin(
                 config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
-                tell=notify,
+                unit=config.unit, vertical_unit=config.vertical_unit, tell=notify,
             )  # fmt: skip
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere
             config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
         )
         with signals.held():
-            lock = InstanceLock(lock_path(path))
+            lock = InstanceLock(lock_path(path), partial(_refuse_taken, path, activated))
             stack.callback(lock.release)
             # two runtime directories may share a directory of segments
             refuse_second(directory, config.instance)
@@ -140,6 +144,7 @@ def run(config: DaemonConfig) -> int:
         with signals.held():
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early)
             stack.push(partial(_close, memory, signals))
+        check_file_size_limit(memory.cache.ledger.budget_bytes)
         del catalogue  # a reload replaces it
         live = _live_maps(config, memory, gid)
         stack.push(partial(_close_live, live, signals))
@@ -154,10 +159,18 @@ def run(config: DaemonConfig) -> int:
             gid,
             signals,
             activated,
+            lock,
         )
         service.run(started_s)
     log.info("stopped", instance=config.instance)
     return CannotWrite.exit_code if live.unsaved else 0
+
+
+def _refuse_taken(path: str, activated: ActivatedSocket | None) -> None:
+    """Refuse sockets that others have now, not once the map is read."""
+    if activated is None:
+        refuse_taken(path)
+    refuse_taken(events_path(path))
 
 
 def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:

@@ -29,6 +29,7 @@ from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
+from shmmap.processes.limits import limit_behind
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
@@ -92,8 +93,10 @@ class MapInMemory:
             said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
             if is_full(error):
                 raise CannotStart(said, hint="free some, or enlarge it") from error
-            hint = "lift limits on the size of files (ulimit -f, LimitFSIZE=)"
-            raise ConfigError(said, key="shm_dir", hint=hint) from error
+            limit = limit_behind(error)
+            if limit is not None:
+                raise CannotStart(limit.message, hint=limit.hint) from error
+            raise ConfigError(said, key="shm_dir") from error
         self.statistics.set("pin_source", list(PinSource).index(pins.source))
         self.statistics.set("last_reload_unix_ns", time.time_ns())
         self.statistics.set("map_problems", len(catalogue.problems))
@@ -122,7 +125,7 @@ class MapInMemory:
             prefetch_share=config.prefetch_share,
             ride_out_s=config.ride_out_s,
         )
-        Adoption(self.cache, self.scheduler.loads).take_over(time.monotonic())
+        Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced).take_over(time.monotonic())
         self.cache.tell_all()
         self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
         if pins.fd >= 0:
@@ -131,7 +134,7 @@ class MapInMemory:
             )
         if self.cache.names.fd >= 0:
             self.watched.watch(
-                self.cache.names.fd, lambda: self.cache.hear_of_names(time.monotonic()), "memory"
+                self.cache.names.fd, lambda: self.scheduler.room.names_vanished(time.monotonic()), "memory"
             )
 
     def close(self, *, keep: bool) -> None:

@@ -71,13 +71,15 @@ def _frame_before(out: str) -> tuple[float, float, float] | None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT``; returns the error's exit code."""
+    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT UNIT VERTICAL_UNIT``; returns the error's exit code."""
     channel = _Channel(socket.socket(fileno=int(arguments[0])))
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     os.nice(_NICENESS)
     # as `shmmap divide` does it, so that both give the same map; changed clouds keep the frame clients know
-    settings = DivideSettings(resume=True, frame_before=_frame_before(arguments[3]))
+    settings = DivideSettings(
+        resume=True, frame_before=_frame_before(arguments[3]), unit=arguments[4], vertical_unit=arguments[5]
+    )
     try:
         divide([arguments[2]], arguments[3], settings, progress=channel)
     except ShmmapError as error:

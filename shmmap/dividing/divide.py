@@ -33,10 +33,12 @@ from shmmap.dividing.row_layout import AXES, RowLayout, common_rows
 from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.sources import Source, open_source
 from shmmap.dividing.stream import Stream
+from shmmap.dividing.units import choose_units
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
+from shmmap.origin.far_cells import far_cells_notes
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
 from shmmap.quantities import format_bytes
 
@@ -116,6 +118,9 @@ class _Run:
             source = open_source(file.path, memory_bytes=room // 2, scratch_dir=space.path)
             stack.callback(source.close)
             self._sources.append(source)
+        self._units = choose_units(self._sources, settings.unit, settings.vertical_unit)
+        for source, scale in zip(self._sources, self._units.scales, strict=True):
+            source.scale = scale
         row = common_rows(
             [source.row for source in self._sources],
             [source.path for source in self._sources],
@@ -252,6 +257,7 @@ class _Run:
             "files": [asdict(file) for file in self._files],
             "row": self._row.descr,
             "frame": self._frame.move,
+            "scales": self._units.scales,
             "lattice": asdict(self._lattice),
             "buckets": asdict(self._buckets),
             "prefix": settings.prefix,
@@ -277,12 +283,19 @@ class _Run:
             )
 
     def _report(self, stream: Stream, cells: CellFiles) -> DividedMap:
-        notes = [*self._frame.notes]
+        notes = [*self._units.notes, *self._frame.notes]
         for source in self._sources:
             notes += [f"{source.path}: {warning}" for warning in source.warnings]
         if not any(GEOGRAPHIC_SYSTEM in note for note in notes):
             low, high = stream.extremes + self._frame.origin
             notes += [warning] if (warning := degrees_warning(low, high)) else []
+        where = list(cells.counts)
+        notes += far_cells_notes(
+            np.array([self._lattice.corner(*one) for one in where]),
+            self._lattice.size,
+            [self._name(*one) for one in where],
+            [cells.counts[one] for one in where],
+        )
         if not self._lattice.whole:
             notes.append(
                 "cells have fractional corners: Autoware's loader, which reads whole metres, refuses them"
@@ -308,6 +321,8 @@ class _Run:
             ],
             notes=notes,
             resumed_points=self.resumed,
+            crs=self._units.crs,
+            unit_m=self._units.unit_m,
         )
 
     def _write_texts(self, cells: CellFiles, report: DividedMap) -> None:

@@ -89,9 +89,10 @@ def _source_bounds(sources: Sequence[Source]) -> Bound3:
     for source in sources:
         if source.claimed_bounds is not None:
             if source.points:
-                bounds.add(np.array(source.claimed_bounds, np.float64))
+                plane, height = source.scale
+                bounds.add(np.array(source.claimed_bounds, np.float64) * (plane, plane, height))
             continue
-        source.begin(RowLayout(source.row), 0)
+        source.begin(RowLayout(source.row, scale=source.scale), 0)
         rows = np.empty(_SCAN_POINTS, source.row)
         while count := source.read(rows):
             bounds.add(np.column_stack([rows[axis][:count] for axis in "xyz"]))

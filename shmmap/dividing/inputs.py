@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from shmmap.errors import BadRequest, MapMissing
+from shmmap.formats.block_reader import CLOUD_SUFFIXES
 from shmmap.formats.causes import refusal
-from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.origin.map_frame import REPORT_NAME
 from shmmap.origin.metadata_text import METADATA_NAME
 

@@ -16,6 +16,7 @@ from shmmap.dividing.memory import memory_left
 from shmmap.dividing.progress import NoProgress, Progress
 from shmmap.dividing.row_layout import AXES, NO_MOVE, RowLayout, common_rows
 from shmmap.dividing.sources import Source, open_source
+from shmmap.dividing.units import choose_units
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header, pcd_rows
@@ -115,6 +116,7 @@ def merge(
                     file.path, memory_bytes=memory_left(memory_bytes) // 2, scratch_dir=os.path.dirname(out)
                 )
                 stack.callback(source.close)
+                choose_units([source], "", "")  # refuses feet: a PCD file cannot say so
                 sources.append(source)
                 moves.append((x, y, z))
         if not sources:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest, MapDataError
 
-__all__ = ["AXES", "NO_MOVE", "RowLayout", "common_rows", "word_view"]
+__all__ = ["AXES", "NO_MOVE", "NO_SCALE", "RowLayout", "common_rows", "word_view"]
 
 AXES: Final = ("x", "y", "z")
 NO_MOVE: Final = (0.0, 0.0, 0.0)
+NO_SCALE: Final = (1.0, 1.0)
 
 Columns = Mapping[str, NDArray[Any]] | NDArray[np.void]
 
@@ -30,22 +31,32 @@ class RowLayout:
         Structured dtype with x, y and z, both float32 or float64, and every other field.
     move
         Added to each point, metres (x, y, z); summed in float64 and rounded once.
+    scale
+        Metres per unit of the source, in the plane and in height; multiplied before.
     """
 
     row: np.dtype[np.void]
     move: tuple[float, float, float] = NO_MOVE
+    scale: tuple[float, float] = NO_SCALE
 
     def takes_as_is(self, row: np.dtype[np.void]) -> bool:
         """Whether records of type ``row`` are rows of the map already, byte by byte."""
-        return row == self.row and self.move == NO_MOVE and row.itemsize == self.row.itemsize
+        return row == self.row and self._stays and row.itemsize == self.row.itemsize
+
+    @property
+    def _stays(self) -> bool:
+        return self.move == NO_MOVE and self.scale == NO_SCALE
 
     def put(self, block: Columns, rows: NDArray[np.void]) -> None:
         """Write the columns of ``block`` to ``rows``; both have the same length."""
         for name in self.row.names or ():
             values = block[name]
-            if name in AXES and self.move != NO_MOVE:
+            if name in AXES and not self._stays:
+                axis = AXES.index(name)
                 moved = values.astype(np.float64)
-                moved += self.move[AXES.index(name)]
+                if self.scale != NO_SCALE:
+                    moved *= self.scale[axis // 2]
+                moved += self.move[axis]
                 values = moved
             with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs; too large becomes inf
                 rows[name] = values

@@ -25,8 +25,9 @@ from typing import Any, Final
 from xxhash import xxh3_64_hexdigest
 
 from shmmap.dividing.report import LINK_NAME
-from shmmap.errors import CannotWrite, InternalError, MapMissing, error_from_wire
-from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing, error_from_wire
+from shmmap.formats.block_reader import READABLE_SUFFIXES
+from shmmap.formats.coordinate_system import FEET
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_change import Tables
@@ -41,7 +42,7 @@ from shmmap.processes.start_child import how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
 
-_RECIPE: Final = "cells of 20 m, frame moved, 1"  # changes whenever the same cloud would be divided otherwise
+_RECIPE: Final = "cells of 20 m, frame moved, 2"  # changes whenever the same cloud would be divided otherwise
 _KEPT_CLOUDS: Final = 8
 _MORE_TIME_USEC: Final = 60_000_000
 _USE_LOCK: Final = ".use"  # held shared by every daemon that serves the cloud
@@ -58,6 +59,8 @@ def find_origin(
     metadata: str = "",
     strict: bool = False,
     cache_dir: str = "",
+    unit: str = "",
+    vertical_unit: str = "",
     tell: Callable[..., None] = _tell_nobody,
 ) -> MapOrigin:
     """Return the origin of the map at a path, be it a map or a cloud that has to be divided first.
@@ -66,6 +69,8 @@ def find_origin(
     ----------
     metadata, strict, cache_dir
         As in `open_map`; empty ones are looked for, or the user's.
+    unit, vertical_unit
+        Of a cloud's coordinates, as in `shmmap.dividing.units.choose_units`.
     tell
         Sends ``KEY=value`` lines of progress to the service manager, see `DividedCloud`.
 
@@ -73,13 +78,21 @@ def find_origin(
     ------
     MapMissing
         There is nothing at the path.
+    BadRequest
+        Units are named for a divided map, which has metres.
     """
     path = absolute_path(map_path)
     suffix = os.path.splitext(path)[1].lower()
-    is_cloud = os.path.isfile(path) and suffix in CLOUD_SUFFIXES and not metadata
-    if is_cloud and not (suffix == ".pcd" and is_served_whole(path)):
+    is_cloud = os.path.isfile(path) and suffix in READABLE_SUFFIXES and not metadata
+    in_feet = unit in FEET or vertical_unit in FEET
+    if is_cloud and (in_feet or not (suffix == ".pcd" and is_served_whole(path))):
         cache_dir = absolute_path(cache_dir or default_cache_directory())
-        return DividedCloud(path, cache_dir, strict=strict, tell=tell)
+        return DividedCloud(path, cache_dir, strict=strict, units=(unit, vertical_unit), tell=tell)
+    if in_feet:
+        raise BadRequest(
+            f"{path} is a divided map, not a cloud: it is not converted",
+            hint="divide its cloud again: shmmap divide --unit",
+        )
     return open_map(path, metadata=metadata or None, strict=strict, cache_dir=cache_dir or None)
 
 
@@ -94,14 +107,23 @@ class DividedCloud:
         Where divided clouds are kept, and indexes of large maps; absolute.
     strict
         As in `open_map`.
+    units
+        Of the cloud's coordinates, in the plane and in height, as in `find_origin`.
     tell
         Sends ``KEY=value`` lines to the service manager.
     """
 
     def __init__(
-        self, path: str, cache_dir: str, *, strict: bool = False, tell: Callable[..., None] = _tell_nobody
+        self,
+        path: str,
+        cache_dir: str,
+        *,
+        strict: bool = False,
+        units: tuple[str, str] = ("", ""),
+        tell: Callable[..., None] = _tell_nobody,
     ) -> None:
         self.path = path
+        self._units = units
         self._cache_dir = cache_dir
         stem = os.path.basename(path).rpartition(".")[0][:64]
         self._clouds = os.path.join(cache_dir, "divided")
@@ -123,7 +145,7 @@ class DividedCloud:
         except OSError as error:
             raise MapMissing(f"cannot read {self.path}: {error.strerror}") from error
         stamp = (status.st_size, status.st_mtime_ns, status.st_ctime_ns)
-        name = xxh3_64_hexdigest(json.dumps([_RECIPE, *stamp]).encode())
+        name = xxh3_64_hexdigest(json.dumps([_RECIPE, *self._units, *stamp]).encode())
         out = os.path.join(self._directory, name)
         link = os.path.join(self._directory, LINK_NAME)
         try:
@@ -132,7 +154,6 @@ class DividedCloud:
                 if not os.path.isdir(out):  # another daemon may have divided it
                     self._divide(out)
                 _point(link, name)
-                self._remove_others(name)
             self._sweep()
         except OSError as error:
             raise CannotWrite(
@@ -141,13 +162,17 @@ class DividedCloud:
         catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(
             fresh=fresh, before=before
         )
+        with contextlib.suppress(OSError), self._alone():  # what is served now is read until the change
+            self._remove_others(name)
         report = read_report(out) or {}
         catalogue.problems = (*catalogue.problems, *map(str, report.get("notes", ())))
         return catalogue
 
     def _divide(self, out: str) -> None:
         log.info("dividing", cloud=self.path, into=out)
-        process, channel = start_child("shmmap.dividing.child_main", self.path, out, new_session=False)
+        process, channel = start_child(
+            "shmmap.dividing.child_main", self.path, out, *self._units, new_session=False
+        )
         failure: dict[str, Any] = {}
         stage = ""
         with process, channel:

@@ -32,6 +32,8 @@ class DivideSettings:
     frame_before
         What ``auto`` adds where that leaves float32 precise enough: what an earlier state of the same cloud
         was moved by, so that its map stays where it is.
+    unit, vertical_unit
+        Of the inputs' coordinates, in the plane and in height; see `shmmap.dividing.units`.
     leaf
         Side of the voxels whose points become one, metres; 0 keeps every point.
     prefix
@@ -62,6 +64,8 @@ class DivideSettings:
     origin: tuple[float, float] = (0.0, 0.0)
     translate: Translation = "auto"
     frame_before: tuple[float, float, float] | None = None
+    unit: str = ""
+    vertical_unit: str = ""
     leaf: float = 0.0
     prefix: str = ""
     encoding: str = "binary"

@@ -12,23 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.dividing.row_layout import AXES, RowLayout
-from shmmap.errors import BadRequest, MapDataError
+from shmmap.dividing.row_layout import AXES, NO_SCALE, RowLayout
+from shmmap.errors import MapDataError
+from shmmap.formats.block_reader import cloud_suffix, open_blocks
 from shmmap.formats.causes import refusal
-from shmmap.formats.cloud import CLOUD_SUFFIXES
-from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
-from shmmap.formats.open3d_reader import read_with_open3d
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.mapped import expanded_blocks
 from shmmap.formats.pcd.reader import PcdReader
-from shmmap.quantities import format_bytes
 
 __all__ = ["Bound3", "Source", "open_source"]
 
 Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _BLOCK_POINTS: Final = 1 << 16  # of files that must be converted; small enough for the cache
-_LAS_BLOCK_POINTS: Final = 1 << 18  # a few of LAZ's chunks of 50000 points, so that all cores help
-_OPEN3D_FACTOR: Final = 5  # bytes in memory per byte of file, at the worst moment of reading
+_READER_BLOCK_POINTS: Final = 1 << 18  # a few of LAZ's chunks of 50000 points, so that all cores help
 
 
 class Source(Protocol):
@@ -44,6 +41,10 @@ class Source(Protocol):
         Packed type of a point: x, y, z (both float32 or float64) and every other field.
     claimed_bounds
         (min_xyz, max_xyz) where the file's header says so.
+    crs
+        What the file says of its coordinate system; None where it says nothing.
+    scale
+        Metres per unit, in the plane and in height, to be set before it is read; 1 at first.
     warnings
         Oddities of the file.
     """
@@ -52,6 +53,8 @@ class Source(Protocol):
     points: int
     row: np.dtype[np.void]
     claimed_bounds: Bound3 | None
+    crs: CoordinateSystem | None
+    scale: tuple[float, float]
     warnings: tuple[str, ...]
 
     def begin(self, layout: RowLayout, start: int) -> None:
@@ -86,26 +89,15 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
     ------
     MapDataError
         The file is not what it claims to be.
-    BadRequest
-        It would have to be read whole, and is too large for that.
     """
-    suffix = os.path.splitext(path)[1].lower()
+    suffix = cloud_suffix(path)
     if suffix == ".pcd":
         with _open_pcd(path) as reader:
             floats = all(reader.record[axis].kind == "f" for axis in AXES)
             if reader.header.encoding == "binary" and floats:
                 return _BinaryPcd(reader)
             return _StreamedPcd(reader, memory_bytes, scratch_dir)
-    if suffix in LAS_SUFFIXES:
-        return _Las(path)
-    if suffix not in CLOUD_SUFFIXES:
-        raise refusal(
-            "unsupported_format",
-            f"files called {suffix or 'without a suffix'} are not read",
-            path=path,
-            hint=f"readable are {', '.join(CLOUD_SUFFIXES)}; convert it to one of them",
-        )
-    return _Whole(path, suffix, memory_bytes)
+    return _Blocks(path, suffix)
 
 
 def _open_pcd(path: str) -> PcdReader:
@@ -124,6 +116,8 @@ class _BinaryPcd:
     """
 
     claimed_bounds: Bound3 | None = None
+    crs: CoordinateSystem | None = None
+    scale = NO_SCALE
 
     def __init__(self, reader: PcdReader) -> None:
         self.path = reader.path
@@ -192,6 +186,8 @@ class _Stream(ABC):
     """What is common to formats that come as blocks of columns."""
 
     claimed_bounds: Bound3 | None = None
+    crs: CoordinateSystem | None = None
+    scale = NO_SCALE
 
     def __init__(self, path: str, points: int, columns: tuple[ColumnSpec, ...]) -> None:
         self.path = path
@@ -267,49 +263,23 @@ class _StreamedPcd(_Stream):
                     yield dict(zip(names, (column[skipped:] for column in block), strict=True))
 
 
-class _Las(_Stream):
-    """LAS, LAZ and COPC."""
+class _Blocks(_Stream):
+    """Every other format."""
 
-    def __init__(self, path: str) -> None:
-        with LasReader(path) as reader:
+    def __init__(self, path: str, suffix: str) -> None:
+        self._suffix = suffix
+        with open_blocks(path, suffix) as reader:
             super().__init__(path, reader.points, reader.columns)
             self.claimed_bounds = reader.bounds
+            self.crs = reader.crs
             self.warnings = reader.warnings
 
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
-        with LasReader(self.path) as reader:
+        with open_blocks(self.path, self._suffix) as reader:
             if reader.points != self.points or _row_of(reader.columns) != self.row:
                 raise _changed(self.path)
-            yield from reader.blocks(_LAS_BLOCK_POINTS, start)
-
-
-class _Whole(_Stream):
-    """What only Open3D reads, which knows no blocks."""
-
-    def __init__(self, path: str, suffix: str, memory_bytes: int) -> None:
-        try:
-            size = os.stat(path).st_size
-        except FileNotFoundError:
-            raise refusal("missing", "no such file", path=path) from None
-        except OSError as error:
-            raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
-        if size * _OPEN3D_FACTOR > memory_bytes:
-            raise BadRequest(
-                f"{path} must be read whole, which takes about"
-                f" {format_bytes(size * _OPEN3D_FACTOR)} of memory",
-                hint="give more --max-memory, or convert it to PCD or LAS, which are streamed",
-            )
-        self._columns, warnings = read_with_open3d(path, suffix)
-        specs = tuple(
-            ColumnSpec(name, values.dtype, 1 if values.ndim == 1 else values.shape[1])
-            for name, values in self._columns.items()
-        )
-        super().__init__(path, len(self._columns["xyz"]), specs)
-        self.warnings = warnings
-
-    def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
-        for at in range(start, self.points, _BLOCK_POINTS):
-            yield {name: values[at : at + _BLOCK_POINTS] for name, values in self._columns.items()}
+            yield from reader.blocks(_READER_BLOCK_POINTS, start)
+            self.warnings = reader.warnings
 
 
 def _row_of(columns: tuple[ColumnSpec, ...]) -> np.dtype[np.void]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ class Stream:
             if skip >= source.points:
                 skip -= source.points
                 continue
-            source.begin(self._layout, skip)
+            source.begin(replace(self._layout, scale=source.scale), skip)
             left = source.points - skip
             skip = 0
             while left:

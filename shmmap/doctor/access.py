@@ -13,7 +13,15 @@ from typing import Final
 
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Patient
-from shmmap.errors import DaemonUnreachable, NoAnswer, NoSocket, ProtocolMismatch, SocketPermission
+from shmmap.errors import (
+    DaemonUnreachable,
+    NoAnswer,
+    NoSocket,
+    ProtocolMismatch,
+    ShmmapError,
+    SocketPermission,
+)
+from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.quantities import counted
 
 __all__ = [
@@ -108,6 +116,8 @@ def check_socket(patient: Patient) -> Finding:
     try:
         connect(path, time.monotonic() + ANSWER_S)
     except NoSocket as error:
+        if why := _closed_place(patient):
+            return fail(name, why, "see whose it is and remove it, or set XDG_RUNTIME_DIR, or runtime_dir")
         return warn(name, error.message, "start it: `systemctl start shmmapd` or `shmmap serve MAP`")
     except SocketPermission as error:
         return fail(name, f"{error.message}: {_access(path)}", error.hint)
@@ -122,6 +132,17 @@ def check_socket(patient: Patient) -> Finding:
     if open_to_all and above:
         return warn(name, fact, f"every account may connect: chmod o-rwx {path}")
     return ok(name, fact)
+
+
+def _closed_place(patient: Patient) -> str:
+    """Why a daemon could not have its socket in the directory in /tmp; empty where it can, or needs none."""
+    place = fallback_runtime_dir()
+    try:
+        chosen = os.path.dirname(patient.config.socket())
+    except ShmmapError:
+        return ""
+    why = why_not_private(place) if chosen == place and os.path.lexists(place) else ""
+    return f"the daemon would refuse its runtime directory {place}: {why}" if why else ""
 
 
 def _access(path: str) -> str:
@@ -146,6 +167,13 @@ def check_map_access(patient: Patient) -> Finding:
                 name,
                 f"{path} is being served, but reading it found {counted(problems, 'problem')}",
                 "the daemon's log names them, and so does `shmmap reload`",
+            )
+        outside = patient.seen.counters.get("cells_outside_box", 0) if patient.seen is not None else 0
+        if outside:
+            return warn(
+                name,
+                f"{path} is being served, but points of {counted(outside, 'cell')} lie outside its box",
+                "moved without the metadata? the daemon's log names them, and so does `shmmap inspect`",
             )
         return ok(name, f"{path} is being served")
     if not os.path.exists(path):

@@ -14,6 +14,8 @@ from shmmap.quantities import counted
 __all__ = ["check_cells"]
 
 ANSWER_S: Final = 2.0
+SHORT: Final = ("out of memory", "of memory that a loader may use")
+"""What loads say that failed for lack of memory."""
 NAMED: Final = 3
 """Cells that are named, with their causes."""
 
@@ -37,11 +39,18 @@ def check_cells(patient: Patient) -> Finding:
         return ok(name, f"{since}; no cell is known to fail now")
     causes = "; ".join(_cause(*one, failing[one]) for one in list(failing)[:NAMED])
     more = f"; and {len(failing) - NAMED:,} more" if len(failing) > NAMED else ""
+    fact = f"{counted(len({cell for cell, _ in failing}), 'cell')} cannot be loaded: {causes}{more}"
+    blamed = [cell for (cell, _), message in failing.items() if not any(map(message.__contains__, SHORT))]
+    if not blamed:
+        return warn(
+            name,
+            fact,
+            "the files are not to blame: give the daemon more memory (MemoryMax=, docker --memory), or divide"
+            " the map into smaller cells",
+        )
     prefix = patient.seen.identity.id_prefix if patient.seen.identity is not None else ""
     return warn(
-        name,
-        f"{counted(len({cell for cell, _ in failing}), 'cell')} cannot be loaded: {causes}{more}",
-        f"`shmmap inspect {prefix}{next(iter(failing))[0]}` reads the file and says what is wrong with it",
+        name, fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it"
     )
 
 

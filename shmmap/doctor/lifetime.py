@@ -12,7 +12,7 @@ from typing import Final
 
 import shmmap
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.patient import Machine, Patient
+from shmmap.doctor.patient import Machine, Patient, answering_at
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.names import usual_directory
@@ -36,6 +36,12 @@ def check_daemon(patient: Patient) -> Finding:
     instance = patient.config.instance
     if patient.awaits_first_client:
         return ok(name, f"instance {instance} does not run; its first client starts it")
+    if identity is None and patient.answering:
+        return warn(
+            name,
+            f"instance {instance}, pid {patient.answering}, answers, but its statistics were removed",
+            "it makes them again within seconds, or its log says why not",
+        )
     if identity is None:
         return warn(
             name, f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`"
@@ -91,6 +97,14 @@ def check_leftovers(patient: Patient) -> Finding:
     except OSError as error:
         return warn(name, f"{patient.shm_dir}: {error.strerror}", "run it with sudo")
     orphans = {name: held for name, held in found.items() if not _looked_after(patient, name)}
+    listening = patient.listening if orphans else set()
+    silent = ""
+    for path in sorted(listening):
+        if path.removesuffix(".sock") + ".events.sock" in listening:  # a daemon, whatever its files
+            answer = answering_at(path)
+            silent = silent if answer else path
+            for instance in answer:
+                orphans.pop(instance, None)
     if not orphans:
         return ok(name, "every segment belongs to a running daemon" if found else "none")
     listed = ", ".join(
@@ -103,6 +117,12 @@ def check_leftovers(patient: Patient) -> Finding:
             f"segments and chunks of live maps of daemons that do not run: {listed}",
             "start that instance with its live maps: chunks may be in memory alone, and are saved then",
         )
+    if silent:
+        return warn(
+            name,
+            f"segments of daemons without statistics: {listed}",
+            f"a daemon at {silent} does not answer this user, and they may be its: see `shmmap health`",
+        )
     return warn(
         name,
         f"segments of daemons that do not run: {listed}",
@@ -112,7 +132,7 @@ def check_leftovers(patient: Patient) -> Finding:
 
 def _looked_after(patient: Patient, instance: str) -> bool:
     if instance == patient.config.instance:
-        return patient.alive or patient.seen is None
+        return patient.alive or patient.seen is None or patient.answering > 0
     places = {patient.shm_dir, usual_directory(instance)}  # live maps may be elsewhere than cells
     try:
         states = [read_statistics(instance, place).state for place in places]

@@ -8,6 +8,7 @@ import re
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
+from shmmap.daemon.host.budget import room_in_group
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.keeping_ahead import ahead_verdict
@@ -26,8 +27,6 @@ __all__ = [
 ]
 
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
-OVERHEAD_BYTES: Final = 512 << 20
-"""The daemon and its loaders beside the segments; a loader that reads a compressed cell is the largest."""
 
 
 class _Mount(NamedTuple):
@@ -92,6 +91,8 @@ def check_cache(patient: Patient) -> Finding:
     if not patient.alive or patient.seen is None:
         return skip(name, "no daemon runs")
     verdict = cache_verdict(patient.seen.counters)
+    if patient.seen.counters.get("refused_over_budget_1min", 0):
+        return fail(name, verdict.text, verdict.hint)
     return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
 
 
@@ -128,9 +129,10 @@ def check_container(patient: Patient) -> Finding:
     return ok(name, f"in a container with {format_bytes(size)} of shared memory")
 
 
-def _cgroup_limit(machine: Machine, pid: int) -> int:
-    """Smallest memory limit on the way up from the process's cgroup, 0 for none."""
+def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
+    """Smallest limit on the way up from the process's cgroup, 0 for none; bytes that are no tmpfs's."""
     limits = []
+    private = 0
     for line in machine.text(f"/proc/{pid or 'self'}/cgroup").splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers == "":
@@ -141,28 +143,37 @@ def _cgroup_limit(machine: Machine, pid: int) -> int:
             continue
         here = PurePosixPath(path)
         for place in places:
+            used = dict(line.split()[:2] for line in machine.text(f"{place}{here}/memory.stat").splitlines())
+            private = max(private, sum(int(used.get(name, 0)) for name in ("anon", "rss", "kernel")))
             for above in (here, *here.parents):
                 for file in ("memory.max", "memory.limit_in_bytes"):
                     text = machine.text(f"{place}{above}/{file}").strip()
                     limits += [int(text)] if text.isdigit() and int(text) < 1 << 60 else []
-    return min(limits, default=0)
+    return min(limits, default=0), private
 
 
 def check_memory_limit(patient: Patient) -> Finding:
-    """Would the cgroup's limit kill the daemon before its budget is full?"""
+    """Would the cgroup's limit kill the daemon before its budget is full?
+
+    Segments are charged to the group, as the daemon reckons when it chooses its budget; what its processes
+    use beside them is measured while it runs.
+    """
     name = "memory limit"
-    limit, budget = _cgroup_limit(patient.machine, patient.pid), patient.budget_bytes
+    limit, private = _cgroup_limit(patient.machine, patient.pid)
+    budget = patient.budget_bytes
     if not limit:
         return ok(name, "the control group sets no limit")
     chosen = format_bytes(budget) if budget else "chosen at start"
     fact = f"the control group allows {format_bytes(limit)}; budget {chosen}"
-    if budget and budget + OVERHEAD_BYTES > limit:
-        return fail(
-            name,
-            fact,
-            "crossing it kills the daemon (segments are charged to it): lower the budget to"
-            f" {format_bytes(max(limit - OVERHEAD_BYTES, 1 << 20))}, or raise MemoryMax=",
-        )
+    room = room_in_group(limit)
+    kills = "crossing it kills the daemon (segments are charged to it): lower the budget to"
+    if budget > room:
+        return fail(name, fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
+    if patient.alive:
+        fact += f", and its processes use {format_bytes(private)}"
+        if budget + private > limit:
+            most = format_bytes(max(limit - private, 1 << 20))
+            return warn(name, fact, f"{kills} {most}, or raise MemoryMax=")
     return ok(name, fact)
 
 

@@ -17,7 +17,7 @@ from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["Machine", "Patient", "examine"]
+__all__ = ["Machine", "Patient", "answering_at", "examine"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,8 @@ class Patient:
         The daemon's statistics; None where they cannot be read, and ``unreadable`` says why.
     uid
         The account that asks.
+    answering
+        Process of a daemon of this instance that answers although it has no statistics; 0: none.
     """
 
     machine: Machine
@@ -63,6 +65,7 @@ class Patient:
     seen: Snapshot | None
     unreadable: str = ""
     uid: int = field(default_factory=os.geteuid)
+    answering: int = 0
 
     @property
     def alive(self) -> bool:
@@ -75,10 +78,15 @@ class Patient:
 
         Connecting would start it, and who only looks must not do that.
         """
-        if self.alive or self.seen is None:
+        if self.alive or self.seen is None or self.answering:
             return False
+        return self.socket in self.listening
+
+    @property
+    def listening(self) -> set[str]:
+        """Paths of all sockets at which a process listens."""
         rows = (line.split(maxsplit=7) for line in self.machine.text("/proc/net/unix").splitlines())
-        return any(len(row) == 8 and row[7] == self.socket and int(row[3], 16) & _LISTENS for row in rows)
+        return {row[7] for row in rows if len(row) == 8 and row[7][0] == "/" and int(row[3], 16) & _LISTENS}
 
     @property
     def shm_dir(self) -> str:
@@ -125,6 +133,7 @@ class Patient:
         return self.uid
 
 
+ASKED_S: Final = 2.0
 _UNIT: Final = "/etc/systemd/system/shmmapd.service"
 _LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
@@ -143,7 +152,24 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
         path = seen.identity.endpoint
     else:
         path = _socket(config)
-    return Patient(machine or Machine(), config, file, path, seen, unreadable)
+    patient = Patient(machine or Machine(), config, file, path, seen, unreadable)
+    if patient.alive:
+        return patient
+    return dataclasses.replace(patient, answering=answering_at(path).get(config.instance, 0))
+
+
+def answering_at(path: str) -> dict[str, int]:
+    """Ask whoever listens at a socket: the process of the daemon there, by its instance."""
+    from shmmap.client.client import connect
+    from shmmap.client.discovery import is_served
+
+    if not is_served(path):
+        return {}
+    try:
+        with connect(path, timeout=ASKED_S, connect_timeout=ASKED_S, name="shmmap doctor") as client:
+            return {client.welcome.instance: client.welcome.pid}
+    except ShmmapError:
+        return {}
 
 
 def _socket(config: DaemonConfig) -> str:

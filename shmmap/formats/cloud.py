@@ -11,22 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.formats.causes import refusal
+from shmmap.formats.block_reader import cloud_suffix, open_blocks
+from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.finite import Bounds
-from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
-from shmmap.formats.open3d_reader import OPEN3D_SUFFIXES, read_with_open3d
 from shmmap.formats.pcd.header import IDENTITY_VIEWPOINT
 from shmmap.formats.pcd.reader import PcdReader
-from shmmap.formats.source_file import open_regular
 
-__all__ = ["CLOUD_SUFFIXES", "CloudDescription", "PointCloud", "describe", "read_cloud", "read_pcd"]
+__all__ = ["CloudDescription", "PointCloud", "describe", "read_cloud", "read_pcd"]
 
-CLOUD_SUFFIXES: Final = (".pcd", *LAS_SUFFIXES, *OPEN3D_SUFFIXES)
-"""Endings of the files that are read, in lower case."""
-
-_LAS_BLOCK_POINTS: Final = 1 << 20
-_NO_WARNINGS: Final[tuple[str, ...]] = ()
+_BLOCK_POINTS: Final = 1 << 18
 
 Bound = NDArray[np.float64]
 
@@ -78,6 +72,8 @@ class CloudDescription:
         As `PointCloud.columns` would have them.
     bounds, viewpoint, warnings
         As in `PointCloud`.
+    crs
+        What the file says of its coordinate system; None where it says nothing.
     digest
         XXH3-128 of a PCD file's bytes; empty for other formats.
     """
@@ -95,6 +91,7 @@ class CloudDescription:
     bounds: tuple[Bound, Bound]
     viewpoint: tuple[float, ...] = IDENTITY_VIEWPOINT
     warnings: tuple[str, ...] = ()
+    crs: CoordinateSystem | None = None
     digest: bytes = field(default=b"", repr=False)
 
 
@@ -110,7 +107,7 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
         parts = [tuple(column.copy() for column in block) for block in reader.blocks()]
         columns = {
             spec.name: np.concatenate(
-                [np.empty(_shape(spec), spec.dtype), *(part[index] for part in parts)], dtype=spec.dtype
+                [np.empty(_shape(spec, 0), spec.dtype), *(part[index] for part in parts)], dtype=spec.dtype
             )
             for index, spec in enumerate(reader.columns)
         }
@@ -125,36 +122,40 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
 
 
 def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> PointCloud:
-    """Read a whole cloud: PCD by our own reader, LAS and LAZ through laspy, the rest through Open3D.
+    """Read a whole cloud of any format: PCD, PLY and text by our own readers, LAS and LAZ through laspy.
+
+    Coordinates are in the file's unit; where that is not the metre, ``warnings`` says so.
 
     Raises
     ------
     MapDataError
         If the file cannot be read, or its format is not supported.
     """
-    suffix = _suffix(path)
+    suffix = cloud_suffix(path)
     if suffix == ".pcd":
         return read_pcd(path, keep_non_finite=keep_non_finite)
-    if suffix in LAS_SUFFIXES:
-        columns, warnings = _read_las(path), _NO_WARNINGS
-    else:
-        columns, warnings = read_with_open3d(os.fspath(path), suffix)
-    points = len(columns["xyz"])
-    bounds = Bounds()
-    mask = bounds.add(np.ascontiguousarray(columns["xyz"]))
-    if mask is not None and not keep_non_finite:
-        columns = {name: values[mask] for name, values in columns.items()}
-    return PointCloud(
-        columns=columns,
-        points=points,
-        dropped=points - len(columns["xyz"]),
-        bounds=bounds.result(),
-        warnings=warnings,
-    )
+    bounds, kept = Bounds(), 0
+    with open_blocks(os.fspath(path), suffix) as reader:
+        columns = {spec.name: np.empty(_shape(spec, reader.points), spec.dtype) for spec in reader.columns}
+        for block in reader.blocks(_BLOCK_POINTS):
+            mask = bounds.add(block["xyz"])
+            if mask is not None and not keep_non_finite:
+                block = {name: values[mask] for name, values in block.items()}
+            rows = slice(kept, kept + len(block["xyz"]))
+            for name, values in block.items():
+                columns[name][rows] = values
+            kept = rows.stop
+        return PointCloud(
+            columns={name: values[:kept] for name, values in columns.items()},
+            points=reader.points,
+            dropped=reader.points - kept,
+            bounds=bounds.result(),
+            warnings=reader.warnings,
+        )
 
 
 def describe(path: str | os.PathLike[str]) -> CloudDescription:
-    """Read a file to its end and say what it holds; PCD, LAS and LAZ in bounded memory.
+    """Read a file to its end and say what it holds, in bounded memory.
 
     Raises
     ------
@@ -168,31 +169,9 @@ def describe(path: str | os.PathLike[str]) -> CloudDescription:
 
 
 def _described(path: str | os.PathLike[str]) -> CloudDescription:
-    suffix = _suffix(path)
-    if suffix in LAS_SUFFIXES:
-        return _describe_las(path, suffix)
+    suffix = cloud_suffix(path)
     if suffix != ".pcd":
-        cloud = read_cloud(path)
-        specs = tuple(
-            ColumnSpec(
-                name, values.dtype, 1 if values.ndim == 1 else values.shape[1], "m" if name == "xyz" else ""
-            )
-            for name, values in cloud.columns.items()
-        )
-        return CloudDescription(
-            path=os.fspath(path),
-            format=suffix[1:],
-            encoding="",
-            version="",
-            file_bytes=os.stat(path).st_size,
-            points=cloud.points,
-            dropped=cloud.dropped,
-            width=cloud.points,
-            height=1,
-            columns=specs,
-            bounds=cloud.bounds,
-            warnings=cloud.warnings,
-        )
+        return _describe_blocks(os.fspath(path), suffix)
     with PcdReader(path) as reader:
         for _ in reader.blocks():
             pass
@@ -215,16 +194,16 @@ def _described(path: str | os.PathLike[str]) -> CloudDescription:
         )
 
 
-def _describe_las(path: str | os.PathLike[str], suffix: str) -> CloudDescription:
+def _describe_blocks(path: str, suffix: str) -> CloudDescription:
     bounds, dropped = Bounds(), 0
-    with LasReader(path) as reader:
-        for block in reader.blocks(_LAS_BLOCK_POINTS):
+    with open_blocks(path, suffix) as reader:
+        for block in reader.blocks(_BLOCK_POINTS):
             mask = bounds.add(block["xyz"])
             dropped += 0 if mask is None else int(np.count_nonzero(~mask))
         return CloudDescription(
             path=reader.path,
             format=suffix[1:],
-            encoding="",
+            encoding=reader.encoding,
             version=reader.version,
             file_bytes=os.stat(path).st_size,
             points=reader.points,
@@ -234,31 +213,9 @@ def _describe_las(path: str | os.PathLike[str], suffix: str) -> CloudDescription
             columns=reader.columns,
             bounds=bounds.result(),
             warnings=reader.warnings,
+            crs=reader.crs,
         )
 
 
-def _read_las(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
-    with LasReader(path) as reader:
-        blocks = list(reader.blocks(_LAS_BLOCK_POINTS))
-        return {
-            spec.name: np.concatenate([np.empty(_shape(spec), spec.dtype), *(b[spec.name] for b in blocks)])
-            for spec in reader.columns
-        }
-
-
-def _suffix(path: str | os.PathLike[str]) -> str:
-    name = os.fspath(path)
-    suffix = os.path.splitext(name)[1].lower()
-    if suffix not in CLOUD_SUFFIXES:
-        os.close(open_regular(name))  # what is not there, or no file, is refused for that
-        raise refusal(
-            "unsupported_format",
-            f"files called {suffix or 'without a suffix'} are not read",
-            path=name,
-            hint=f"readable are {', '.join(CLOUD_SUFFIXES)}; convert it to one of them",
-        )
-    return suffix
-
-
-def _shape(spec: ColumnSpec) -> tuple[int, ...]:
-    return (0,) if spec.components == 1 else (0, spec.components)
+def _shape(spec: ColumnSpec, rows: int) -> tuple[int, ...]:
+    return (rows,) if spec.components == 1 else (rows, spec.components)

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds whose coordinates are longitude and latitude, which no map in metres can be made of.
+"""Clouds whose coordinates are no metres: longitude and latitude, which no map can be made of, and feet.
 
 Divided into cells of metres, a whole town of them falls into one cell.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+import re
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GEOGRAPHIC_SYSTEM", "degrees_warning", "is_geographic"]
+from shmmap.formats.coordinate_system import METRE, CoordinateSystem, LengthUnit
+
+__all__ = ["GEOGRAPHIC_SYSTEM", "degrees_warning", "unit_text", "unit_warnings", "units_text"]
 
 GEOGRAPHIC_SYSTEM: Final = (
     "its coordinate system is geographic: x and y are degrees, not metres; convert it to a metric "
@@ -22,8 +25,6 @@ GEOGRAPHIC_SYSTEM: Final = (
 _MOST_DEGREES: Final = 5.0  # of x and of y; larger clouds are divided by other means
 _FLATNESS: Final = 20.0  # heights are in metres, so such a cloud seems to be far higher than wide
 _OFF_ORIGIN: Final = 1.0  # what small thing stands at the origin may be as slender as that
-_MODEL_TYPE_KEY: Final = 1024  # GTModelTypeGeoKey of GeoTIFF; 2 is geographic
-_GEOGRAPHIC_MODEL: Final = 2
 
 
 def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -> str:
@@ -48,14 +49,29 @@ def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -
     )
 
 
-def is_geographic(header: Any) -> bool:
-    """Whether a LAS header (laspy's) names a geographic coordinate system; needs no projection library."""
-    for record in header.vlrs:
-        kind = type(record).__name__
-        if kind == "WktCoordinateSystemVlr":
-            return str(record.string).lstrip().upper().startswith(("GEOGCS[", "GEOGCRS[", "GEODCRS["))
-        if kind == "GeoKeyDirectoryVlr":
-            models = [key.value_offset for key in record.geo_keys if key.id == _MODEL_TYPE_KEY]
-            if models:
-                return int(models[0]) == _GEOGRAPHIC_MODEL
-    return False
+def unit_warnings(crs: CoordinateSystem | None) -> tuple[str, ...]:
+    """Return what has to be said of a file's units: that they are degrees, or no metres."""
+    if crs is None:
+        return ()
+    plane, height = crs.units
+    said = [GEOGRAPHIC_SYSTEM] if crs.geographic else []
+    if crs.geographic and height != METRE:
+        said.append(f"heights are in {unit_text(height)}, not metres")
+    elif not crs.geographic and (plane, height) != (METRE, METRE):
+        said.append(f"coordinates are not in metres: {units_text(plane, height)}")
+    return tuple(said)
+
+
+def units_text(plane: LengthUnit, height: LengthUnit) -> str:
+    """Say units in the plane and in height, each with its length."""
+    if plane == height:
+        return f"x, y and z are in {unit_text(plane)}"
+    return f"x and y are in {unit_text(plane)}, z in {unit_text(height)}"
+
+
+def unit_text(unit: LengthUnit) -> str:
+    """Name a unit with its length."""
+    if unit == METRE:
+        return "metres"
+    name = re.sub(r"\bfoot\b", "feet", unit.name)
+    return f"{name} ({unit.metres:.12g} m)" if unit.metres else f"{name} (of a length not known)"

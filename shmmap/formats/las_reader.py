@@ -21,18 +21,16 @@ from numpy.typing import NDArray
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, PackageMissing
 from shmmap.formats.causes import refusal
-from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, is_geographic
-from shmmap.formats.source_file import open_regular
+from shmmap.formats.degrees import unit_warnings
+from shmmap.formats.las_header import LASZIP, VARIABLE_CHUNKS, read_las_header
 
 __all__ = ["LAS_SUFFIXES", "LasReader"]
 
 LAS_SUFFIXES: Final = (".las", ".laz")  # COPC files end in .copc.laz
 
-_SIGNATURE: Final = b"LASF"
-_SHORTEST_HEADER_BYTES: Final = 227  # LAS 1.0 to 1.2
-_LEGACY_COUNT: Final = struct.Struct("<I4xBHI")  # at 96: offset to points, format, record bytes, points
-_LONG_COUNT_AT: Final = 247  # uint64, from LAS 1.4 on
-_LAZ_BIT: Final = 0x80
+_LAYERED: Final = 3  # compressor whose chunks count their points
+
+Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class LasReader:
@@ -46,7 +44,9 @@ class LasReader:
         ``xyz`` (N, 3) float64 in metres (or whatever unit the file's coordinate system has), then every
         other dimension with its own dtype, in file order.
     bounds
-        (min_xyz, max_xyz) as the header claims, float64.
+        (min_xyz, max_xyz) as the header claims, float64; None where it claims nothing that could be true.
+    crs
+        What the file says of its coordinate system; None where it says nothing.
     compressed
         Whether it is LAZ.
     version
@@ -64,17 +64,28 @@ class LasReader:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
-        self.compressed = _check_start(self.path)
+        checked = read_las_header(self.path)
+        self.compressed = checked.compressed
         laspy = _laspy(self.path)
         try:
             self._reader = laspy.open(self.path)
         except Exception as error:
             raise refusal("bad_las", f"laspy refuses it: {_first_line(error)}", path=self.path) from error
         header = self._reader.header
-        self.points = int(header.point_count)
+        header.point_count = self.points = checked.points  # laspy believes a wide count of 0
         self.version = str(header.version)
-        self.bounds = (np.array(header.mins, np.float64), np.array(header.maxs, np.float64))
-        self.warnings = (GEOGRAPHIC_SYSTEM,) if is_geographic(header) else ()
+        self.encoding = ""
+        low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
+        sound = np.isfinite([low, high]).all() and (low <= high).all() and np.any([low, high])
+        self.bounds: Bound3 | None = (low, high) if sound else None
+        self.crs = checked.crs
+        counted = _counted(self.path, header) if self.compressed and not checked.warnings else self.points
+        if counted < self.points:
+            message = f"{self.points} points announced, {counted} are there"
+            raise refusal("truncated", message, path=self.path, offset=os.stat(self.path).st_size)
+        if counted > self.points:
+            checked.warnings.append(f"the header counts {self.points} points, the compressed data {counted}")
+        self.warnings: tuple[str, ...] = (*checked.warnings, *unit_warnings(checked.crs))
         self._names = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
         empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
         self._columns = column_names(self._names)
@@ -136,31 +147,27 @@ class LasReader:
         return block
 
 
-def _check_start(path: str) -> bool:
-    """Refuse what is no LAS or is cut short, before laspy allocates for it; returns whether it is LAZ."""
+def _counted(path: str, header: Any) -> int:
+    """Return how many points a LAZ file's chunks hold; where they do not say, what its header does."""
+    import lazrs
+
+    points = int(header.point_count)
     try:
-        with open(open_regular(path), "rb") as file:
-            head = file.read(_LONG_COUNT_AT + 8)
-            size = os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise refusal("unreadable", f"cannot be read: {error.strerror}", path=path) from error
-    if not head:
-        raise refusal("empty_file", "no bytes at all", path=path)
-    if not head.startswith(_SIGNATURE):
-        raise refusal("bad_las", "not a LAS file: it does not start with LASF", path=path, offset=0)
-    if len(head) < _SHORTEST_HEADER_BYTES:
-        raise refusal("truncated", "the file ends within its header", path=path, offset=len(head))
-    data_at, form, record_bytes, points = _LEGACY_COUNT.unpack_from(head, 96)
-    if head[25] >= 4 and len(head) >= _LONG_COUNT_AT + 8:
-        points = int.from_bytes(head[_LONG_COUNT_AT:], "little")
-    compressed = bool(form & _LAZ_BIT)
-    # LAZ needs more than a bit a point; every LAS point its record
-    needed = data_at if compressed else data_at + points * record_bytes
-    if size < needed or (compressed and points > (size - data_at) * 256):
-        raise refusal(
-            "truncated", f"{points} points announced need {needed} bytes, {size} are there", path=path
-        )
-    return compressed
+        (laszip,) = (one for one in header.vlrs if (one.user_id.encode(), one.record_id) == LASZIP)
+        record = laszip.record_data_bytes()
+        compressor, chunk_points = struct.unpack_from("<H10xI", record)
+        with open(path, "rb") as file:
+            file.seek(header.offset_to_point_data)
+            chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+            if chunk_points == VARIABLE_CHUNKS:
+                return sum(count for count, _ in chunks)
+            if compressor != _LAYERED or not chunks:
+                return points
+            last = sum(nbytes for _, nbytes in chunks[:-1])
+            file.seek(header.offset_to_point_data + 8 + last + header.point_format.size)
+            return (len(chunks) - 1) * int(chunk_points) + int.from_bytes(file.read(4), "little")
+    except Exception:  # noqa: BLE001  whatever it is, reading the points says it
+        return points
 
 
 def _laspy(path: str) -> Any:

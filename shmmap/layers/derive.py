@@ -31,13 +31,17 @@ class Neighbour(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CellJob:
-    """Which cell: id, source file, box (metres), frame, and for a layer with a halo the cells around it."""
+    """Which cell: id, source file, box (metres), frame, and for a layer with a halo the cells around it.
+
+    ``at`` says where to find what a path names.
+    """
 
     cell_id: str
     path: str
     box: Box
     frame_id: str = "map"
     neighbours: tuple[Neighbour, ...] = ()
+    at: Callable[[str], str] = str
 
     def version(self, spec: LayerSpec, source: SourceStamp, around: Sequence[SourceStamp]) -> int:
         """Version of a layer of the cell for these states of its file and of its neighbours'."""
@@ -95,11 +99,11 @@ def derive(
         ENOSPC if the file system is full.
     """
     if source is None:
-        source = read_source(job.path, job.box, spec.source_columns)
+        source = read_source(job.at(job.path), job.box, spec.source_columns)
     points, warnings = source.points, source.warnings
     around: tuple[tuple[SourceStamp, bytes], ...] = ()
     if job.neighbours:
-        paths = [near.path for near in job.neighbours]
+        paths = [job.at(near.path) for near in job.neighbours]
         halo = read_halo(paths, job.box, spec.halo_m, points.xyz.dtype)
         points.halo, around, warnings = halo.xyz, halo.files, (*warnings, *halo.warnings)
     table = build_spec(spec, points)
@@ -116,6 +120,7 @@ def derive(
             source_digest=combined_digest(source.digest, [digest for _, digest in around]),
             source_points=source.source_points,
             dropped_points=source.dropped_points,
+            outside_points=source.outside_points,
         ),
         builder_version=spec.builder_version,
         units=table.units,

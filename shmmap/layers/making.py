@@ -42,10 +42,10 @@ class Made:
 
 def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
     """Key of a layer for the files as they are now; None where the cell's own cannot be looked at."""
-    source = state_of(job.path)
+    source = state_of(job.at(job.path))
     if source is NO_SOURCE:
         return None
-    return CacheKey(spec, job, source, tuple(state_of(near.path) for near in job.neighbours))
+    return CacheKey(spec, job, source, tuple(state_of(job.at(near.path)) for near in job.neighbours))
 
 
 def make_layer(
@@ -86,7 +86,7 @@ def make_layer(
     if spec.kind.name == LAYER:
         warnings: list[str] = []
         header = build_points(
-            job.path,
+            job.at(job.path),
             fd,
             cell_id=job.cell_id,
             box=job.box,

@@ -10,6 +10,7 @@ from typing import Final
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import Block, PcdReader
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
+from shmmap.layers.outside import OutsideBox
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.writer import SegmentWriter
 
@@ -69,7 +70,9 @@ def build_points(
         stamp = SourceStamp.of(os.fstat(reader.fileno()))
         rows = reader.header.points
         writer = _started(reader, rows, segment_fd, reserve, cell_id, box, frame_id)
+        outside = OutsideBox(box)
         for block in reader.blocks():
+            outside.add(block[0], reader.bounds)
             if not reader.dropped:  # else this pass can only count
                 _append(writer, block)
         if reader.dropped:
@@ -93,6 +96,7 @@ def build_points(
             source_points=reader.header.points,
             dropped_points=reader.dropped,
             builder_version=BUILDER_VERSION,
+            outside_points=outside.count,
         )
 
 

@@ -15,6 +15,7 @@ from shmmap.errors import MapDataError, SegmentCorrupt
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers.contract import Box, PointTable
+from shmmap.layers.outside import OutsideBox
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import NO_SOURCE, SourceStamp
 from shmmap.segment.verify import read_header
@@ -40,6 +41,7 @@ class CellSource:
     dropped_points: int
     z_min: float
     z_max: float
+    outside_points: int = 0
     warnings: tuple[str, ...] = ()
 
 
@@ -59,8 +61,9 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
         rows = reader.header.points
         shapes = [(rows,) if spec.components == 1 else (rows, spec.components) for spec in specs]
         arrays = [np.empty(shape, spec.dtype) for shape, spec in zip(shapes, specs, strict=True)]
-        at = 0
+        at, outside = 0, OutsideBox(box)
         for block in reader.blocks():
+            outside.add(block[0], reader.bounds)
             end = at + len(block[0])
             if end > rows:
                 break
@@ -82,6 +85,7 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
             dropped_points=reader.dropped,
             z_min=float(low[2]),
             z_max=float(high[2]),
+            outside_points=outside.count,
             warnings=reader.warnings,
         )
 
@@ -120,6 +124,7 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
         dropped_points=header.dropped_points,
         z_min=header.z_min,
         z_max=header.z_max,
+        outside_points=header.outside_points,
     )
 
 

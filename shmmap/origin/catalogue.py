@@ -14,6 +14,7 @@ from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.cell_names import CellNames
 from shmmap.origin.map_frame import UNKNOWN_FRAME, MapFrame
+from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Stamp, cell_version
@@ -51,6 +52,11 @@ class Catalogue:
     by_base, made, fixed_digest
         What was made of the same names and boxes before: `CellNames.by_base`, `SpatialIndex.made` and
         `fixed_digest`.
+
+    Attributes
+    ----------
+    opened
+        Directories that its cells are to be read through; None: their paths have to do.
 
     Raises
     ------
@@ -91,6 +97,7 @@ class Catalogue:
         self._fixed_digest = fixed_digest
         self._map_version: int | None = None
         self.problems = tuple(problems)
+        self.opened: OpenedDirectories | None = None
         self.frame: MapFrame = UNKNOWN_FRAME
         """Where the map frame lies in the world, see `MapFrame`; whoever reads the map sets it."""
 

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import os
 import stat
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -72,8 +73,10 @@ class _Found:
         self.names = []
 
 
-def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
+def scan(roots: Sequence[str], *, recursive: bool, at: Callable[[str], str] = str) -> ScannedFiles:
     """List the PCD files in and among ``roots`` (absolute paths of directories and files).
+
+    ``at`` says where to find what a path names.
 
     A file that is reached twice counts once.  Symbolic links are followed and keep their own names;
     a directory reached twice is listed once.  Hidden directories are passed over when recursing, and
@@ -84,38 +87,38 @@ def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
     MapMissing
         One of the roots cannot be read.
     """
-    prefix = common_directory([os.path.join(root, "") if os.path.isdir(root) else root for root in roots])
+    prefix = common_directory([os.path.join(root, "") if os.path.isdir(at(root)) else root for root in roots])
     skip = len(os.fsencode(prefix))
     found = _Found()
     problems: dict[str, list[str]] = {}
     directories: dict[str, os.stat_result] = {}
     seen: set[tuple[int, int]] = set()
-    pending: list[bytes] = []
+    pending: list[tuple[bytes, bytes]] = []  # where a directory is found, and its path
     for root in roots:
-        path = os.fsencode(root)
+        place, path = os.fsencode(at(root)), os.fsencode(root)
         try:
-            status = os.stat(path)
+            status = os.stat(place)
             if stat.S_ISDIR(status.st_mode):
-                os.scandir(path).close()
-                pending.append(path)
+                os.scandir(place).close()
+                pending.append((place, path))
             else:
                 found.add(path[skip:], status)
         except OSError as error:
             raise MapMissing(f"cannot read {root}: {error.strerror}") from error
     while pending:
-        directory = pending.pop()
+        place, directory = pending.pop()
         try:
-            status = os.stat(directory)
+            status = os.stat(place)
             if (status.st_dev, status.st_ino) in seen:
                 continue
             seen.add((status.st_dev, status.st_ino))
-            inner = _list_directory(directory, skip, found, problems)
+            inner = _list_directory(place, directory, skip, found, problems)
         except OSError as error:
             problems.setdefault(f"cannot be listed ({error.strerror})", []).append(_readable(directory))
             continue
         directories[os.fsdecode(directory)] = status
         if recursive:
-            pending.extend(inner)
+            pending += [(os.path.join(place, name), os.path.join(directory, name)) for name in inner]
     found.pack()
     names = np.concatenate(found.blocks)
     found.blocks.clear()
@@ -126,14 +129,14 @@ def scan(roots: Sequence[str], *, recursive: bool) -> ScannedFiles:
 
 
 def _list_directory(
-    directory: bytes, skip: int, found: _Found, problems: dict[str, list[str]]
+    place: bytes, directory: bytes, skip: int, found: _Found, problems: dict[str, list[str]]
 ) -> list[bytes]:
-    """Add a directory's PCD files to ``found``; return the directories in it."""
+    """Add a directory's PCD files to ``found``; return the names of the directories in it."""
     inner: list[bytes] = []
     below = os.path.join(directory, b"")[skip:]
-    with os.scandir(directory) as entries:
+    with _opened(place) as fd, os.scandir(fd) as entries:  # names in there are quicker to look at than paths
         for entry in entries:
-            name = entry.name
+            name = os.fsencode(entry.name)
             try:
                 is_directory = entry.is_dir()
                 if name.startswith(b".") if is_directory else not is_pcd(name):
@@ -145,15 +148,24 @@ def _list_directory(
                 if not _is_utf8(name):
                     problem = "the name is not UTF-8"
                 elif is_directory:
-                    inner.append(entry.path)
+                    inner.append(name)
                     continue
                 elif stat.S_ISREG(status.st_mode):
                     found.add(below + name, status)
                     continue
                 else:
                     problem = "no regular file"
-            problems.setdefault(problem, []).append(_readable(entry.path))
+            problems.setdefault(problem, []).append(_readable(os.path.join(directory, name)))
     return inner
+
+
+@contextlib.contextmanager
+def _opened(place: bytes) -> Iterator[int]:
+    fd = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
 
 
 def _is_utf8(name: bytes) -> bool:

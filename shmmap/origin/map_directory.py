@@ -22,6 +22,7 @@ from shmmap.origin.map_frame import read_map_frame
 from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
 from shmmap.origin.metadata_entries import MapMetadata, list_some
 from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES, TOO_LARGE, metadata_bytes, parse_metadata
+from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.origin.reading_apart import read_apart
 from shmmap.origin.sidecar import default_cache_directory, load_sidecar, save_sidecar, sidecar_file
 from shmmap.origin.single_pcd import load_single_pcd
@@ -108,42 +109,50 @@ class MapDirectory:
         MapDataError
             The metadata is wrong, fits none of the files, or (strict) lacks some of them.
         """
-        layout = find_layout(self.path, self.metadata, self.pcd_paths)
-        catalogue = self._catalogue(self._key(layout), fresh, before)
+        opened = OpenedDirectories()
+        layout = find_layout(self.path, self.metadata, self.pcd_paths, opened)
+        catalogue = self._catalogue(self._key(layout), fresh, before, opened)
+        catalogue.opened = opened
         if layout.metadata is not None:
-            catalogue.frame = read_map_frame(os.path.dirname(layout.metadata))
+            catalogue.frame = read_map_frame(opened.at(os.path.dirname(layout.metadata)))
         return catalogue
 
-    def _catalogue(self, key: str, fresh: bool, before: Tables | None) -> Catalogue:
+    def _catalogue(
+        self, key: str, fresh: bool, before: Tables | None, opened: OpenedDirectories
+    ) -> Catalogue:
         sidecar = sidecar_file(self.cache_dir, key)
-        if not fresh and (cached := load_sidecar(sidecar, key)) is not None:
+        if not fresh and (cached := load_sidecar(sidecar, key, opened.at)) is not None:
             return cached
         try:
-            return self.scanned(_READ_HERE_BYTES)
+            return self.scanned(_READ_HERE_BYTES, opened)
         except MapDataError as error:
             if error.cause != TOO_LARGE:
                 raise
         earlier = before if isinstance(before, Catalogue) else None
-        return read_apart(self.path, json.dumps(dataclasses.asdict(self)), earlier)
+        words = json.dumps([dataclasses.asdict(self), opened.descriptors])
+        return read_apart(self.path, words, earlier, tuple(opened.descriptors.values()))
 
     def _key(self, layout: MapLayout) -> str:
         return json.dumps([layout.roots, layout.metadata, self.strict])
 
-    def scanned(self, most_bytes: int = MOST_METADATA_BYTES) -> Catalogue:
+    def scanned(
+        self, most_bytes: int = MOST_METADATA_BYTES, opened: OpenedDirectories | None = None
+    ) -> Catalogue:
         """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`.
 
         Metadata of more bytes is refused before anything else is looked at.
         """
-        layout = find_layout(self.path, self.metadata, self.pcd_paths)
+        opened = opened or OpenedDirectories()
+        layout = find_layout(self.path, self.metadata, self.pcd_paths, opened)
         key = self._key(layout)
         sidecar = sidecar_file(self.cache_dir, key)
         scanned_ns = time.time_ns()
         data, sources = b"", []
         if layout.metadata is not None:
             # looked at before it is read: a change meanwhile then differs from what is written down
-            sources = [Source.of(layout.metadata, _status(layout.metadata))]
-            data = metadata_bytes(layout.metadata, most_bytes)
-        files = scan(layout.roots, recursive=not self.strict)
+            sources = [Source.of(layout.metadata, _status(layout.metadata, opened))]
+            data = metadata_bytes(layout.metadata, most_bytes, at=opened.at(layout.metadata))
+        files = scan(layout.roots, recursive=not self.strict, at=opened.at)
         if not len(files.names):
             raise MapMissing(
                 f"there is no PCD file in {', '.join(layout.roots)}",
@@ -154,15 +163,17 @@ class MapDirectory:
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
         del data  # of ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
-        if len(catalogue) >= self.cached_from_cells and all(os.path.isdir(root) for root in layout.roots):
+        if len(catalogue) >= self.cached_from_cells and all(
+            os.path.isdir(opened.at(root)) for root in layout.roots
+        ):
             sources += [Source.of(path, status) for path, status in files.directories.items()]
             save_sidecar(sidecar, key, sources, catalogue, scanned_ns)
         return catalogue
 
 
-def _status(path: str) -> os.stat_result:
+def _status(path: str, opened: OpenedDirectories) -> os.stat_result:
     try:
-        return os.stat(path)
+        return os.stat(opened.at(path))
     except OSError as error:
         raise MapMissing(f"cannot read {path}: {error.strerror}") from error
 

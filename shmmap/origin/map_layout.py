@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.directory_scan import is_pcd
+from shmmap.origin.opened_directories import OpenedDirectories
 
 __all__ = ["MapLayout", "absolute_path", "find_layout"]
 
@@ -67,8 +68,10 @@ def absolute_path(path: str | os.PathLike[str]) -> str:
     return os.path.realpath(path) if misled else text
 
 
-def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> MapLayout:
-    """Find the parts of the map at ``path``; all arguments are absolute.
+def find_layout(
+    path: str, metadata: str | None, pcd_paths: Sequence[str], opened: OpenedDirectories | None = None
+) -> MapLayout:
+    """Find the parts of the map at ``path``; all paths are absolute.
 
     Parameters
     ----------
@@ -78,30 +81,40 @@ def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> Ma
         The metadata file, where it is somewhere else.
     pcd_paths
         Files and directories to use instead of what is found at ``path``.
+    opened
+        Is given the map's directories to open; all that is looked at is looked at through these.
 
     Raises
     ------
     MapMissing
         There is nothing at ``path``, or nothing that could be a map.
     """
+    opened = opened or OpenedDirectories()
+    opened.open(os.path.dirname(path))
+    opened.open(path)
+    if metadata is not None:
+        opened.open(os.path.dirname(metadata))
+    for directory in pcd_paths:
+        opened.open(directory)
     try:
-        os.stat(path)
+        os.stat(opened.at(path))
     except OSError as error:
         raise MapMissing(
             f"there is no map at {path}: {str(error.strerror).lower()}",
             hint="name the directory of a divided map, or one cloud; `shmmap demo` needs no map",
         ) from error
-    if metadata is not None and not os.path.isfile(metadata):
+    if metadata is not None and not os.path.isfile(opened.at(metadata)):
         raise MapMissing(
             f"there is no metadata file at {metadata}", hint="name the YAML file that lists the map's cells"
         )
-    if os.path.isfile(path) and path.lower().endswith((".yaml", ".yml")):
+    if os.path.isfile(opened.at(path)) and path.lower().endswith((".yaml", ".yml")):
         metadata = metadata or path
         path = os.path.dirname(path)
     cells = os.path.join(path, _CELLS_NAME)
-    root = cells if os.path.exists(cells) else path
+    opened.open(cells)
+    root = cells if os.path.exists(opened.at(cells)) else path
     if pcd_paths:
-        roots = tuple(p for p in pcd_paths if os.path.exists(p))
+        roots = tuple(p for p in pcd_paths if os.path.exists(opened.at(p)))
         if not roots:
             raise MapMissing(
                 f"none of the PCD paths exists: {', '.join(pcd_paths)}",
@@ -110,19 +123,19 @@ def find_layout(path: str, metadata: str | None, pcd_paths: Sequence[str]) -> Ma
         problems = tuple(f"invalid path: {p}" for p in pcd_paths if p not in roots)
     else:
         roots, problems = (root,), ()
-    if metadata is None and os.path.isdir(path):
-        metadata = _find_metadata(path, root)
+    if metadata is None and os.path.isdir(opened.at(path)):
+        metadata = _find_metadata(path, root, opened)
     return MapLayout(roots, metadata, problems)
 
 
-def _find_metadata(path: str, root: str) -> str | None:
+def _find_metadata(path: str, root: str, opened: OpenedDirectories) -> str | None:
     folders = [path, root]
-    if os.path.basename(path) == _CELLS_NAME or _holds_pcd(path):
+    if os.path.basename(path) == _CELLS_NAME or _holds_pcd(opened.at(path)):
         folders.append(os.path.dirname(path))
     for folder in folders:
         for name in _METADATA_NAMES:
             candidate = os.path.join(folder, name)
-            if os.path.isfile(candidate):
+            if os.path.isfile(opened.at(candidate)):
                 return candidate
     return None
 

@@ -30,8 +30,8 @@ _TOO_DEEP_FOR_LIBYAML = "exceeded maximum nesting depth"
 _TAG_DIRECTIVE = re.compile(rb"^%TAG", re.MULTILINE)
 
 
-def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES) -> bytes:
-    """Return what is in the metadata file at ``path``.
+def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES, *, at: str = "") -> bytes:
+    """Return what is in the metadata file at ``path``; ``at`` is where to find it, if not there.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES) -> bytes:
         It has more bytes; the error's cause is `TOO_LARGE`.
     """
     try:
-        with open(path, "rb") as file:
+        with open(at or path, "rb") as file:
             data = file.read(most_bytes + 1)
     except OSError as error:
         raise MapMissing(f"cannot read the map's metadata {path}: {error.strerror}") from error

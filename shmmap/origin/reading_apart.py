@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import IO, Final, cast
 
 import msgspec
@@ -53,7 +54,9 @@ class Outcome(msgspec.Struct):
         return error
 
 
-def read_apart(map_path: str, words: str, before: Catalogue | None) -> Catalogue:
+def read_apart(
+    map_path: str, words: str, before: Catalogue | None, descriptors: Sequence[int] = ()
+) -> Catalogue:
     """Have a process read a map.
 
     Parameters
@@ -61,9 +64,11 @@ def read_apart(map_path: str, words: str, before: Catalogue | None) -> Catalogue
     map_path
         The map, for messages.
     words
-        What the process is told: a `MapDirectory` as JSON.
+        What the process is told, as JSON: a `MapDirectory`, and the descriptors of its directories by path.
     before
         An earlier state: what has not changed is shared with it.
+    descriptors
+        Of the directories; the process has them by the same numbers.
 
     Raises
     ------
@@ -77,7 +82,7 @@ def read_apart(map_path: str, words: str, before: Catalogue | None) -> Catalogue
     try:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=environment, cwd="/", pipesize=_PIPE_BYTES,
+            env=environment, cwd="/", pipesize=_PIPE_BYTES, pass_fds=descriptors,
         )  # fmt: skip
     except OSError as error:
         raise ShmmapError(

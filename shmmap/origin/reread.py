@@ -19,6 +19,8 @@ import msgspec
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.origin.catalogue_bytes import write_catalogue
 from shmmap.origin.map_directory import MapDirectory
+from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES
+from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.origin.reading_apart import Outcome
 from shmmap.processes.end_with_parent import die_with
 
@@ -36,10 +38,11 @@ def main(arguments: list[str]) -> int:
     os.nice(_NICENESS)
     _limit(resource.RLIMIT_DATA, _MOST_BYTES)
     _limit(resource.RLIMIT_CPU, _MOST_S)
-    origin = MapDirectory(**json.loads(arguments[1]))
+    words, descriptors = json.loads(arguments[1])
+    origin = MapDirectory(**words)
     outcome, catalogue = Outcome(), None
     try:
-        catalogue = origin.scanned()
+        catalogue = origin.scanned(MOST_METADATA_BYTES, OpenedDirectories(descriptors))
     except ShmmapError as error:
         outcome = Outcome.of(error)
     except OSError as error:

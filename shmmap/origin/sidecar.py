@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 from xxhash import xxh3_64_hexdigest
@@ -45,12 +45,15 @@ def sidecar_file(cache_dir: str, key: str) -> str:
     return os.path.join(cache_dir, xxh3_64_hexdigest(os.fsencode(key)) + ".catalogue")
 
 
-def load_sidecar(path: str, key: str) -> Catalogue | None:
-    """Catalogue from the sidecar, or None when there is none, its sources changed, or it is damaged."""
+def load_sidecar(path: str, key: str, at: Callable[[str], str] = str) -> Catalogue | None:
+    """Catalogue from the sidecar, or None when there is none, its sources changed, or it is damaged.
+
+    ``at`` says where to find what a source's path names.
+    """
     try:
         with open(path, "rb") as file:
             header, catalogue = read_catalogue(file, os.fstat(file.fileno()).st_size)
-        return catalogue if header.key == key and _unchanged(header.sources) else None
+        return catalogue if header.key == key and _unchanged(header.sources, at) else None
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -61,9 +64,9 @@ def load_sidecar(path: str, key: str) -> Catalogue | None:
         return None
 
 
-def _unchanged(sources: Sequence[Source]) -> bool:
+def _unchanged(sources: Sequence[Source], at: Callable[[str], str]) -> bool:
     try:
-        return all(Source.of(source.path, os.stat(source.path)) == source for source in sources)
+        return all(Source.of(source.path, os.stat(at(source.path))) == source for source in sources)
     except OSError:
         return False
 

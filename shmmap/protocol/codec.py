@@ -159,4 +159,4 @@ def decode_reply(data: bytes | memoryview) -> Reply:
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise ProtocolMismatch(
             f"the daemon's reply does not decode: {error}", hint="update the older of client and daemon"
-        ) from error
+        ) from None

@@ -4,22 +4,62 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Mapping
 from typing import Final
 
 from shmmap.errors import BadRequest
 
-__all__ = ["DEFAULT_INSTANCE", "SYSTEM_RUNTIME_DIR", "endpoint_path", "runtime_dirs", "socket_path"]
+__all__ = [
+    "DEFAULT_INSTANCE",
+    "EVENTS_LONGER",
+    "SYSTEM_RUNTIME_DIR",
+    "endpoint_path",
+    "fallback_runtime_dir",
+    "runtime_dirs",
+    "socket_path",
+    "why_not_private",
+]
 
 DEFAULT_INSTANCE: Final = "default"
 SYSTEM_RUNTIME_DIR: Final = "/run/shmmap"
+EVENTS_LONGER: Final = len(".events")
+"""By how much the path of the socket of events is longer than that of requests."""
 _SUN_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) - 1 on Linux
 
 
 def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
-    """Directories a client looks in, in order: the user's own, then the system's."""
+    """Directories a client looks in, in order: the user's own, then the system's.
+
+    ``XDG_RUNTIME_DIR`` is ignored where it is not absolute, as its specification has it.  The directory in
+    /tmp counts where it is there and is nobody else's.
+    """
     own = environ.get("XDG_RUNTIME_DIR", "")
-    return (*([f"{own}/shmmap"] if own else []), SYSTEM_RUNTIME_DIR)
+    found = [f"{own}/shmmap"] if own.startswith("/") else []
+    fallback = fallback_runtime_dir()
+    if os.path.lexists(fallback) and not why_not_private(fallback):
+        found.append(fallback)
+    return (*found, SYSTEM_RUNTIME_DIR)
+
+
+def fallback_runtime_dir() -> str:
+    """Where a user's daemon has its socket without ``XDG_RUNTIME_DIR``, in an ssh session, say."""
+    return f"/tmp/shmmap-{os.geteuid()}"  # noqa: S108  its owner is checked
+
+
+def why_not_private(directory: str) -> str:
+    """Why a directory that anybody could have made is not this user's own; empty where it is."""
+    try:
+        status = os.lstat(directory)
+    except OSError as error:
+        return str(error.strerror)
+    if stat.S_ISLNK(status.st_mode):
+        return "it is a symbolic link"
+    if not stat.S_ISDIR(status.st_mode):
+        return "it is no directory"
+    if status.st_uid != os.geteuid():
+        return f"it belongs to uid {status.st_uid}"
+    return "others may write or read there (chmod 700)" if status.st_mode & 0o077 else ""
 
 
 def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:
@@ -27,8 +67,15 @@ def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:
     return f"{runtime_dir.rstrip('/')}/{instance}.sock"
 
 
-def endpoint_path(endpoint: str) -> str:
+def endpoint_path(endpoint: str, *, longer: int = 0) -> str:
     """Return the absolute socket path of an endpoint given as path or ``ipc://`` URL.
+
+    Parameters
+    ----------
+    endpoint
+        The path or URL.
+    longer
+        How many bytes a name beside it is longer, which must fit into a socket address, too.
 
     Raises
     ------
@@ -36,12 +83,15 @@ def endpoint_path(endpoint: str) -> str:
         For another transport, or a path longer than a socket address can hold (107 bytes).
     """
     path = endpoint.removeprefix("ipc://")
-    if "://" in path or not path or path.startswith("@"):
+    if "://" in path or not path or path.startswith("@") or "\0" in path:
         raise BadRequest(f"endpoint {endpoint!r} is not usable", hint="give a socket path or an ipc:// URL")
     absolute = os.path.abspath(path)
-    if len(os.fsencode(absolute)) > _SUN_PATH_BYTES:
+    nbytes, most = len(os.fsencode(absolute)), _SUN_PATH_BYTES - longer
+    if nbytes > most:
+        events = f", {longer} more for the socket of events beside it" if longer else ""
         raise BadRequest(
-            f"socket path {absolute} is longer than the {_SUN_PATH_BYTES} bytes a socket address holds",
-            hint="use a shorter --runtime-dir or --endpoint",
+            f"socket path {absolute} has {nbytes} bytes, and at most {most} may be used: a socket address"
+            f" holds {_SUN_PATH_BYTES}{events}",
+            hint="use a shorter directory or name: --runtime-dir, --instance or --endpoint",
         )
     return absolute

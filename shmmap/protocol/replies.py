@@ -39,7 +39,8 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
 
     ``session`` is the slot the client locks in every segment it opens.  Cell ids in replies are
     relative to ``id_prefix`` and segment names to ``segment_prefix``.  ``events`` is the path of the
-    socket that events leave by; empty where there is none.
+    socket that events leave by; empty where there is none.  ``(point + origin) / unit_m`` is a point
+    in the coordinate system ``crs`` of the files that the map was made of.
     """
 
     request: int
@@ -61,6 +62,9 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
     budget_bytes: int
     pid: int = 0
     events: str = ""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    crs: str = ""
+    unit_m: tuple[float, float] = (1.0, 1.0)
 
 
 class Handle(msgspec.Struct, array_like=True, frozen=True, gc=False):

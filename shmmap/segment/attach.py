@@ -29,7 +29,7 @@ from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
 from shmmap.optional_packages import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.header import read_columns, unpack_header
+from shmmap.segment.header import OUTSIDE, OUTSIDE_AT, read_columns, unpack_header
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
 from shmmap.segment.names import retired_name
 from shmmap.segment.owned import Owned
@@ -175,6 +175,11 @@ class AttachedSegment:
         if header is None:
             header = self._header = unpack_header(self.raw.data, len(self.raw))
         return header
+
+    @property
+    def outside_points(self) -> int:
+        """Points outside the cell's box; cheaper than the header."""
+        return int(OUTSIDE.unpack_from(self.raw.data, OUTSIDE_AT)[0])
 
     def column(self, index: int) -> NDArray[np.generic]:
         """Return column number ``index`` as a zero-copy array."""

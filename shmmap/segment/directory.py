@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import stat
 from collections.abc import Iterator
 
 from shmmap.errors import CannotStart
@@ -132,9 +133,13 @@ class ShmDirectory:
         step("daemon.unlinked")
         return True
 
-    def exists(self, name: str) -> bool:
-        """Whether there is such a name."""
-        return os.access(name.lstrip("/"), os.F_OK, dir_fd=self._fd, follow_symlinks=False)
+    def size_of(self, name: str) -> int:
+        """Length of a segment in bytes; -1 if it is gone, or if something else has its name."""
+        try:
+            status = os.stat(name.lstrip("/"), dir_fd=self._fd, follow_symlinks=False)
+        except OSError:
+            return -1
+        return status.st_size if stat.S_ISREG(status.st_mode) else -1
 
     def names(self, prefix: str) -> list[str]:
         """Names that start with ``prefix`` (slash included), sorted."""

@@ -27,13 +27,15 @@ from shmmap.segment.layout import (
     SourceStamp,
 )
 
-__all__ = ["check_start", "pack_header", "read_columns", "unpack_header"]
+__all__ = ["OUTSIDE", "OUTSIDE_AT", "check_start", "pack_header", "read_columns", "unpack_header"]
 
 MAGIC: Final = b"SHMMAP\x00\x01"
 BYTE_ORDER: Final = 0x01020304
 
 FIXED: Final = struct.Struct("<8sHHIQQQQQQqq16s4d2d3dIIIIIIIIIIII")
 LATTICE: Final = struct.Struct("<3d3q3Q")  # after the fixed part; all zero: no lattice
+OUTSIDE: Final = struct.Struct("<Q")  # after the lattice; since 1.3, before 0
+OUTSIDE_AT: Final = FIXED.size + LATTICE.size
 TABLE: Final = struct.Struct("<III")  # column count, offset of the table, bytes of a row
 TABLE_AT: Final = FIXED.size - 11 * 4
 CRC: Final = struct.Struct("<II")
@@ -85,6 +87,7 @@ def pack_header(header: SegmentHeader) -> bytes:
     if header.lattice is not None:
         leaf, first, shape_xyz = header.lattice
         LATTICE.pack_into(page, FIXED.size, *leaf, *first, *shape_xyz)
+    OUTSIDE.pack_into(page, OUTSIDE_AT, header.outside_points)
     end = header.header_bytes - TAIL_BYTES
     CRC.pack_into(page, end, zlib.crc32(memoryview(page)[:end]), 0)
     return bytes(page)
@@ -216,6 +219,7 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
         builder_version=builder_version,
         frame_id=_text(page[frame_at : frame_at + frame_bytes]),
         lattice=_unpack_lattice(page),
+        outside_points=OUTSIDE.unpack_from(page, OUTSIDE_AT)[0],
     )
 
 
@@ -227,8 +231,8 @@ def _shared_text(raw: bytes) -> str:
 def _text(raw: bytes | memoryview) -> str:
     try:
         return str(raw, "utf-8")
-    except UnicodeDecodeError as error:
-        raise SegmentCorrupt(f"{bytes(raw)!r} in the header is no UTF-8") from error
+    except UnicodeDecodeError:
+        raise SegmentCorrupt(f"{bytes(raw)!r} in the header is no UTF-8") from None
 
 
 def _unpack_lattice(page: memoryview) -> Lattice | None:

@@ -37,7 +37,7 @@ __all__ = [
     "plan_columns",
 ]
 
-LAYOUT_VERSION: Final = (1, 2)
+LAYOUT_VERSION: Final = (1, 3)
 PAGE_BYTES: Final = 4096
 ALIGNMENT_BYTES: Final = 64
 COLUMNS_OFFSET: Final = 512
@@ -132,7 +132,8 @@ class SegmentHeader(msgspec.Struct, frozen=True):
     ``box`` is the cell's (min_x, min_y, max_x, max_y); ``z_min``/``z_max`` bound the points and are
     NaN for an empty cell.  Coordinates in columns are relative to ``origin`` ((0, 0, 0) for
     `points`, which keeps the source's bits).  ``rows`` counts the points kept,
-    ``source_points`` those in the file, ``dropped_points`` those left out as not finite.
+    ``source_points`` those in the file, ``dropped_points`` those left out as not finite,
+    ``outside_points`` those kept although they lie outside ``box``.
     For a computed layer ``rows`` are its own (points, voxels), and ``lattice`` is what they lie on.
     """
 
@@ -153,6 +154,7 @@ class SegmentHeader(msgspec.Struct, frozen=True):
     builder_version: int = 0
     frame_id: str = "map"
     lattice: Lattice | None = None
+    outside_points: int = 0
 
 
 def _up(value: int, step: int) -> int:

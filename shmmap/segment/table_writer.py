@@ -23,8 +23,8 @@ __all__ = ["SegmentOrigin", "write_table"]
 class SegmentOrigin:
     """What a segment says about the cell and the file it was made from.
 
-    ``box`` (min_x, min_y, max_x, max_y) in metres; ``source_points`` and ``dropped_points`` count the
-    file's points and those left out as not finite.
+    ``box`` (min_x, min_y, max_x, max_y) in metres; ``source_points``, ``dropped_points`` and
+    ``outside_points`` count the file's points, those left out as not finite, those outside the box.
     """
 
     cell_id: str
@@ -34,6 +34,7 @@ class SegmentOrigin:
     source_digest: bytes
     source_points: int
     dropped_points: int
+    outside_points: int = 0
 
 
 def write_table(
@@ -91,6 +92,7 @@ def write_table(
         z_max=z_max,
         source_points=origin.source_points,
         dropped_points=origin.dropped_points,
+        outside_points=origin.outside_points,
         source=origin.source,
         source_digest=origin.source_digest,
         builder_version=builder_version,

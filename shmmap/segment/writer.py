@@ -110,6 +110,7 @@ class SegmentWriter:
         source_points: int,
         dropped_points: int,
         builder_version: int,
+        outside_points: int = 0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> SegmentHeader:
         """Write the header; the segment is whole after this.
@@ -137,6 +138,7 @@ class SegmentWriter:
             source_points=source_points,
             dropped_points=dropped_points,
             builder_version=builder_version,
+            outside_points=outside_points,
         )
         step("worker.header")
         write_all(self._fd, memoryview(pack_header(header)), 0)

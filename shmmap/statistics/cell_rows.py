@@ -34,7 +34,8 @@ class CellRow:
         Cell id without the daemon's ``id_prefix``.  Of an id longer than 104 bytes of UTF-8 the
         table keeps only the end, and ``id_cut`` says so.
     layer
-        Layer spec; of one longer than 40 bytes only the beginning is kept (``layer_cut``).
+        Layer spec; of one that fits into the row neither by itself nor behind the id only the beginning is
+        kept (``layer_cut``).
     version
         64-bit version, as in the handle.
     segment
@@ -72,6 +73,11 @@ class CellRow:
     layer_cut: bool = False
     ahead: bool = False
 
+    @property
+    def whole_layer(self) -> str:
+        """The layer, with a mark where its end is missing."""
+        return f"{self.layer}…" if self.layer_cut else self.layer
+
 
 def _fit(text: str, limit: int, *, keep_end: bool) -> tuple[bytes, bool]:
     data = text.encode("utf-8", "surrogateescape")
@@ -86,14 +92,18 @@ def _fit(text: str, limit: int, *, keep_end: bool) -> tuple[bytes, bool]:
 
 
 def pack_cell(row: CellRow) -> bytes:
-    """Return the 256 bytes of one cell row."""
+    """Return the 256 bytes of one cell row; what a long layer's field lacks lies behind the id."""
     cell_id, id_cut = _fit(row.id, ID_BYTES, keep_end=True)
-    layer, layer_cut = _fit(row.layer, LAYER_BYTES, keep_end=False)
+    whole = row.layer.encode("utf-8", "surrogateescape")
+    layer_cut = len(whole) > LAYER_BYTES
+    if len(cell_id) + len(whole) > ID_BYTES + LAYER_BYTES:
+        whole, _ = _fit(row.layer, LAYER_BYTES, keep_end=False)
+    layer, rest = whole[:LAYER_BYTES], whole[LAYER_BYTES:]
     flags = id_cut * ID_CUT + layer_cut * LAYER_CUT + row.ahead * AHEAD
     packed = CELL_ROW.pack(
         row.version, row.bytes, row.points, *row.box, row.hits, row.last_use_monotonic_ns, row.load_ns,
-        row.segment.encode(), CELL_STATES.index(row.state), flags, len(cell_id), len(layer), 0,
-        layer, cell_id, 0,
+        row.segment.encode(), CELL_STATES.index(row.state), flags, len(cell_id), len(whole), 0,
+        layer, cell_id + rest, 0,
     )  # fmt: skip
     return packed + struct.pack("<I", zlib.crc32(packed))
 
@@ -114,6 +124,9 @@ def unpack_cell(data: memoryview) -> CellRow | None:
     ) = CELL_ROW.unpack_from(data)  # fmt: skip
     if not state:
         return None
+    rest = max(0, layer_length - LAYER_BYTES)
+    if rest:
+        layer += cell_id[id_length : id_length + rest]
     return CellRow(
         id=cell_id[:id_length].decode("utf-8", "surrogateescape"),
         layer=layer[:layer_length].decode("utf-8", "surrogateescape"),
@@ -127,6 +140,6 @@ def unpack_cell(data: memoryview) -> CellRow | None:
         last_use_monotonic_ns=last_use,
         load_ns=load_ns,
         id_cut=bool(flags & ID_CUT),
-        layer_cut=bool(flags & LAYER_CUT),
+        layer_cut=bool(flags & LAYER_CUT) and not rest,
         ahead=bool(flags & AHEAD),
     )

@@ -155,6 +155,12 @@ COUNTERS: Final = (
     Counter(
         "live_restarts", "counter", "", "Times the process that keeps live maps ended, and was started anew"
     ),
+    Counter(
+        "cells_outside_box", "gauge", "", "Cells loaded with points outside their box; the log names them"
+    ),
+    Counter(
+        "sockets_missing", "gauge", "", "Sockets whose files others removed, and that cannot be made again"
+    ),
     *(
         Counter(f"longest_turn_{kind}_ns", "gauge", "ns", f"Longest turn in which {text}")
         for kind, text in TURN_KINDS.items()

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 MAGIC: Final = b"SHMSTAT\x01"
-LAYOUT_VERSION: Final = (1, 4)
+LAYOUT_VERSION: Final = (1, 5)
 BYTE_ORDER: Final = 0x01020304
 PAGE_BYTES: Final = 4096
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 from typing import Final
 
+from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
@@ -43,6 +44,8 @@ __all__ = ["StatisticsWriter"]
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
 _CLIENTS_A_PAGE = 16
+_RESTORE_AGAIN_S = 5.0
+_COPIED_BYTES = 4 << 20  # of a segment that is made again, in a millisecond
 
 
 def _always(nbytes: int) -> bool:
@@ -99,7 +102,10 @@ class StatisticsWriter:
         self.values["starting"] = int(starting)
         self.reserve: Callable[[int], bool] = _always
         self.name = statistics_name(instance)
+        self._instance = instance
         self._directory = directory
+        self._successor = -1  # takes the place of a file that others removed, once it has all that this has
+        self._restore_s = 0.0
         self._durations = {h.name: [0] * (1 + BUCKETS) for h in HISTOGRAMS}
         self._layout = plan(COUNTERS, HISTOGRAMS)
         self._packer = struct.Struct(f"<{len(COUNTERS)}q")
@@ -274,11 +280,8 @@ class StatisticsWriter:
 
     def _write(self, data: bytes, place: int) -> bool:
         """Write all of it; False if that cannot be done, which whoever asked tries again at a later beat."""
-        left = memoryview(data)
         try:
-            while left:
-                written = os.pwrite(self._fd, left, place)
-                left, place = left[written:], place + written
+            _write_whole(self._fd, data, place)
         except OSError as error:
             if not self._told:
                 self._told = True
@@ -287,6 +290,11 @@ class StatisticsWriter:
                         effect="cells are served as before, `shmmap top` and `health` show an older state",
                     )  # fmt: skip
             return False
+        if self._successor >= 0:
+            try:
+                _write_whole(self._successor, data, place)
+            except OSError:
+                self._give_up_successor()
         return True
 
     def _slot(self, key: Hashable) -> int | None:
@@ -323,18 +331,68 @@ class StatisticsWriter:
             return False
         return True
 
+    def restore(self, now_s: float) -> None:
+        """Make the segment again if others removed its file, a part of it at each call.
+
+        What has no name any more cannot get one again: its bytes are copied.
+        """
+        if self._successor < 0 and (now_s < self._restore_s or self._is_named()):
+            return
+        try:
+            if self._successor < 0:
+                self._begin_successor()
+            if self._copy_some():
+                take_name(self._directory, self._instance, self._successor)
+                os.close(self._fd)
+                self._fd, self._successor = self._successor, -1
+                log.warning("statistics made again", file=self._directory.path + self.name)
+        except (OSError, ShmmapError) as error:
+            log.warning("statistics cannot be made again", error=error)
+            self._give_up_successor()
+            self._restore_s = now_s + _RESTORE_AGAIN_S
+
+    def _begin_successor(self) -> None:
+        log.warning("statistics removed by another program", file=self._directory.path + self.name)
+        self._successor = self._directory.create()
+        status = os.fstat(self._fd)
+        if status.st_gid != os.fstat(self._successor).st_gid:
+            os.fchown(self._successor, -1, status.st_gid)
+        os.fchmod(self._successor, status.st_mode & 0o777)
+        hold(self._successor)
+
+    def _copy_some(self) -> bool:
+        """Copy a part to the successor; True once it has everything."""
+        at, end = os.lseek(self._successor, 0, os.SEEK_CUR), os.fstat(self._fd).st_size
+        return at + os.sendfile(self._successor, self._fd, at, min(end - at, _COPIED_BYTES)) >= end
+
+    def _give_up_successor(self) -> None:
+        if self._successor >= 0:
+            os.close(self._successor)
+            self._successor = -1
+
+    def _is_named(self) -> bool:
+        """Whether the segment's name is that of this file."""
+        try:
+            named = os.stat(self._directory.path + self.name, follow_symlinks=False)
+        except OSError:
+            return False
+        return os.path.samestat(named, os.fstat(self._fd))
+
     @property
     def size_bytes(self) -> int:
         """Memory the segment occupies, to be counted with the segments of cells."""
-        return measured_bytes(self._fd)
+        return measured_bytes(self._fd) + (measured_bytes(self._successor) if self._successor >= 0 else 0)
 
     def close(self) -> None:
-        """Remove the segment; a successor's of the same name stays."""
-        mine = os.fstat(self._fd)
-        try:
-            named = os.stat(f"{self._directory.path}{self.name}")
-        except FileNotFoundError:
-            named = None
-        if named is not None and (named.st_dev, named.st_ino) == (mine.st_dev, mine.st_ino):
+        """Remove the segment; what else has its name stays."""
+        if self._is_named():
             self._directory.unlink(self.name)
+        self._give_up_successor()
         os.close(self._fd)
+
+
+def _write_whole(fd: int, data: bytes, place: int) -> None:
+    left = memoryview(data)
+    while left:
+        written = os.pwrite(fd, left, place)
+        left, place = left[written:], place + written

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shmmap.daemon.loading.adoption import Adoption
+from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.layers.points import build_points
 from shmmap.segment.names import new_segment_name
 from shmmap.segment.publish_block import PublishBlock
@@ -75,7 +76,7 @@ def main() -> None:
             life = InnerDaemon(
                 str(made.root), budget_bytes=4 << 30, cache_dir=scratch, shm_dir=first.shm_dir, name="next"
             )
-            adoption = Adoption(life.cache, life.loads)
+            adoption = Adoption(life.cache, life.loads, MisplacedCells(life.cache))
             spent = milliseconds(lambda: adoption.take_over(life.now_s()))
             assert life.ledger.resident_count == options.segments
             life.leave()

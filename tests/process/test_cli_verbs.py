@@ -191,7 +191,9 @@ def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
         "1 segment kept, pinned by an operator (see `shmmap unpin`):",
         "  20_0.pcd: points",
     ]
-    assert re.search(r"evicted cell=\S*20_0\.pcd layer=points bytes=\d+ reason=request", shmmap.daemon.log)
+    waiting = Patience()
+    while waiting(re.search(r'cells evicted count=1 bytes=\d+ of="1 request"', shmmap.daemon.log) is None):
+        pass
     shmmap("unpin", "--all")
     assert shmmap.json("evict", "--all")["pinned"] == 0
 

@@ -11,6 +11,7 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -178,3 +179,24 @@ def cache_of(one: DaemonProcess) -> Path:
     """Where a daemon keeps its divided cloud."""
     (found,) = (one.cache_dir / "shmmap" / "divided").iterdir()
     return found
+
+
+def test_a_cloud_in_feet_is_refused_with_the_factor_or_converted(
+    daemon: DaemonFactory, connect: Connect, tmp_path: Path
+) -> None:
+    """As `divide` does it; the division is kept apart from those of other units."""
+    wkt = 'PROJCS["here (ftUS)",GEOGCS["G",DATUM["D"]],UNIT["US survey foot",0.3048006096012192]]'
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    las.x, las.y, las.z = np.arange(500.0), np.arange(500.0), np.full(500, 10.0)
+    las.write(str(tmp_path / "feet.las"))
+    one = daemon(tmp_path / "feet.las", start=False)
+    assert one.run_to_end() == 65
+    assert "not in metres: x, y and z are in US survey feet (0.304800609601 m)" in one.log
+    assert "--unit auto multiplies them by 0.304800609601" in one.log
+    for unit, farthest in (("auto", 499 * 1200 / 3937), ("m", 499.0)):
+        one = daemon(tmp_path / "feet.las", "--unit", unit)
+        reply = connect(one).area(circle(0.0, 0.0, 4000.0))
+        x = np.concatenate([read_pcd(Path(cell.id))["x"] for cell in reply.cells])
+        assert len(x) == 500
+        assert float(x.max()) == pytest.approx(farthest, abs=1e-3)

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,9 +20,11 @@ from shmmap_clients.elevation_map.build import BuildProgress, MapChanged
 from shmmap_clients.elevation_map.surface import surface_heights
 
 import shmmap
+from shmmap.origin.map_writer import MapWriter
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
 LONG_S = 120.0
@@ -238,3 +242,56 @@ def test_no_height_at_all_is_no_answer(daemon: Factory, divided_map: DividedMap,
     assert nothing.stderr.endswith("the map spans x -60 .. 60 m, y -60 .. 60 m\n")
     assert json.loads(nothing.stdout)["measured"] == 0
     assert elevation(*words, "--allow-empty").returncode == 0
+
+
+def a_map_of(folder: Path, *parts: NDArray[np.float32]) -> Path:
+    with MapWriter(folder, durable=False) as writer:
+        writer.add({"xyz": np.concatenate(parts)}, complete=True)
+        writer.finish()
+    return folder
+
+
+def ground(x: float, y: float, points: int = 40_000) -> NDArray[np.float32]:
+    """A square of 60 m, all of one height."""
+    xy = np.random.default_rng(0).uniform((x, y), (x + 60, y + 60), (points, 2))
+    return np.column_stack([xy, np.full(points, 2.5)]).astype(np.float32)
+
+
+@pytest.mark.parametrize("stray", [(9000.0, 9000.0), (40.0, -9e5)])
+def test_a_stray_point_is_named_and_costs_nothing(
+    daemon: Factory, tmp_path: Path, stray: tuple[float, float]
+) -> None:
+    points = np.array([[*stray, 100.0]], np.float32)
+    one = daemon(a_map_of(tmp_path / "map", ground(0, 0), points))
+    words = ["--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint, "--rule", "mean"]
+    words += ["--resolution", "0.5"]
+    done = elevation(*words, "--out", f"{tmp_path}/e.npz", f"{tmp_path}/e.tif", f"{tmp_path}/e.png")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["rows"] < 300 > document["columns"]
+    assert document["measured"] > 10_000
+    [far] = document["far"]
+    assert far["metres"] > 8000
+    assert done.stderr.startswith(f"shmmap-elevation: warning: {far['id']} lies ")
+    assert "km from all other cells" in done.stderr
+    written = sorted(path.name for path in tmp_path.glob("*e.*"))
+    assert written == ["e.npz", "e.pgw", "e.png", "e.png.json", "e.tif"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_no_unfinished_file(daemon: Factory, tmp_path: Path, number: signal.Signals) -> None:
+    """Two parts of a map kilometres apart: a large grid, whose file takes seconds to write."""
+    one = daemon(a_map_of(tmp_path / "map", ground(0, 0, 5000), ground(8000, 8000, 5000)))
+    (tmp_path / "out").mkdir()
+    words = ["--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint, "--out", f"{tmp_path}/out/e.npz"]
+    command = [sys.executable, "-m", "shmmap_clients.elevation_map", "build", "--quiet", *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        waiting = Patience()
+        while waiting(not any((tmp_path / "out").iterdir())):
+            time.sleep(0.01)
+        assert process.poll() is None
+        process.send_signal(number)
+        _, said = process.communicate(timeout=LONG_S)
+    assert process.returncode == 128 + number
+    assert said == ""
+    assert not list((tmp_path / "out").iterdir())

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import multiprocessing
 import multiprocessing.forkserver
 import multiprocessing.resource_tracker
@@ -40,9 +41,11 @@ EXAMPLES = {
 
 
 @pytest.fixture(autouse=True)
-def no_helpers_left() -> Iterator[None]:
-    """End the processes that `multiprocessing` keeps beside those that it spawns."""
+def no_helpers_left(served: DaemonProcess) -> Iterator[None]:
+    """End the processes that `multiprocessing` keeps, before the daemon is judged."""
+    del served
     yield
+    gc.collect()  # what a pool leaves to be collected begins the helpers again
     multiprocessing.forkserver._forkserver._stop()  # type: ignore[attr-defined]
     multiprocessing.resource_tracker._resource_tracker._stop()  # type: ignore[attr-defined]
 

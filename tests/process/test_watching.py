@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
 
-from shmmap import EventStream, connect
+import numpy as np
+import pytest
+
+from shmmap import CellSet, EventStream, connect
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -67,3 +73,136 @@ def test_without_the_setting_nothing_is_watched(daemon: DaemonFactory, divided_m
         client.reload()
         assert next_reload(stream).changed == 1
         assert client.stats().counters["reloads"] == 1
+
+
+# --- links ------------------------------------------------------------------------------------------
+
+OLD, NEW = 500, 40
+"""Points of each cell in the two maps."""
+
+
+def switch(link: Path, target: str) -> None:
+    """Have a link lead somewhere else, in one step."""
+    interim = link.with_name(link.name + ".next")
+    interim.symlink_to(target)
+    interim.rename(link)
+
+
+def map_itself(root: Path) -> tuple[Path, Callable[[], object]]:
+    """``current`` leads to the map."""
+    (root / "current").symlink_to("v1")
+    return root / "current", lambda: switch(root / "current", "v2")
+
+
+def parent(root: Path) -> tuple[Path, Callable[[], object]]:
+    """``releases/current`` leads to a directory that has the map in it, by an absolute path."""
+    for version in ("v1", "v2"):
+        (root / "releases" / version).mkdir(parents=True)
+        (root / version).rename(root / "releases" / version / "map")
+    link = root / "releases" / "current"
+    link.symlink_to(root / "releases" / "v1")
+    return link / "map", lambda: switch(link, str(root / "releases" / "v2"))
+
+
+def two_links(root: Path) -> tuple[Path, Callable[[], object]]:
+    """A link leads to the link that is switched."""
+    (root / "stable").symlink_to("v1")
+    (root / "current").symlink_to("./stable")
+    return root / "current", lambda: switch(root / "stable", "v2")
+
+
+def cells_alone(root: Path) -> tuple[Path, Callable[[], object]]:
+    """The map's directory stays, its directory of cells is a link."""
+    (root / "map").mkdir()
+    (root / "v1" / "pointcloud_map_metadata.yaml").rename(root / "map" / "pointcloud_map_metadata.yaml")
+    link = root / "map" / "pointcloud_map.pcd"
+    link.symlink_to("../v1/pointcloud_map.pcd")
+    return root / "map", lambda: switch(link, "../v2/pointcloud_map.pcd")
+
+
+def kubernetes(root: Path) -> tuple[Path, Callable[[], object]]:
+    """A volume: each name is a link through ``..data``, which leads to a directory that is new each time."""
+    volume = root / "volume"
+    volume.mkdir()
+    (root / "v1").rename(volume / "..2026_01")
+    (root / "v2").rename(volume / "..2026_02")
+    (volume / "..data").symlink_to("..2026_01")
+    for name in ("pointcloud_map.pcd", "pointcloud_map_metadata.yaml"):
+        (volume / name).symlink_to(f"..data/{name}")
+    return volume, lambda: switch(volume / "..data", "..2026_02")
+
+
+def flat_kubernetes(root: Path) -> tuple[Path, Callable[[], object]]:
+    """The cells themselves are the links."""
+    volume = root / "volume"
+    volume.mkdir()
+    for version, name in (("v1", "..2026_01"), ("v2", "..2026_02")):
+        (root / version / "pointcloud_map.pcd").rename(volume / name)
+        (root / version / "pointcloud_map_metadata.yaml").rename(
+            volume / name / "pointcloud_map_metadata.yaml"
+        )
+    (volume / "..data").symlink_to("..2026_01")
+    for name in os.listdir(volume / "..data"):
+        (volume / name).symlink_to(f"..data/{name}")
+    return volume, lambda: switch(volume / "..data", "..2026_02")
+
+
+def renamed(root: Path) -> tuple[Path, Callable[[], object]]:
+    """No link at all: the directory above gets another name, and another one gets its."""
+    (root / "maps").mkdir()
+    (root / "next").mkdir()
+    (root / "v1").rename(root / "maps" / "map")
+    (root / "v2").rename(root / "next" / "map")
+
+    def exchange() -> None:
+        (root / "maps").rename(root / "before")
+        (root / "next").rename(root / "maps")
+
+    return root / "maps" / "map", exchange
+
+
+def removed(root: Path) -> tuple[Path, Callable[[], object]]:
+    """The link is switched, and the old map removed at once."""
+    (root / "current").symlink_to("v1")
+
+    def go_on() -> None:
+        switch(root / "current", "v2")
+        shutil.rmtree(root / "v1")
+
+    return root / "current", go_on
+
+
+WAYS = [map_itself, parent, two_links, cells_alone, kubernetes, flat_kubernetes, renamed, removed]
+
+
+def sizes(cells: CellSet) -> set[int]:
+    assert cells.pending == ()
+    return {len(cell.xyz) for cell in cells}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("watch", [True, False])
+def test_a_link_that_leads_to_another_map(
+    daemon: DaemonFactory, tmp_path: Path, way: Callable[..., tuple[Path, Callable[[], object]]], watch: bool
+) -> None:
+    """One map after the other, never a mixture of both; ids stay the paths as given."""
+    names = sorted(make_map(tmp_path / "v1", points=OLD).corners)
+    make_map(tmp_path / "v2", points=NEW, seed=2)
+    path, change = way(tmp_path)
+    one = daemon(path, *(["--watch"] if watch else []))
+    with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
+        assert sizes(client.selected(names[:12], wait=30.0)) == {OLD}
+        assert client.welcome.id_prefix.startswith(f"{path}/")
+        change()
+        if not watch and way is not removed:
+            cells = client.selected(names, wait=30.0)  # most of them have not been read yet
+            assert (len(cells), sizes(cells)) == (36, {OLD})
+        if not watch:
+            client.reload()
+        while (told := next_reload(stream)).error:
+            pass  # it was looked for in between
+        assert (told.changed, told.added, told.removed) == (36, 0, 0)
+        cells = client.selected(names, wait=30.0)
+        assert (len(cells), sizes(cells)) == (36, {NEW})
+        assert all(cell.id.startswith(f"{path}/") for cell in cells)
+    assert "/proc/self/fd" not in one.log

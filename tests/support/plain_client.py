@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import mmap
 import os
@@ -56,8 +57,13 @@ def socket_paths(environ: Mapping[str, str]) -> list[str]:
     name = (environ.get("SHMMAP_INSTANCE") or "default") + ".sock"
     if directory := environ.get("SHMMAP_RUNTIME_DIR"):
         return [os.path.join(os.getcwd(), directory, name)]
-    own = environ.get("XDG_RUNTIME_DIR")
-    return [*([f"{own}/shmmap/{name}"] if own else []), f"/run/shmmap/{name}"]
+    own = environ.get("XDG_RUNTIME_DIR", "")
+    found = [f"{own}/shmmap/{name}"] if own.startswith("/") else []
+    with contextlib.suppress(FileNotFoundError):
+        status = os.lstat(f"/tmp/shmmap-{os.geteuid()}")
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077:
+            found.append(f"/tmp/shmmap-{os.geteuid()}/{name}")
+    return [*found, f"/run/shmmap/{name}"]
 
 
 def connect_first(paths: list[str]) -> socket.socket:

@@ -29,6 +29,7 @@ BASE = {
     "processes",
     "geometry",
     "quantities",
+    "lacking",
     "optional_packages",
     "kernel_cache",
     "compiling",
@@ -42,6 +43,7 @@ PARTS = {
     "failpoints": set[str](),
     "logfmt": set[str](),
     "quantities": set[str](),
+    "lacking": {"errors", "geometry", "quantities"},
     "processes": set[str](),
     "geometry": {"errors"},
     "optional_packages": {"errors"},
@@ -58,8 +60,8 @@ PARTS = {
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},
     "client": {
-        "errors", "columns", "failpoints", "geometry", "optional_packages", "chunks", "segment", "protocol",
-        "statistics.layout",
+        "errors", "columns", "failpoints", "geometry", "lacking", "optional_packages", "chunks", "segment",
+        "protocol", "statistics.layout",
     },
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
@@ -69,7 +71,7 @@ PARTS = {
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
         "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
-        "daemon.pins.probe", "daemon.service_manager",
+        "daemon.pins.probe", "daemon.service_manager", "daemon.host.budget",
     },
     "simulation": BASE | {"formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},

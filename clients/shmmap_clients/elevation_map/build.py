@@ -183,7 +183,7 @@ def _build(
     begun = state.done
     for number in range(state.done, len(order)):
         if number + 1 < len(order):  # the daemon loads it while we compute
-            client.selected((listing[order[number + 1]].id,), rule.layer, wait=None)
+            client.selected((listing[order[number + 1]].id,), rule.layer, wait=None, strict=None)
         cell = _load(client, listing[order[number]], rule.layer, wait_s, failed, listing.map_version)
         rows = None
         if cell is not None:
@@ -215,7 +215,7 @@ def _load(
     client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError], map_version: int
 ) -> Cell | None:
     """The cell in the state of the map that was listed; None if it cannot be loaded, which is remembered."""
-    answer = client.selected((info.id,), layer, wait=wait_s)
+    answer = client.selected((info.id,), layer, wait=wait_s, strict=None)
     if answer.failed:
         failed += answer.failed
         return None

@@ -34,7 +34,7 @@ def far_cells(boxes: NDArray[np.float64], sizes: NDArray[np.int64]) -> NDArray[n
     (N,) float64, metres to the nearest cell of the map; 0 for the map's own cells.
     """
     parts = _parts(boxes)
-    held = np.bincount(parts, weights=sizes.astype(np.float64))
+    held = np.bincount(parts, weights=sizes if sizes.any() else np.ones(len(sizes)))
     few = min(max(_SHARE * held.sum(), _FEW_BYTES), held.max() / 10)
     own = (held > few)[parts]
     far = np.zeros(len(boxes))

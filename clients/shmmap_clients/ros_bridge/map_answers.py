@@ -99,7 +99,9 @@ class MapAnswers:
         if isinstance(message, GetPartialRequest):
             area = sensible(message.area)
             if area is not None and self._is_small(message.area):
-                cells: Sequence[Cell] = self._all(lambda wait: self._client.area(area, wait=wait))
+                cells: Sequence[Cell] = self._all(
+                    lambda wait: self._client.area(area, wait=wait, strict=None)
+                )
             else:
                 cells = self._selected(self._touched(message.area))
         else:
@@ -116,7 +118,7 @@ class MapAnswers:
         held = self._requesters.held(requester, message.cached_ids, self._catalogue.versions)
         area = sensible(message.area)
         if area is not None and _is_one_slice(message.cached_ids) and self._is_small(message.area):
-            found = self._all(lambda wait: self._client.differential(area, held, wait=wait))
+            found = self._all(lambda wait: self._client.differential(area, held, wait=wait, strict=None))
             cells: Sequence[Cell] = found
             removed: Collection[str] = found.removed
         else:
@@ -156,7 +158,7 @@ class MapAnswers:
             raise TooLarge(f"{len(ids):,} cells in one request", hint=f"ask for at most {_MOST_CELLS:,}")
         found: list[Cell] = []
         for some in _slices(ids):
-            found += self._all(lambda wait, some=some: self._client.selected(some, wait=wait))  # type: ignore[misc]
+            found += self._all(lambda wait, some=some: self._client.selected(some, wait=wait, strict=None))  # type: ignore[misc]
         return found
 
     def _all(self, ask: Callable[[float], CellSet]) -> CellSet:

@@ -57,7 +57,7 @@ class StatusFile:
         self._fd = -1
         self._written = 0
         own = os.environ.get("XDG_RUNTIME_DIR", "")
-        for place in (os.path.dirname(endpoint), f"{own}/shmmap" if own else ""):
+        for place in (os.path.dirname(endpoint), f"{own}/shmmap" if own.startswith("/") else ""):
             if place and self._take(f"{place}/{status_name(instance, domain)}"):
                 return
 

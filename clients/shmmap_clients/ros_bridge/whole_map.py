@@ -52,7 +52,7 @@ def whole_map(
     most = min(most_bytes, MOST_BYTES) - _HEAD_BYTES
     read_bytes = 0
     for info in cells:
-        found = client.selected([info.id], wait=wait_s).raise_for_failures()
+        found = client.selected([info.id], wait=wait_s, strict=None).raise_for_failures()
         if not found.complete or not found:
             raise LoadFailed(f"{info.id}: not loaded after {wait_s:g} s", cell_id=info.id, layer="points")
         read_bytes += info.source_bytes

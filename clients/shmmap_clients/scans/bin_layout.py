@@ -75,7 +75,7 @@ class BinLayout:
                     f"{word.strip()!r} is no column of a .bin",
                     hint="NAME or NAME:TYPE, with a type of f4, f8, i1 to i8, u1 to u8",
                 )
-            columns.append((name, np.dtype(kind).newbyteorder("<" if kind[0] not in "<>" else kind[0]).str))
+            columns.append((name, np.dtype(kind if kind[0] in "<>" else f"<{kind}").str))
         names = [name for name, _ in columns if name != "_"]
         if len(names) != len({*names}) or not {"x", "y", "z"} <= {*names} or "xyz" in names:
             raise BadRequest(

@@ -112,7 +112,7 @@ class ScanReader:
         if self.min_range is None:
             return columns, None
         xyz = columns["xyz"]
-        finite = np.isfinite(xyz).all(axis=1)
+        finite = np.asarray(np.isfinite(xyz).all(axis=1))
         with np.errstate(over="ignore", invalid="ignore"):
             # NaN is no nearer than anything
             near = np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64, casting="unsafe") < self.min_range**2

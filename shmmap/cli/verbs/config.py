@@ -25,7 +25,7 @@ Exit code: 0 good, 66 no map there, 78 a mistake: the codes that the daemon woul
 
 _CHOSEN = {
     "metadata": "beside or inside the map",
-    "runtime_dir": "/run/shmmap, or $XDG_RUNTIME_DIR/shmmap for a user's daemon",
+    "runtime_dir": "/run/shmmap; a user's daemon: $XDG_RUNTIME_DIR/shmmap, else /tmp/shmmap-UID",
     "endpoint": "INSTANCE.sock in the runtime directory",
     "group": "only the daemon's own user may connect",
     "admin_group": "only root and the daemon's own user",

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.options import Subparsers, add_json_option, add_verb, numbers, size_bytes
+from shmmap.cli.options import Subparsers, add_json_option, add_unit_options, add_verb, numbers, size_bytes
 from shmmap.cli.program import complain
 from shmmap.cli.screens.work_result import fields_text, print_result
 
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "metres", "run", "translation"]
 
 _EPILOG = """\
-IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb) or a directory
-of files; all together become one map.  PCD, LAS and LAZ may be larger than memory.
+IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb, or a table of
+numbers: .txt .csv .asc) or a directory of files, tables left out; all together become one map.  Files may
+be larger than memory.
 A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite are
 left out and counted.  All fields are kept, with their types, unless --fields names those to keep.
 OUT appears complete or not at all.  Autoware's map loader reads it.
@@ -27,7 +28,8 @@ JSON (fields may be added, none is removed):
    "origin": [x, y, z] to add to come back to the frame of the inputs, "cell_size", "leaf", "order",
    "encoding", "fields": [[name, dtype]], "bounds": [[x, y, z], [x, y, z]],
    "sources": [{"path", "size", "mtime_ns", "ctime_ns", "points"}], "notes": [text],
-   "resumed_points", "seconds", "peak_memory_bytes"}
+   "resumed_points", "crs": name of the inputs' coordinate system, "unit_m": [metres per unit of the inputs
+   in the plane, in height], "seconds", "peak_memory_bytes"}
 Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no such input,
 73 OUT cannot be written, 75 another run is making OUT."""
 
@@ -66,6 +68,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "float32 would lose more than 0.5 mm where they are, as `serve` does with a cloud; none keeps their "
         "frame, in float64 where needed",
     )
+    add_unit_options(points)
     points.add_argument(
         "--leaf",
         metavar="METRES",
@@ -128,6 +131,8 @@ def run(args: argparse.Namespace) -> int:
         cell_size=args.cell_size,
         origin=(origin_x, origin_y),
         translate=args.translate,
+        unit=args.unit or "",
+        vertical_unit=args.vertical_unit or "",
         leaf=args.leaf,
         prefix=args.prefix,
         encoding=args.encoding,
@@ -176,6 +181,8 @@ def _lines(made: DividedMap) -> list[tuple[str, str]]:
         ("points", f"{made.points:,} of {made.points_read:,} read{left_out}"),
         ("fields", fields_text(made.fields)),
     ]
+    if made.crs:
+        lines.append(("crs", made.crs))
     if made.resumed_points:
         lines.append(("resumed", f"after {made.resumed_points:,} points"))
     return [*lines, *(("note", note) for note in made.notes)]

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import print_hanging, print_json
+from shmmap.errors import NoSocket
 
 if TYPE_CHECKING:
     from shmmap.doctor.finding import Finding
@@ -53,11 +55,10 @@ def run(args: argparse.Namespace) -> int:
     from shmmap.doctor.patient import examine
 
     file = args.config or installed_config_file()
-    flags = {
-        "instance": daemon_address.instance(args) if args.instance or daemon_address.endpoint(args) else None,
-        "endpoint": daemon_address.endpoint(args),
-        "shm_dir": args.shm_dir,
-    }
+    flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}
+    if flags["endpoint"]:
+        with contextlib.suppress(NoSocket):
+            flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
         print_json({"worst": worst(findings), "findings": [asdict(one) for one in findings]})

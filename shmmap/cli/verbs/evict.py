@@ -6,11 +6,17 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
-from shmmap.cli.near_cells import near_cells_hint, print_near_cells
+from shmmap.cli.areas import (
+    add_cells_argument,
+    cells_meant,
+    check_cells_argument,
+    no_cell_there,
+    print_near_cells,
+)
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import counted, print_json, print_line
+from shmmap.lacking import near_cells_hint
 
 if TYPE_CHECKING:
     from shmmap.client.client import Client

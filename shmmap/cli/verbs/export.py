@@ -8,13 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from shmmap.cli.areas import add_area_or_ids, area_from, area_text, no_cell_there
-from shmmap.cli.near_cells import near_cells_hint, print_near_cells
+from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
-from shmmap.cli.screens.refusals import NOT_COVERED, failure_lines, unknown_ids
 from shmmap.errors import BadRequest
+from shmmap.lacking import NOT_COVERED, area_text, failure_lines, near_cells_hint, unknown_ids
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,7 +75,10 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--crop needs an area", hint="add --circle, --square or --box")
     kind = _format(args)
     with connect(args) as client:
-        found = client.area(area, wait=args.wait) if area else client.selected(args.id, wait=args.wait)
+        if area:
+            found = client.area(area, wait=args.wait, strict=None)
+        else:
+            found = client.selected(args.id, wait=args.wait, strict=None)
         if not found.complete:
             _complain_of(found, args.wait)
             print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))

@@ -25,6 +25,7 @@ from shmmap.errors import MapDataError, MapMissing
 
 if TYPE_CHECKING:
     from shmmap.formats.cloud import CloudDescription
+    from shmmap.formats.coordinate_system import CoordinateSystem
 
 __all__ = ["add_parser", "run"]
 
@@ -33,12 +34,20 @@ _JSON = """\
    "dropped": how many of them are not finite (NOT FINITE), "width", "height",
    "fields": [{"name": "xyz" for x, y and z, "dtype": as numpy writes it, "count": values per point, "unit"}],
    "bounds": {"min": [x, y, z], "max": [x, y, z]} of the finite points, null when there are none,
-   "viewpoint": [x, y, z, qw, qx, qy, qz], "warnings": [text]}
+   "viewpoint": [x, y, z, qw, qx, qy, qz], "warnings": [text],
+   "crs": {"name", "epsg": 0 when not said, "geographic": x and y are degrees,
+           "unit_m": [metres per unit of x and y, of z], "units": [name, name]}, null when nothing is said}
 Of a directory:
   {"path", "files": [the same of each file], "failed": [{"path", "message"}], "points", "dropped",
-   "file_bytes", "bounds": sums and bounds of all files}
+   "file_bytes", "bounds": sums and bounds of all files,
+   "map": of a divided map, else null: {"cells", "outside_box": [{"path", "box": [x0, y0, x1, y1]}] of cells
+          with points outside their box, "far": [text] on cells far from all others, "origin": [x, y, z] to
+          add to come back to the frame of the clouds it was divided from, "crs", "unit_m" as of
+          `divide --json`, "problems": [text]}}
 Exit code: 0; 1 when there is no finite point, 65 bad data (the message has path, byte offset and cause),
 66 no such file, or no cloud in the directory."""
+
+_NAMED_OUTSIDE = 10
 
 _FILES = (
     Column("FILE"),
@@ -68,7 +77,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "path",
         metavar="PATH",
-        help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb, or a directory of such files",
+        help="a PCD file, or .las .laz .ply .pts .xyz .xyzn .xyzrgb .txt .csv .asc, or a directory of files",
     )
     add_allow_empty(parser)
     add_json_option(parser)
@@ -130,6 +139,7 @@ def _directory(args: argparse.Namespace) -> int:
     points, dropped = sum(one.points for one in found), sum(one.dropped for one in found)
     nbytes = sum(one.file_bytes for one in found)
     bounds = _all_bounds(found)
+    served = _as_map(args.path, found)
     if args.json:
         print_json(
             {
@@ -140,6 +150,7 @@ def _directory(args: argparse.Namespace) -> int:
                 "dropped": dropped,
                 "file_bytes": nbytes,
                 "bounds": bounds,
+                "map": served,
             }
         )
     else:
@@ -152,6 +163,7 @@ def _directory(args: argparse.Namespace) -> int:
                 ("size", format_bytes(nbytes)),
                 *_bounds_lines(bounds),
                 *_grouped_warnings(found),
+                *_map_lines(served),
             ]
         )
     for _, message in failed:
@@ -161,6 +173,70 @@ def _directory(args: argparse.Namespace) -> int:
     if bounds is None:
         return nothing_found(args, f"{args.path}: no finite point in {counted(len(found), 'file')}")
     return 0
+
+
+def _as_map(path: str, found: list[CloudDescription]) -> dict[str, Any] | None:
+    """What the metadata says of files as cells of a map, and where it is wrong; None where there is none."""
+    import numpy as np
+
+    from shmmap.layers.outside import OutsideBox
+    from shmmap.origin.far_cells import far_cells_notes
+    from shmmap.origin.map_directory import open_map
+    from shmmap.origin.map_layout import absolute_path, find_layout
+
+    try:
+        if find_layout(absolute_path(path), None, ()).metadata is None:
+            return None
+        catalogue = open_map(path).load(fresh=True)
+    except (MapDataError, MapMissing) as error:
+        return {"cells": 0, "outside_box": [], "far": [], "problems": [error.message]}
+    cells: list[tuple[CloudDescription, tuple[float, float, float, float]]] = []
+    for one in found:
+        index = catalogue.find(os.path.abspath(one.path))
+        if index is not None:
+            cells.append((one, catalogue.box(index)))
+    outside = []
+    for one, box in cells:
+        corners = np.array(one.bounds)
+        checked = OutsideBox(box)
+        checked.add(corners, (corners[0], corners[1]))
+        if checked.count:
+            outside.append({"path": one.path, "box": list(box)})
+    far = far_cells_notes(
+        np.array([box[:2] for _, box in cells]).reshape(-1, 2),
+        max(catalogue.mean_size),
+        [os.path.basename(one.path) for one, _ in cells],
+        [one.points for one, _ in cells],
+    )
+    return {
+        "cells": len(catalogue),
+        "outside_box": outside,
+        "far": far,
+        "origin": list(catalogue.frame.origin),
+        "crs": catalogue.frame.crs,
+        "unit_m": list(catalogue.frame.unit_m),
+        "problems": list(catalogue.problems),
+    }
+
+
+def _map_lines(served: dict[str, Any] | None) -> list[tuple[str, str]]:
+    if served is None:
+        return []
+    lines = [("map", counted(served["cells"], "cell"))] if served["cells"] else []
+    if served.get("crs"):
+        lines.append(("crs", served["crs"]))
+    if any(served.get("origin", ())):
+        x, y, z = map(format_metres, served["origin"])
+        lines.append(("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from"))
+    outside = served["outside_box"]
+    for one in outside[:_NAMED_OUTSIDE]:
+        min_x, min_y, max_x, max_y = one["box"]
+        box = f"x {min_x:g} .. {max_x:g}, y {min_y:g} .. {max_y:g}"
+        what = f"{os.path.basename(one['path'])} has points outside its box {box}"
+        lines.append(("outside", f"{what}: was it moved, and the metadata not?"))
+    if len(outside) > _NAMED_OUTSIDE:
+        lines.append(("outside", f"and {len(outside) - _NAMED_OUTSIDE:,} more cells"))
+    return [*lines, *(("far", text) for text in served["far"]), *(("problem", t) for t in served["problems"])]
 
 
 def _row(found: CloudDescription, directory: str) -> list[str]:
@@ -232,14 +308,44 @@ def _as_json(found: CloudDescription) -> dict[str, Any]:
         "bounds": _bounds(found),
         "viewpoint": list(found.viewpoint),
         "warnings": list(found.warnings),
+        "crs": _crs_json(found.crs),
     }
 
 
-def _bounds_lines(bounds: dict[str, list[float]] | None) -> list[tuple[str, str]]:
+def _crs_json(crs: CoordinateSystem | None) -> dict[str, Any] | None:
+    if crs is None:
+        return None
+    return {
+        "name": crs.name,
+        "epsg": crs.epsg,
+        "geographic": crs.geographic,
+        "unit_m": [unit.metres for unit in crs.units],
+        "units": [unit.name for unit in crs.units],
+    }
+
+
+def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
+    """Name and units of a file's system; of its warnings nothing is said twice."""
+    if crs is None:
+        return []
+    from shmmap.formats.degrees import units_text
+
+    said = "x and y are in degrees" if crs.geographic else units_text(*crs.units)
+    unsaid = "" if crs.geographic or crs.plane is not None else " (taken so: the file does not say)"
+    return [("crs", crs.label or "without a name"), ("units", said + unsaid)]
+
+
+def _in_metres(crs: CoordinateSystem | None) -> bool:
+    """Whether coordinates are in metres, as far as the file says."""
+    return crs is None or not (crs.geographic or any(unit.metres != 1.0 for unit in crs.units))
+
+
+def _bounds_lines(bounds: dict[str, list[float]] | None, metric: bool = True) -> list[tuple[str, str]]:
     if bounds is None:
         return [("bounds", "none: no finite point")]
+    unit = " m" if metric else ""
     return [
-        (axis, f"{low:.3f} .. {high:.3f} m ({high - low:.3f} m)")
+        (axis, f"{low:.3f} .. {high:.3f}{unit} ({high - low:.3f}{unit})")
         for axis, low, high in zip("xyz", bounds["min"], bounds["max"], strict=True)
     ]
 
@@ -252,7 +358,8 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))
-    lines += _bounds_lines(_bounds(found))
+    lines += _bounds_lines(_bounds(found), _in_metres(found.crs))
+    lines += _crs_lines(found.crs)
     if tuple(found.viewpoint) != (0, 0, 0, 1, 0, 0, 0):
         lines.append(("viewpoint", " ".join(f"{value:g}" for value in found.viewpoint)))
     lines += [("warning", warning) for warning in found.warnings]

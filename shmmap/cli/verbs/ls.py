@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
+from shmmap.cli.areas import add_area_options, area_from, around, those_in
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import (
@@ -19,6 +19,7 @@ from shmmap.cli.screens.output import (
     print_table,
 )
 from shmmap.errors import DaemonUnreachable
+from shmmap.lacking import area_text, extent_text
 
 if TYPE_CHECKING:
     from shmmap.statistics.cell_rows import CellRow
@@ -158,7 +159,7 @@ def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[s
     return {
         "id": f"…{row.id}" if row.id_cut else id_prefix + row.id,
         "version": f"{row.version:016x}",
-        "layer": row.layer,
+        "layer": row.whole_layer,
         "state": row.state,
         "segment": retired_name(segment) if row.state == "zombie" else segment,
         "ahead": row.ahead,
@@ -183,7 +184,7 @@ def _as_text(row: CellRow, now_ns: int) -> list[str]:
         format_metres(row.box[1]),
         f"{format_metres(max(row.box[2] - row.box[0], row.box[3] - row.box[1]))} m",
         _shown_state(row),
-        row.layer,
+        row.whole_layer,
         f"{row.points:,}",
         format_bytes(row.bytes),
         f"{row.hits:,}",

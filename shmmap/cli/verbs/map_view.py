@@ -10,11 +10,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from shmmap.cli.areas import add_area_options, area_from, area_text, around, extent_text, those_in
+from shmmap.cli.areas import add_area_options, area_from, around, those_in
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import counted, format_bytes, print_hanging, print_line, wants_style
 from shmmap.errors import DaemonUnreachable
+from shmmap.lacking import area_text, extent_text
 
 if TYPE_CHECKING:
     from shmmap.cli.screens.map_scene import BoxTuple, Scene

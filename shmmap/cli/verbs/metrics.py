@@ -35,10 +35,11 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print one scrape."""
-    from shmmap.cli.daemon_address import instance, shm_dir
+    from shmmap.cli.daemon_address import locate
     from shmmap.statistics.prometheus import exposition
     from shmmap.statistics.reader import read_statistics
 
-    found = read_statistics(instance(args), shm_dir(args))
-    sys.stdout.write(exposition(found, instance(args)))
+    name, directory = locate(args)
+    found = read_statistics(name, directory)
+    sys.stdout.write(exposition(found, name))
     return DaemonUnreachable.exit_code if found.state in ("absent", "dead") else 0

@@ -5,7 +5,15 @@ from __future__ import annotations
 
 import argparse
 
-from shmmap.cli.options import Subparsers, add_json_option, add_layer_option, add_verb, at_least, size_bytes
+from shmmap.cli.options import (
+    Subparsers,
+    add_json_option,
+    add_layer_option,
+    add_unit_options,
+    add_verb,
+    at_least,
+    size_bytes,
+)
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -47,6 +55,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
     )
+    add_unit_options(parser)
     parser.add_argument(
         "--workers",
         metavar="N",
@@ -83,7 +92,10 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--cache-size 0 keeps no layer", hint="name a size such as 512M or 2G")
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
-    origin = find_origin(args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir)
+    origin = find_origin(
+        args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir,
+        unit=args.unit or "", vertical_unit=args.vertical_unit or "",
+    )  # fmt: skip
     layers = canonical_layers(args.layer)
     catalogue = origin.load(fresh=True)
     done = prepare_map(

@@ -7,8 +7,7 @@ import argparse
 import re
 from typing import TYPE_CHECKING
 
-from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there
-from shmmap.cli.near_cells import near_cells_hint, print_near_cells
+from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
 from shmmap.cli.options import (
     Subparsers,
     add_daemon_options,
@@ -29,8 +28,9 @@ from shmmap.cli.screens.output import (
     print_table,
     rows_text,
 )
-from shmmap.cli.screens.refusals import NOT_COVERED, failure_lines, holder_rows, unknown_ids
+from shmmap.cli.screens.refusals import holder_rows
 from shmmap.errors import BadRequest
+from shmmap.lacking import NOT_COVERED, failure_lines, near_cells_hint, pending_lines, unknown_ids
 
 if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
@@ -112,11 +112,11 @@ def run(args: argparse.Namespace) -> int:
     layers = layers_from(args)
     with connect(args) as client:
         if area is None:
-            found = client.selected(args.id, layers, wait=args.wait)
+            found = client.selected(args.id, layers, wait=args.wait, strict=None)
         elif held_given:
-            found = client.differential(area, held, layers, wait=args.wait)
+            found = client.differential(area, held, layers, wait=args.wait, strict=None)
         else:
-            found = client.area(area, layers, wait=args.wait)
+            found = client.area(area, layers, wait=args.wait, strict=None)
         welcome = client.welcome
         if args.json:
             print_json(_as_json(found, welcome.frame_id))
@@ -214,8 +214,8 @@ def _print_text(found: CellSet, id_prefix: str, *, summed: bool) -> None:
         )
     for cell_id in found.removed:
         print_line(f"removed: {cell_id}")
-    for pending in found.pending:
-        print_line(f"pending: {pending.id} ({pending.layer})")
+    for line in pending_lines(found.pending):
+        print_line(line)
     for line in failure_lines(found.failed):
         indent = len(line) - len(line.lstrip())
         print_hanging(line[:indent], line[indent:])

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 
-from shmmap.cli.options import Subparsers, add_verb
+from shmmap.cli.options import Subparsers, add_unit_options, add_verb
 
 __all__ = ["add_parser", "run"]
 
@@ -21,7 +21,8 @@ by how much.  To keep its frame: `shmmap divide --translate none`, and serve tha
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
 its next start (a restart sends it first, then SIGTERM as usual; in a container: --stop-signal USR1);
-SIGHUP reads the map again.
+SIGHUP reads the map again; where the daemon was started at a terminal it stops it, as when that is closed
+(not under nohup or a service manager).
 Exit code: 0 after a signal, 65 bad map, 66 no map there, 71 something is full, missing or in the way, 75 the
 instance runs already, 78 bad setting."""
 
@@ -43,6 +44,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--strict", action="store_true", default=None, help="refuse what Autoware's own loader refuses"
     )
+    add_unit_options(parser)
     parser.add_argument(
         "--watch",
         action="store_true",
@@ -69,8 +71,8 @@ def add_parser(subparsers: Subparsers) -> None:
     place.add_argument(
         "--runtime-dir",
         metavar="DIR",
-        help="directory of the request socket (default: /run/shmmap, or $XDG_RUNTIME_DIR/shmmap for a user's "
-        "daemon)",
+        help="directory of the request socket (default: /run/shmmap; for a user's daemon "
+        "$XDG_RUNTIME_DIR/shmmap, else /tmp/shmmap-UID)",
     )
     place.add_argument("--shm-dir", metavar="DIR", help="directory of the segments (default: /dev/shm)")
     place.add_argument(
@@ -133,6 +135,12 @@ def add_parser(subparsers: Subparsers) -> None:
         "are (default: 0.5)",
     )
     parser.add_argument(
+        "--log-level",
+        metavar="LEVEL",
+        help="the least that is logged: debug (each eviction, each client that left), info or warning "
+        "(default: info)",
+    )
+    parser.add_argument(
         "--cache-dir",
         metavar="DIR",
         help="where the map's index, divided clouds and computed layers are kept between starts (default: "
@@ -149,6 +157,19 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal says stop."""
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy's threads would spin, and nobody could be forked
+    from shmmap.processes.limits import limit_behind
+
+    try:
+        return _serve(args)
+    except (OSError, RuntimeError, MemoryError, ImportError) as error:
+        if (limit := limit_behind(error)) is None:
+            raise
+        from shmmap.errors import CannotStart
+
+        raise CannotStart(limit.message, hint=limit.hint) from None
+
+
+def _serve(args: argparse.Namespace) -> int:
     from shmmap.daemon.config import load_config
     from shmmap.daemon.main import run as serve
     from shmmap.daemon.service_manager.status import ServiceManager

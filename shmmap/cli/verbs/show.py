@@ -6,13 +6,12 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.areas import extent_text
-from shmmap.cli.near_cells import near_cells_hint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.accounts import user_name
 from shmmap.cli.screens.output import format_bytes, print_json, print_pairs, rows_text
 from shmmap.cli.screens.refusals import holder_row
 from shmmap.errors import UnknownCell
+from shmmap.lacking import extent_text, near_cells_hint
 
 if TYPE_CHECKING:
     from shmmap.protocol.messages import Holder, ShownCell, ShownSegment

@@ -126,6 +126,9 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         )
     if problems := count.get("map_problems", 0):
         lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
+    if outside := count.get("cells_outside_box", 0):
+        cells = f"{counted(outside, 'cell')} with points outside the cell's box"
+        lines.append(("misplaced", f"{cells}: see the daemon's log, or `shmmap inspect` the map"))
     if count["stale_cells"]:
         lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
     if count["zombies"]:

@@ -88,7 +88,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show one screen, or one after the other."""
-    from shmmap.cli.daemon_address import instance, shm_dir, snapshot
+    from shmmap.cli.daemon_address import locate, snapshot
     from shmmap.cli.screens.top_screen import screen
     from shmmap.statistics.reader import StatisticsReader
 
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
         for line in screen(found, identity, width=width, max_clients=256):
             print_line("".join(text for text, _style in line).rstrip())
     else:
-        with StatisticsReader(instance(args), shm_dir(args)) as reader:
+        with StatisticsReader(*locate(args)) as reader:
             return _live(reader, max(args.interval, SHORTEST_S))
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import argparse
 
 from shmmap.cli.areas import add_cells_argument, cells_meant, check_cells_argument, no_cell_there
-from shmmap.cli.near_cells import near_cells_hint
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import print_json
 from shmmap.cli.verbs.pin import PINS_JSON, print_pins
+from shmmap.lacking import near_cells_hint
 
 __all__ = ["add_parser", "run"]
 

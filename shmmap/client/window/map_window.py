@@ -6,10 +6,10 @@ from __future__ import annotations
 import os
 import weakref
 from collections.abc import Sequence
-from threading import TIMEOUT_MAX
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from shmmap.client.arguments import heights, names, number, timeout_s
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
 from shmmap.client.points_around import PointsAround, points_around
@@ -21,7 +21,7 @@ from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.retention import Retention, RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowUpdate, update_between
 from shmmap.errors import BadRequest, ConnectionLost, ShmmapError
-from shmmap.geometry import Circle, ZRange
+from shmmap.geometry import Circle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -74,10 +74,13 @@ class MapWindow:
         Seconds that a reply to the window may take, beyond what it lets the daemon wait for loads; None:
         those of the client.  A daemon that hangs shows in `error` after this long; one that ended, at once.
 
+    instance
+        Name of the daemon's instance, instead of a client or an endpoint.
+
     Raises
     ------
     DaemonUnreachable, ProtocolMismatch
-        As `connect`, where an endpoint is given.
+        As `connect`, where no client is given.
     LimitReached
         This process may not have the descriptors or threads that are needed.
     BadRequest
@@ -98,19 +101,19 @@ class MapWindow:
         z: tuple[float, float] | None = None,
         name: str = "",
         timeout: float | None = None,
+        instance: str | None = None,
     ) -> None:
-        if not update_distance >= 0 or not refresh_interval > 0:
-            raise BadRequest(
-                "update_distance must not be negative and refresh_interval must be positive,"
-                f" they are {update_distance!r} m and {refresh_interval!r} s"
-            )
-        if timeout is not None and not 0 < timeout <= TIMEOUT_MAX:
-            raise BadRequest(f"timeout must be a positive number of seconds, not {timeout!r}")
+        update_distance = number("update_distance", update_distance, unit="metres")
+        refresh_interval = number("refresh_interval", refresh_interval, positive=True)
+        if timeout is not None:
+            timeout = timeout_s("timeout", timeout)
         Circle(0.0, 0.0, radius)
         self._radius = radius
+        if isinstance(client, Client) and instance is not None:
+            raise BadRequest("give a client or an instance, not both")
         self._owns_client = not isinstance(client, Client)
-        self._client = client if isinstance(client, Client) else connect(client, name=name)
-        self._layers = (layers,) if isinstance(layers, str) else tuple(layers)
+        self._client = client if isinstance(client, Client) else connect(client, instance=instance, name=name)
+        self._layers = names("layers", layers)
         self._seen = EMPTY.versions
         self._closed = False
         self._follower: WindowFollower | BlockingFollower
@@ -120,7 +123,7 @@ class MapWindow:
                 radius,
                 layers=self._layers,
                 shape=shape,
-                z=ZRange(*z) if z is not None else None,
+                z=heights(z),
                 retention=retention if retention is not None else Retention(),
                 populate=background,  # page faults, too, are better taken by the thread
                 timeout_s=timeout,
@@ -218,8 +221,8 @@ class MapWindow:
             Only in the blocking mode: the daemon cannot be asked; the window keeps what it has.
         """
         pose = pose_intent(x, y, vx, vy, heading, route)
-        if wait is not None and not wait >= 0:
-            raise BadRequest(f"wait must not be negative, it is {wait!r}")
+        if wait is not None:
+            wait = number("wait", wait)
         if self._closed:
             raise BadRequest("this window is closed", hint="make another one")
         state = self._follower.move(pose, wait)
@@ -239,7 +242,7 @@ class MapWindow:
             False if it was not so within ``timeout`` seconds, or the daemon cannot be asked.  In the
             blocking mode, whether it is so.
         """
-        return self._follower.wait_until_current(timeout) is not None
+        return self._follower.wait_until_current(number("timeout", timeout)) is not None
 
     # --- what the window holds ------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ def pose_intent(
         angle = None if heading is None else float(heading)
         pose = Intent(float(x), float(y), float(vx), float(vy), angle)
     except (TypeError, ValueError) as error:
-        raise BadRequest(f"pose: numbers are needed, and two for each point of a route: {error}") from error
+        raise BadRequest(f"pose: numbers are needed, and two for each point of a route: {error}") from None
     numbers_finite = all(map(math.isfinite, (pose.x, pose.y, pose.vx, pose.vy, angle or 0.0)))
     if not numbers_finite or not np.isfinite(path).all():
         raise BadRequest("pose: every number in it must be finite")

@@ -79,7 +79,7 @@ class WindowRefresher:
         timeout_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        if shape not in _SHAPES:
+        if not isinstance(shape, str) or shape not in _SHAPES:
             raise BadRequest(f"window shape {shape!r} is unknown", hint="use 'circle' or 'square'")
         self._make_area = _SHAPES[shape]
         self._make_area(0.0, 0.0, radius, z)
@@ -177,6 +177,7 @@ class WindowRefresher:
             by_name=by_name,
             populate=self._populate,
             timeout=self._timeout_s,
+            strict=None,  # `WindowUpdate` says what is missing
         )
 
     def _apply(

@@ -166,7 +166,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         )
 
 
-EMPTY: Final = WindowState()
+EMPTY: Final = WindowState(covered=False)  # nobody has said what the map has there
 
 
 def moved(state: WindowState, pose: Intent, update_distance: float) -> bool:

@@ -9,7 +9,7 @@ of `shmmap.daemon.loading.scheduler`, which publishes here.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from shmmap.daemon.cache.cell_rows import CellRows
 from shmmap.daemon.cache.eviction.evictor import Evictor
 from shmmap.daemon.cache.holders import Holders
-from shmmap.daemon.cache.segment_name_watch import SegmentNameWatch
+from shmmap.daemon.cache.segment_name_watch import LostSegments, SegmentNameWatch
 from shmmap.daemon.cache.survey import Survey
 from shmmap.daemon.cache.warm_index import Heights, WarmIndex
 from shmmap.daemon.events.cell_events import CellEvents
@@ -69,6 +69,8 @@ class CellCache:
         The cells that are in memory at their current version.
     heights
         Of cells that were loaded since they changed.
+    lost
+        Counts segments that other programs removed or cut short.
     unentered : int
         How many segments are still to be looked for in the state of the map that is served now.
     """
@@ -98,7 +100,9 @@ class CellCache:
         self.heights = Heights(len(catalogue))
         self.unentered = 0
         self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
-        self.events = CellEvents(event_log, statistics, self.wire_id, PressureEvents(event_log, self._memory))
+        self.lost = LostSegments()
+        pressure = PressureEvents(event_log, self._memory, reclaimer.sessions.largest_holder)
+        self.events = CellEvents(event_log, statistics, self.wire_id, pressure)
         self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
         self.used: set[Resident] = set()
         self.statistics = statistics
@@ -312,25 +316,30 @@ class CellCache:
             self.warm.leave(index, resident.key.layer)
         self.tell(self.rows.show, resident, "zombie")
 
-    def hear_of_names(self, now_s: float) -> None:
-        """Names vanished from the directory: what somebody else removed is handed out no more."""
+    def names_vanished(self, now_s: float) -> bool:
+        """Retire segments whose names others removed; True if that released memory."""
         names = self.names.gone()
         if names is None:
             self._unsure = self.ledger.segments.walk()
-            return
-        for name in names:
-            self._look_for(self.ledger.resident_named(name), now_s)
+            return False
+        return self._retire_lost(names, now_s)
 
-    def look_for_some(self, now_s: float) -> None:
-        """Look for a few segments of which nobody knows whether they vanished: too many names had."""
-        for resident in islice(self._unsure, LOOKS_FOR_NAMES):
-            self._look_for(self.ledger.resident_named(resident.name), now_s)
+    def look_for_some(self, now_s: float) -> bool:
+        """Look for a few segments after so many names vanished that the kernel lost count."""
+        return self._retire_lost([one.name for one in islice(self._unsure, LOOKS_FOR_NAMES)], now_s)
 
-    def _look_for(self, resident: Resident | None, now_s: float) -> None:
-        if resident is not None and not self.directory.exists(resident.name):
-            cell = resident.key.cell_id
-            log.warning("segment removed by somebody else", segment=resident.name, cell=cell)
-            self.reclaimer.retire(resident, now_s, "damaged")
+    def _retire_lost(self, names: Iterable[str], now_s: float) -> bool:
+        residents = map(self.ledger.resident_named, names)
+        return sum(self.retire_if_lost(one, now_s) for one in residents if one is not None) > 0
+
+    def retire_if_lost(self, resident: Resident, now_s: float) -> bool:
+        """Retire a segment that others removed or cut short, so that its cell is loaded again."""
+        size = self.directory.size_of(resident.name)
+        if size >= resident.nbytes:
+            return False
+        self.lost.add(resident, removed=size < 0, now_s=now_s)
+        self.reclaimer.retire(resident, now_s, "damaged")
+        return True
 
     def close(self, *, keep: bool = False) -> None:
         """Take every segment's name away, or leave the names to the next life."""

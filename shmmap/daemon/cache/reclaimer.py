@@ -120,7 +120,7 @@ class Reclaimer:
         retired = self.ledger.retired[resident.name]
         self.on_retired(resident, why)
         if not found:
-            self._forget(retired)
+            self._vanished(retired)
             return True
         if resident.checked:
             self._by_key[resident.key] = retired
@@ -169,7 +169,7 @@ class Reclaimer:
             self.never_revive(key)
             return None
         if not found:
-            self._forget(retired)
+            self._vanished(retired)
             return None
         self.pins.release(retired_name(name))
         del self._by_key[key]
@@ -181,6 +181,14 @@ class Reclaimer:
     def never_revive(self, key: Key) -> None:
         """What is retired of this key must not be handed out again."""
         self._by_key.pop(key, None)
+
+    def _vanished(self, retired: Retired) -> None:
+        """Release the bytes of a segment whose name others removed.
+
+        Its readers keep its memory, and nobody can find out until when.
+        """
+        self._forget(retired)
+        self.ledger.freed(retired.resident.name)
 
     def _forget(self, retired: Retired) -> None:
         """There is no such segment any more, or only its memory."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from shmmap.daemon.events.eviction_history import EvictionHistory
 from shmmap.daemon.events.late_cells import LateCells
-from shmmap.daemon.events.log import EventLog, PressureEvents
+from shmmap.daemon.events.log import EventLog, MinuteLog, PressureEvents
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
@@ -33,6 +33,8 @@ class CellEvents:
     ----------
     late
         Tells of cells that clients on their way had to wait for.
+    minutes
+        Logs how many were evicted, and how many clients left, a line a minute.
     """
 
     event_log: EventLog
@@ -40,6 +42,7 @@ class CellEvents:
     wire_id: Callable[[str], str]
     pressure: PressureEvents
     late: LateCells = field(init=False)
+    minutes: MinuteLog = field(default_factory=MinuteLog)
     _history: EvictionHistory = field(default_factory=EvictionHistory)
 
     def __post_init__(self) -> None:
@@ -86,7 +89,8 @@ class CellEvents:
         if why != "superseded":
             cell, layer = resident.key
             reason = "budget" if why == "room" else why
-            log.info("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason=reason)
+            log.debug("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason=reason)
+            self.minutes.count("cells evicted", reason, resident.nbytes)
             self.event_log.publish(
                 events.Evicted, self.wire_id(cell), layer, resident.version, resident.nbytes, why
             )

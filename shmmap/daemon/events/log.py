@@ -8,21 +8,30 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
 import msgspec
 
+from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.protocol.events import EventPage, Recent, encode_event
 
-__all__ = ["EventLog", "PressureEvents", "nowhere"]
+__all__ = ["EventLog", "MinuteLog", "PressureEvents", "nowhere"]
 
 REMEMBERED: Final = 4096
 """Events kept for who asks later: under a megabyte."""
 PAGE_EVENTS: Final = 500
 PRESSURE_S: Final = 1.0
+LOG_S: Final = 60.0
+_NAMED: Final = 3
+_SETTINGS: Final = {
+    "over_budget": "budget (--budget): raise it, or have clients hold less",
+    "quota": "session_quota (--session-quota): raise it, or have this client hold less",
+    "no_space": "shm_dir (--shm-dir): its file system is full, or smaller than the budget",
+}
+"""What an operator can change, by the code of a refusal."""
 
 
 def nowhere(data: bytes) -> None:
@@ -87,30 +96,73 @@ class EventLog:
         )
 
 
+class MinuteLog:
+    """Log lines about what happens often: the first at once, then one a minute with the sum."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, Counter[str]] = {}
+        self._bytes: Counter[str] = Counter()
+        self._due_s: dict[str, float] = {}
+
+    def count(self, event: str, of: str, nbytes: int) -> None:
+        """Add one of an event, of a client or for a reason, and its bytes."""
+        self._counts.setdefault(event, Counter())[of] += 1
+        self._bytes[event] += nbytes
+
+    def step(self, now_s: float) -> None:
+        """Log what has been counted and is due."""
+        for event in [event for event in self._counts if now_s >= self._due_s.get(event, float("-inf"))]:
+            of = self._counts.pop(event)
+            most = ", ".join(f"{count} {name}" for name, count in of.most_common(_NAMED))
+            more = f" and {len(of) - _NAMED} more" if len(of) > _NAMED else ""
+            log.info(event, count=of.total(), bytes=self._bytes.pop(event), of=most + more)
+            self._due_s[event] = now_s + LOG_S
+
+
 class PressureEvents:
-    """Tells of cells refused for lack of memory, at most once a second however many there are.
+    """Cells refused for lack of memory: an event a second and a log line a minute, however many there are.
 
     Parameters
     ----------
     memory
         Gives budget, used, pinned and zombie bytes.
+    holder
+        Says who has most of the memory.
     """
 
-    def __init__(self, log: EventLog, memory: Callable[[], tuple[int, int, int, int]]) -> None:
-        self._log = log
+    def __init__(
+        self,
+        event_log: EventLog,
+        memory: Callable[[], tuple[int, int, int, int]],
+        holder: Callable[[], str] = str,
+    ) -> None:
+        self._event_log = event_log
         self._memory = memory
+        self._holder = holder
         self._refused = 0
+        self._unlogged = 0
         self._last: tuple[str, str, str] = ("", "", "")
-        self._told_s = float("-inf")
+        self._told_s = self._logged_s = float("-inf")
 
     def refused(self, cell_id: str, layer: str, code: str, now_s: float) -> None:
         """Note that a cell was refused."""
         self._refused += 1
+        self._unlogged += 1
         self._last = (cell_id, layer, code)
-        self.turn(now_s)
+        self.step(now_s)
 
-    def turn(self, now_s: float) -> None:
-        """Tell what has not been told, if the last telling is long enough ago."""
+    def step(self, now_s: float) -> None:
+        """Publish and log what has not been, if the last time is long enough ago."""
         if self._refused and now_s - self._told_s >= PRESSURE_S:
-            self._log.publish(events.Pressure, *self._last, self._refused, *self._memory())
+            self._event_log.publish(events.Pressure, *self._last, self._refused, *self._memory())
             self._refused, self._told_s = 0, now_s
+        if self._unlogged and now_s - self._logged_s >= LOG_S:
+            cell, layer, code = self._last
+            budget, used, pinned, _ = self._memory()
+            log.warning(
+                "cells refused for lack of memory", count=self._unlogged, code=code, last=cell, layer=layer,
+                budget_bytes=budget, used_bytes=used, in_use_bytes=pinned,
+                most_is_held_by=self._holder() or None,
+                setting=_SETTINGS.get(code),
+            )  # fmt: skip
+            self._unlogged, self._logged_s = 0, now_s

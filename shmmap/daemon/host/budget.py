@@ -9,7 +9,7 @@ from typing import Final
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["choose_budget", "loader_bytes"]
+__all__ = ["choose_budget", "loader_bytes", "room_in_group"]
 
 DEFAULT_CEILING_BYTES: Final = 4 << 30
 RESERVE_BYTES: Final = 256 << 20
@@ -37,6 +37,11 @@ def loader_bytes(limit_bytes: int | None) -> int:
     total = _memory_bytes("MemTotal")
     least, most = LOADER_BYTES
     return min(max(least, min(total, limit_bytes or total) // 4), most)
+
+
+def room_in_group(limit_bytes: int) -> int:
+    """Return how much of a control group's memory the segments may have: half is left, at most 256 MiB."""
+    return limit_bytes - min(limit_bytes // 2, RESERVE_BYTES)
 
 
 def choose_budget(
@@ -74,7 +79,7 @@ def choose_budget(
         Too little is free.
     """
     size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
-    group_room = limit_bytes - min(limit_bytes // 2, RESERVE_BYTES) if limit_bytes is not None else LARGEST
+    group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
     room = min(free - min(size // 20, RESERVE_BYTES), group_room)
     if asked_bytes:
         if asked_bytes > size:

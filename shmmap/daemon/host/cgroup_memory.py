@@ -13,7 +13,7 @@ from typing import Final
 
 from shmmap.daemon.host.mounts import mounts
 
-__all__ = ["memory_limit_bytes"]
+__all__ = ["memory_limit_bytes", "out_of_memory_kills"]
 
 _NO_LIMIT: Final = 1 << 60
 """Version 1 says "none" with the largest number of pages there is."""
@@ -42,6 +42,11 @@ def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
                 break
             place = place.parent
     return min((limit for limit in limits if limit < _NO_LIMIT), default=None)
+
+
+def out_of_memory_kills(vmstat: str = "/proc/vmstat") -> int:
+    """Return how many processes the kernel has killed for lack of memory, the machine's or a group's."""
+    return next((int(line.split()[1]) for line in _lines(Path(vmstat)) if line.startswith("oom_kill ")), 0)
 
 
 def _groups(path: Path) -> dict[str, str]:

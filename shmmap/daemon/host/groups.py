@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of this machine's users."""
+"""Groups and names of this machine's users."""
 
 from __future__ import annotations
 
 import grp
+import pwd
 
 from shmmap.errors import ConfigError
 
-__all__ = ["group_id"]
+__all__ = ["account_name", "group_id"]
+
+
+def account_name(uid: int) -> str:
+    """Return a user's name, or the number of one without."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
 
 
 def group_id(name: str, key: str) -> int:

@@ -10,8 +10,8 @@ import struct
 from typing import Final, NamedTuple
 
 __all__ = [
-    "CHANGED", "CLOSED", "CREATED", "DIRECTORY", "ENDED", "NAME_GONE", "OVERFLOW", "SELF_MOVED",
-    "Event", "Inotify",
+    "ALSO", "CHANGED", "CLOSED", "CREATED", "DIRECTORY", "ENDED", "NAMES_CHANGED", "NAME_GONE", "OVERFLOW",
+    "SELF_GONE", "SELF_MOVED", "Event", "Inotify",
 ]  # fmt: skip
 
 CLOSED: Final = 0x08 | 0x10
@@ -22,6 +22,12 @@ CREATED: Final = 0x100
 """A name in the directory is new: IN_CREATE."""
 SELF_MOVED: Final = 0x800
 """What is watched has another name now: IN_MOVE_SELF."""
+SELF_GONE: Final = 0x400 | SELF_MOVED
+"""What is watched was removed, or has another name now: IN_DELETE_SELF."""
+NAMES_CHANGED: Final = NAME_GONE | 0x80 | CREATED
+"""A name in the directory came, went, or means something else now."""
+ALSO: Final = 0x20000000
+"""To be watched for beside what is watched for already: IN_MASK_ADD."""
 CHANGED: Final = 0x08 | NAME_GONE | 0x80 | CREATED | 0x400 | SELF_MOVED | 0x1000000 | 0x4000000
 """A file in the directory was written, came or went, or the directory itself did; directories only, and
 nothing of files that have no name any more."""

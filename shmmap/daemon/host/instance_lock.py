@@ -6,10 +6,12 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from shmmap.errors import InstanceBusy
+from shmmap.errors import InstanceBusy, ShmmapError
 from shmmap.segment.taken_name import name_taken
 
 __all__ = ["InstanceLock"]
@@ -24,17 +26,35 @@ class InstanceLock:
     ----------
     path
         It says the process id, for the message to whoever comes second.
+    check
+        Raises what else hinders the daemon, once the lock is held and before the file is changed.
 
     Raises
     ------
     InstanceBusy
         Somebody holds it; the message names the process.
     CannotStart
-        The file cannot be made, or is another user's.
+        The file cannot be made, or is another user's or another program's.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, check: Callable[[], object] = lambda: None) -> None:
         self.path = path
+        self._fd = self._locked(path)
+        try:
+            if not re.fullmatch(rb"[0-9\0]*\n?", os.pread(self._fd, 64, 0)):
+                raise name_taken("the lock file", path, None, otherwise=_OTHERWISE)
+            check()
+        except BaseException:
+            if not os.fstat(self._fd).st_size:
+                self.release()
+            else:
+                os.close(self._fd)
+            raise
+        os.ftruncate(self._fd, 0)
+        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
+
+    @staticmethod
+    def _locked(path: str) -> int:
         while True:
             try:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
@@ -54,11 +74,17 @@ class InstanceLock:
                 ) from None
             with contextlib.suppress(FileNotFoundError):
                 if Path(path).stat().st_ino == os.fstat(fd).st_ino:
-                    break
+                    return fd
             os.close(fd)  # its owner removed it just before we got the lock: try the new file
-        self._fd = fd
-        os.ftruncate(fd, 0)
-        os.pwrite(fd, f"{os.getpid()}\n".encode(), 0)
+
+    def restore(self) -> None:
+        """Make the file again if another program removed it, unless another daemon has made one."""
+        if os.path.exists(self.path):
+            return
+        with contextlib.suppress(ShmmapError, OSError):
+            again = InstanceLock(self.path)
+            os.close(self._fd)
+            self._fd = again._fd
 
     def release(self) -> None:
         """Remove the file and let the next daemon in.

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable
 
 from shmmap.daemon.host.signals import StartSignals
 from shmmap.segment.directory import ShmDirectory
@@ -20,12 +19,11 @@ def lock_path(socket_path: str) -> str:
     return socket_path.removesuffix(".sock") + ".lock"
 
 
-def take_away(directory: ShmDirectory, instance: str, more: Iterable[str] = ()) -> None:
-    """Remove the instance's names, then the files ``more``."""
-    names = directory.names(segment_prefix(instance))
-    for path in (*(directory.path + name for name in names), *more):
+def take_away(directory: ShmDirectory, instance: str) -> None:
+    """Remove the instance's names."""
+    for name in directory.names(segment_prefix(instance)):
         with contextlib.suppress(OSError):
-            os.unlink(path)
+            os.unlink(directory.path + name)
 
 
 def stopped_early(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import os
 import signal
 import socket
 from collections.abc import Iterator
@@ -24,13 +25,28 @@ _libc: Final = ctypes.CDLL(None)  # found now: it must be quick when signals pil
 _ALL: Final = (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL)
 
 
+def _belongs_to_terminal() -> bool:
+    """Whether a terminal started this process, and neither nohup nor a service manager keeps it."""
+    if os.getpid() == 1 or "NOTIFY_SOCKET" in os.environ:
+        return False
+    if os.environ.get("SYSTEMD_EXEC_PID") == str(os.getpid()):
+        return False
+    return os.isatty(0) and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+
+
 class StartSignals:
     """Signals while the daemon starts: stop means unwinding at once, a reload waits until it serves.
 
     Masks would not do: they are a thread's, and libraries have threads of their own.
+
+    Attributes
+    ----------
+    hangup_stops : bool
+        SIGHUP says that the terminal is closed that the daemon belongs to, and stops it.
     """
 
     def __init__(self) -> None:
+        self.hangup_stops = _belongs_to_terminal()
         self.reload_wanted = False
         self.keep = False
         self._held = False
@@ -40,9 +56,9 @@ class StartSignals:
 
     def _on_signal(self, number: int, frame: object) -> None:
         del frame
-        self.reload_wanted |= number == RELOAD_SIGNAL
         self.keep |= number == KEEP_SIGNAL
-        if number == RELOAD_SIGNAL:
+        if number == RELOAD_SIGNAL and not self.hangup_stops:
+            self.reload_wanted = True
             return
         if not self._stop:
             log.info("stopping", signal=signal.Signals(number).name, during="start")
@@ -58,6 +74,10 @@ class StartSignals:
             yield
         finally:
             self._held = False
+        self.raise_if_stopped()
+
+    def raise_if_stopped(self) -> None:
+        """Unwind if a stop has come that was held, or that Python ignored."""
         if self._stop:
             raise SystemExit(0)
 

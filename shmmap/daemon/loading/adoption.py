@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.records import Key, Resident
 from shmmap.errors import BadRequest, SegmentCorrupt
 from shmmap.failpoints import step
@@ -40,6 +41,7 @@ class Adoption:
 
     cache: CellCache
     loads: Loads
+    misplaced: MisplacedCells
 
     def take_over(self, now_s: float) -> None:
         """Look at every name once."""
@@ -60,9 +62,9 @@ class Adoption:
             self._remove(name, str(error.strerror))
             return "dropped"
         try:
-            resident, why_not = self._look(fd, name, now_s)
+            resident, outside, why_not = self._look(fd, name, now_s)
             if not why_not:
-                self._adopt(fd, resident)
+                self._adopt(fd, resident, outside)
                 return "taken_over"
             if self._is_used(fd):
                 self._keep_for_readers(name, resident, now_s)
@@ -74,24 +76,24 @@ class Adoption:
 
     # --- judging ------------------------------------------------------------------------------
 
-    def _look(self, fd: int, name: str, now_s: float) -> tuple[Resident, str]:
-        """Return a leftover as its header describes it, and why it cannot serve; empty if it can."""
+    def _look(self, fd: int, name: str, now_s: float) -> tuple[Resident, int, str]:
+        """Return a leftover as its header describes it, its points outside, and why it cannot serve."""
         live_name, nbytes = name.removesuffix(retired_name("")), measured_bytes(fd)
         unknown = Resident(live_name, Key("", ""), 0, nbytes, 0, (0.0,) * 4, 0.0, 0.0, checked=False)
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):
-            return unknown, "it is no regular file"
+            return unknown, 0, "it is no regular file"
         if status.st_uid != os.geteuid():
-            return unknown, f"it belongs to user {status.st_uid}"
+            return unknown, 0, f"it belongs to user {status.st_uid}"
         try:
             header, block = read_header(fd)
         except (SegmentCorrupt, OSError, UnicodeDecodeError) as error:
-            return unknown, str(error)
+            return unknown, 0, str(error)
         resident = Resident(
             live_name, Key(header.cell_id, header.layer), block.version, nbytes, header.rows, header.box,
             header.z_min, header.z_max, last_use_s=now_s - HAND_OUT_GRACE_S, checked=False,
         )  # fmt: skip
-        return resident, self._why_not(name, status, header, resident)
+        return resident, header.outside_points, self._why_not(name, status, header, resident)
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, resident: Resident) -> str:
         """Why a whole segment cannot serve; empty if it can."""
@@ -121,7 +123,7 @@ class Adoption:
 
     # --- acting -------------------------------------------------------------------------------
 
-    def _adopt(self, fd: int, resident: Resident) -> None:
+    def _adopt(self, fd: int, resident: Resident, outside: int) -> None:
         step("daemon.adopt")
         if self.cache.gid >= 0:
             os.fchown(fd, -1, self.cache.gid)
@@ -129,6 +131,8 @@ class Adoption:
         index = self.cache.index_of(resident.key.cell_id)
         assert index is not None  # noqa: S101  _why_not has found it
         self.cache.adopt(resident, index)
+        if outside:
+            self.misplaced.note(resident.key.cell_id, index, outside)
         self.loads.check(resident)
 
     def _is_used(self, fd: int) -> bool:

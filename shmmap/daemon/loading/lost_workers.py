@@ -4,20 +4,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
+from shmmap.daemon.host.cgroup_memory import memory_limit_bytes, out_of_memory_kills
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.prepared_parent import RESTART
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load
 from shmmap.logfmt import log
+from shmmap.quantities import format_bytes
 from shmmap.segment.version import Stamp
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["LostWorkers"]
 
+KILLED: Final = "signal SIGKILL"
+OUT_OF_MEMORY: Final = "out of memory"
 START_ATTEMPTS: Final = 3
 """After this many loaders in a row that could not start, loads fail instead of waiting."""
 
@@ -43,16 +47,28 @@ class LostWorkers:
     room: Room
     statistics: StatisticsWriter
     fail: Callable[[Load, str, str, Stamp | None, float], None]
+    oom_kills: int = field(default_factory=out_of_memory_kills)
 
     def ended(self, worker: Worker, how: str, now_s: float) -> None:
         """A worker's process ended; ``how`` is for people, and empty where its parent took it along."""
         self.statistics.add("worker_crashes")
         if not worker.ready:
             self._could_not_start(worker, how, now_s)
+        elif how == KILLED:
+            self._replace(worker, "load_failed", self._why_killed(), now_s)
         elif how:
             self._replace(worker, "load_failed", f"the loader died of it ({how})", now_s)
         else:
             self._vanished(worker, now_s)
+
+    def _why_killed(self) -> str:
+        """Whether the kernel killed a loader for lack of memory: that is not its file's fault."""
+        before, self.oom_kills = self.oom_kills, out_of_memory_kills()
+        limit = memory_limit_bytes()
+        allowed = f" (the control group allows {format_bytes(limit)})" if limit else ""
+        if self.oom_kills > before:
+            return f"{OUT_OF_MEMORY}: the kernel killed the loader{allowed}"
+        return f"the loader was killed ({KILLED}): by a person or a program"
 
     def end_overdue(self, now_s: float) -> None:
         """Kill workers whose load, or whose start, took too long."""
@@ -101,7 +117,8 @@ class LostWorkers:
                 if load is not None:
                     load.spent_s = spent_s
                     # where it took too long nobody looks again: the file system may be what hangs
-                    known = load.sources[0] if code == "load_failed" and load.sources else None
+                    blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
+                    known = load.sources[0] if blamed and load.sources else None
                     self.fail(load, code, f"{job.path}: {why}", known, now_s)
             elif load is not None:
                 self.loads.requeue(load)

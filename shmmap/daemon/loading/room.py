@@ -49,6 +49,11 @@ class Room:
         if self.cache.reclaimer.hear(now_s):
             self.loads.forget_refusals()
 
+    def names_vanished(self, now_s: float) -> None:
+        """The kernel reports that names of segments were removed."""
+        if self.cache.names_vanished(now_s):
+            self.loads.forget_refusals()
+
     def hear_of_freed(self) -> None:
         """Memory is back with the kernel."""
         if self.cache.reclaimer.collect():

@@ -16,15 +16,17 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
+from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
-from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
+from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
+from shmmap.processes.limits import limit_behind
 from shmmap.processes.start_child import how_ended
 from shmmap.segment.version import Stamp
 
@@ -48,8 +50,9 @@ class Scheduler:
     ----------
     loads
         What is wanted, queued and under way, and what failed.
-    prefetcher, room, lost
-        Wishes for what nobody has asked for yet; asks the cache for room; replaces workers.
+    prefetcher, room, misplaced, lost
+        Wishes for what nobody has asked for yet; asks the cache for room; counts cells with points outside
+        their box; replaces workers.
     on_settled
         Called with a key when its load ended, in whichever way.
     unfinished : bool
@@ -76,6 +79,7 @@ class Scheduler:
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
+        self.misplaced = MisplacedCells(cache)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
     # --- being asked ----------------------------------------------------------------------------
@@ -105,6 +109,16 @@ class Scheduler:
     def map_changed(self) -> None:
         """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
         self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+        self.misplaced.map_changed()
+        self.pool.read_through(self._opened)
+
+    @property
+    def _opened(self) -> Opened:
+        """The directory that files of the map are read through."""
+        catalogue = self._cache.catalogue
+        if catalogue.opened is None:
+            return NOT_OPENED
+        return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
     def _drop_some(self) -> None:
         for _ in range(min(LOOKS_A_PUMP, len(self._doubtful))):
@@ -119,13 +133,15 @@ class Scheduler:
         """Free what is due: what was refused for lack of memory may fit now."""
         if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
             self.loads.forget_refusals()
-        self._cache.look_for_some(now_s)
+        if self._cache.look_for_some(now_s):
+            self.loads.forget_refusals()
 
     def pump(self, now_s: float) -> None:
         """Hand a queued load to a worker if memory and workers allow; see `unfinished`."""
         if self.room.hungry:
             self.room.feed(self._jobs, now_s)
         self._drop_some()
+        self.misplaced.check_some(LOOKS_A_PUMP)
         self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
 
     def _hand_out_one(self, now_s: float) -> bool:
@@ -152,7 +168,7 @@ class Scheduler:
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
-            taken = self.pool.submit(job, now_s, prefetch=load.prefetch)
+            taken = self.pool.submit(job, now_s, prefetch=load.prefetch, opened=self._opened)
         except OSError as error:
             self._fail(load, failure_code(error), f"no file for a segment: {error.strerror}", None, now_s)
             return True
@@ -276,8 +292,11 @@ class Scheduler:
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
-            self._fail(load, failure_code(error), f"cannot publish: {error.strerror}", None, now_s)
+            limit = limit_behind(error)
+            why = f"{limit.message} ({limit.hint})" if limit is not None else str(error.strerror)
+            self._fail(load, failure_code(error), f"its segment cannot be published: {why}", None, now_s)
             return
+        self.misplaced.note(key.cell_id, index, done.outside)
         took_ns = int((now_s - load.started_s) * 1e9)
         cache.tell(cache.events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)
         for warning in done.warnings:

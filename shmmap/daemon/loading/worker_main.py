@@ -10,6 +10,7 @@ without a name that the daemon has made, so that an orphan leaves nothing behind
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import resource
 import signal
@@ -31,6 +32,8 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
+from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.processes.limits import limit_behind
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
@@ -42,6 +45,7 @@ __all__ = ["WorkerSettings", "limit_memory", "work"]
 
 _NICENESS: Final = 10  # a warm request never waits for a load
 _PAGE_BYTES: Final = 4096
+REPLACED: Final = "another directory has the map's name now: `shmmap reload` reads it"
 
 
 class _Refused(Exception):
@@ -65,6 +69,7 @@ class _Worker:
     _waiting: list[tuple[worker_messages.ToWorker, int]] = field(default_factory=list)
     _light: bool = False
     _buffer: bytearray = field(default_factory=packet_buffer)
+    _opened: OpenedDirectories = field(default_factory=OpenedDirectories)
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
@@ -80,6 +85,8 @@ class _Worker:
                 self._load(job, fd)
             elif isinstance(job, worker_messages.Check):
                 self._check(job)
+            elif isinstance(job, worker_messages.Root):
+                self._opened = OpenedDirectories({job.path: fd} if fd >= 0 else {})
 
     def _receive(self) -> tuple[worker_messages.ToWorker | None, int]:
         """Return the next message and the descriptor that came with it; None when the channel is closed."""
@@ -102,7 +109,7 @@ class _Worker:
                 answer, fd = self._receive()
                 if answer is None:
                     raise BrokenPipeError
-                if isinstance(answer, worker_messages.Job | worker_messages.Check):
+                if not isinstance(answer, worker_messages.Decision):
                     self._waiting.append((answer, fd))
                 elif not answer.granted:
                     raise _Refused
@@ -124,8 +131,8 @@ class _Worker:
             done = worker_messages.Done(
                 job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
                 header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
-                tuple(warning[:500] for warning in made.warnings[:20]),
-                tuple(stamp.token for stamp in made.neighbours), made.cached,
+                tuple(self._opened.named(warning)[:500] for warning in made.warnings[:20]),
+                tuple(stamp.token for stamp in made.neighbours), made.cached, header.outside_points,
             )  # fmt: skip
             step("worker.pass")
             self._send(done)
@@ -137,6 +144,10 @@ class _Worker:
         except ShmmapError as error:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
+            limit = limit_behind(error) if error.errno == errno.EFBIG else None
+            if limit is not None:  # of the segment, whatever the map's file is like
+                self._fail(job, "load_failed", f"{job.path}: its segment: {limit.message} ({limit.hint})")
+                return
             self._fail(job, failure_code(error), f"{job.path}: {error.strerror or error}", unread=True)
         except MemoryError:
             most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])
@@ -155,7 +166,7 @@ class _Worker:
         spec = layer_spec(job.layer)
         return make_layer(
             spec,
-            CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours),
+            CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours, self._opened.at),
             fd,
             cache=self.cache,
             keep=job.layer != LAYER,  # `shmmap prepare` alone stores the source: it is as quick to read
@@ -171,14 +182,14 @@ class _Worker:
             with self.directory.opened(job.points) as fd:
                 lock_slot(fd, LOADER_SLOT)
                 source = read_segment(fd, job.box, spec.source_columns)
-                return source if source.stamp == SourceStamp.of(os.stat(job.path)) else None
+                return source if source.stamp == SourceStamp.of(os.stat(self._opened.at(job.path))) else None
         except (OSError, SegmentCorrupt):
             return None
 
     def _check(self, job: worker_messages.Check) -> None:
         wrong, stamp = "", None
         try:
-            stamp = SourceStamp.of(os.stat(job.path)).token
+            stamp = SourceStamp.of(os.stat(self._opened.at(job.path))).token
             if stamp != job.stamp:
                 wrong = "its source has changed"
             elif job.segment:
@@ -188,13 +199,17 @@ class _Worker:
                     verify_file(fd)
         except (OSError, SegmentCorrupt) as error:
             wrong = str(error)
-        self._send(worker_messages.Checked(job.number, wrong[:500], stamp))
+        self._send(worker_messages.Checked(job.number, self._opened.named(wrong)[:500], stamp))
 
     def _fail(self, job: worker_messages.Job, code: str, message: str, *, unread: bool = False) -> None:
-        stamp = None
+        stamp, place = None, self._opened.at(job.path)
         with contextlib.suppress(OSError):
-            stamp = SourceStamp.of(os.stat(job.path)).token
-        self._send(worker_messages.Failed(job.number, code, message[:4000], stamp, unread))
+            stamp = SourceStamp.of(os.stat(place)).token
+        if place != job.path and stamp is None and os.path.exists(job.path):
+            message = f"{job.path}: {REPLACED}"
+        self._send(
+            worker_messages.Failed(job.number, code, self._opened.named(message)[:4000], stamp, unread)
+        )
 
 
 def _test_hook(path: str) -> None:

@@ -26,6 +26,7 @@ __all__ = [
     "Job",
     "Need",
     "Ready",
+    "Root",
     "ToWorker",
     "decode_from_worker",
     "decode_to_worker",
@@ -60,6 +61,12 @@ class Check(msgspec.Struct, array_like=True, tag="check"):
     stamp: Stamp
 
 
+class Root(msgspec.Struct, array_like=True, tag="root"):
+    """Read files below the directory ``path`` through the descriptor that comes with the packet."""
+
+    path: str
+
+
 class Decision(msgspec.Struct, array_like=True, tag="decision"):
     """Whether the bytes asked for are reserved, or do not fit."""
 
@@ -88,7 +95,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
-    the disk cache.
+    the disk cache; ``outside`` points lie outside the cell's box.
     """
 
     number: int
@@ -103,6 +110,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     warnings: tuple[str, ...] = ()
     neighbours: tuple[Stamp, ...] = ()
     cached: bool = False
+    outside: int = 0
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
@@ -136,7 +144,7 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
     reason: str = ""
 
 
-ToWorker: TypeAlias = Job | Check | Decision
+ToWorker: TypeAlias = Job | Check | Root | Decision
 FromWorker: TypeAlias = Ready | Need | Done | Checked | Failed | Ended
 
 encode: Final = msgspec.msgpack.Encoder().encode

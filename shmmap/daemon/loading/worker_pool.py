@@ -15,7 +15,7 @@ import socket
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
 import msgspec
 
@@ -28,9 +28,12 @@ from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import channel
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["Work", "Worker", "WorkerPool"]
+__all__ = ["NOT_OPENED", "Opened", "Work", "Worker", "WorkerPool"]
 
 Work = worker_messages.Job | worker_messages.Check
+Opened: TypeAlias = tuple[str, int]
+"""A directory that files are read through: its path, and a descriptor of it."""
+NOT_OPENED: Final = ("", -1)
 
 JOBS_AHEAD: Final = 4
 """Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
@@ -69,6 +72,8 @@ class Worker:
         Files without names that its jobs' segments go into, by job.
     prefetched
         Those of its jobs that nobody waited for when they were given out.
+    opened
+        Directory that it reads files through.
     """
 
     channel: socket.socket
@@ -80,6 +85,7 @@ class Worker:
     segments: dict[int, int] = field(default_factory=dict)
     prefetched: set[int] = field(default_factory=set)
     head_since_s: float = 0.0
+    opened: Opened = NOT_OPENED
 
     @property
     def fd(self) -> int:
@@ -194,13 +200,15 @@ class WorkerPool:
         self.watched.watch(worker.fd, lambda: self.on_message(worker), "loaders")
         return worker
 
-    def submit(self, job: Work, now_s: float, *, prefetch: bool = False) -> bool:
+    def submit(self, job: Work, now_s: float, *, prefetch: bool = False, opened: Opened = NOT_OPENED) -> bool:
         """Give a job to the least busy worker, starting one if all are busy; False if nobody took it.
 
         Parameters
         ----------
         prefetch
             Whether nobody waits for it.
+        opened
+            Directory that its files are to be read through: its path and a descriptor; -1 for none.
 
         Raises
         ------
@@ -222,6 +230,7 @@ class WorkerPool:
             return False  # its parent is about to say so: the job would be taken for what it died of
         fd = -1 if isinstance(job, worker_messages.Check) else self.directory.create()
         try:
+            self._send_root(worker, opened)
             self._send(worker, job, fd)
         except OSError:
             if fd >= 0:
@@ -237,8 +246,20 @@ class WorkerPool:
         worker.layers += computed
         return True
 
-    def _send(self, worker: Worker, job: Work, fd: int) -> None:
-        """Send a job, and an empty file with one that makes a segment."""
+    def read_through(self, opened: Opened) -> None:
+        """Have all workers read what they are given from now on through another directory."""
+        for worker in self._workers.values():
+            worker.opened = ("not told", -1)
+            with contextlib.suppress(OSError):  # full or dying: with its next job, if there is one
+                self._send_root(worker, opened)
+
+    def _send_root(self, worker: Worker, opened: Opened) -> None:
+        if opened != worker.opened:
+            self._send(worker, worker_messages.Root(opened[0]), opened[1])
+            worker.opened = opened
+
+    def _send(self, worker: Worker, job: Work | worker_messages.Root, fd: int) -> None:
+        """Send a job, and an empty file with one that makes a segment; or a directory."""
         packet = worker_messages.encode(job)
         if fd < 0:
             worker.channel.send(packet)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from shmmap.geometry import Area
 from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.map_frame import MapFrame
+from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.segment.version import Stamp
 
 __all__ = ["CatalogueView", "ViewOrigin"]
@@ -58,6 +59,10 @@ class CatalogueView(Tables, Protocol):
     @property
     def problems(self) -> Sequence[str]:
         """Oddities found while reading the map, one sentence each."""
+
+    @property
+    def opened(self) -> OpenedDirectories | None:
+        """Directories that its cells are to be read through; None: their paths have to do."""
 
     def query(self, area: Area, most: int | None = None) -> tuple[NDArray[np.intp], bool]:
         """Cells whose box touches ``area``, ascending (which is id order), and whether these are all.

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Noticing by inotify(7) that the map's files change, so that nobody has to ask for a reload.
 
+What a path names may change without anything in the directory: a link on the way, ``maps/current`` say, leads
+somewhere else, or a directory above gets another name.  That is noticed, too.
+
 A change is acted upon once the files have been left alone for a moment, for a map is written file by
 file; however long that takes, not later than some seconds after it began.  The kernel tells only of
 changes made on this machine: on NFS and the like, a reload has to be asked for.
@@ -8,12 +11,24 @@ changes made on this machine: on NFS and the like, a reload has to be asked for.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from collections.abc import Iterable
 from typing import Final
 
-from shmmap.daemon.host.inotify import CHANGED, CREATED, DIRECTORY, ENDED, SELF_MOVED, Inotify
+from shmmap.daemon.host.inotify import (
+    ALSO,
+    CHANGED,
+    CREATED,
+    DIRECTORY,
+    ENDED,
+    NAMES_CHANGED,
+    OVERFLOW,
+    SELF_GONE,
+    SELF_MOVED,
+    Inotify,
+)
 from shmmap.daemon.host.mounts import file_system_of
 from shmmap.errors import CannotStart
 from shmmap.logfmt import log
@@ -22,6 +37,8 @@ __all__ = ["FileWatch", "directories_of"]
 
 SETTLE_S: Final = 0.5
 MOST_S: Final = 5.0
+MOST_LINKS: Final = 40
+"""As many as the kernel follows."""
 LOOK_S: Final = 1.0
 """How often a directory that has vanished is looked for."""
 
@@ -39,6 +56,33 @@ def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
     if os.path.isdir(prefix):
         found.add(prefix)
     return {directory or "." for directory in found}
+
+
+def steps_to(path: str) -> dict[str, set[str]]:
+    """Return the real directories on the way to an absolute path, each with the links in it that lead on."""
+    steps: dict[str, set[str]] = {}
+    names, here, links = path.split("/")[::-1], "/", 0
+    while names:
+        name = names.pop()
+        if name in ("", "."):
+            continue
+        if name == "..":
+            here = os.path.dirname(here)
+            continue
+        followed = steps.setdefault(here, set())
+        next_step = os.path.join(here, name)
+        try:
+            target = os.readlink(next_step)
+        except OSError:  # no link
+            here = next_step
+            continue
+        followed.add(name)
+        links += 1
+        if links > MOST_LINKS:
+            break
+        names += target.split("/")[::-1]
+        here = "/" if target.startswith("/") else here
+    return steps
 
 
 class FileWatch:
@@ -69,6 +113,7 @@ class FileWatch:
         self._since_s: float | None = None
         self._last_s = self._look_s = 0.0
         self._paths: dict[int, str] = {}
+        self._steps: dict[int, set[str]] = {}
         self._missing: set[str] = set()
         for directory in sorted(directories):
             refused = self._add(directory)
@@ -88,8 +133,12 @@ class FileWatch:
 
     def _add(self, directory: str) -> OSError | None:
         """Watch a directory, or return why that cannot be."""
+        for place, links in steps_to(os.path.abspath(directory)).items():
+            mask = ALSO | SELF_GONE | (NAMES_CHANGED if links else 0)
+            with contextlib.suppress(OSError):  # to where this user may not look
+                self._steps.setdefault(self._inotify.add(place, mask), set()).update(links)
         try:
-            self._paths[self._inotify.add(directory, CHANGED)] = directory
+            self._paths[self._inotify.add(directory, CHANGED | ALSO)] = directory
         except OSError as error:
             self._missing.add(directory)
             return error
@@ -99,13 +148,30 @@ class FileWatch:
     def drain(self, now_s: float) -> None:
         """Take note of what the kernel tells, a bounded number of events at a time."""
         for event in self._inotify.read():
+            lost = event.mask & OVERFLOW
+            if lost or event.mask & SELF_GONE or event.name in self._steps.get(event.watch, ()):
+                self._way_changed(now_s)
+            if event.mask & ENDED:
+                self._steps.pop(event.watch, None)
+            if event.watch not in self._paths:
+                continue
             if event.mask & SELF_MOVED:  # what is followed is a path, not what used to be there
                 self._inotify.remove(event.watch)
-            if event.mask & (SELF_MOVED | ENDED) and event.watch in self._paths:
+            if event.mask & (SELF_MOVED | ENDED):
                 self._missing.add(self._paths.pop(event.watch))
             # a file that is only created has nothing in it yet: its writer closes or renames it
             if not event.mask & ENDED and (event.mask & DIRECTORY or not event.mask & CREATED):
                 self._note(now_s)
+
+    def _way_changed(self, now_s: float) -> None:
+        """Another directory may have one of the paths: find out which, when it is there."""
+        for watch in {**self._paths, **self._steps}:
+            self._inotify.remove(watch)
+        self._missing.update(self._paths.values())
+        self._paths.clear()
+        self._steps.clear()
+        self._look_s = 0.0
+        self._note(now_s)
 
     def _note(self, now_s: float) -> None:
         if self._since_s is None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.daemon.cache.survey import Survey, Usage
-from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.events.log import EventLog, MinuteLog
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.transport.connection import Connection
@@ -35,6 +35,8 @@ class Handshake:
     ----------
     operators, tell_live
         Told of a session that has ended.
+    departures
+        Logs how many clients left, a line a minute.
     """
 
     sessions: Sessions
@@ -44,6 +46,7 @@ class Handshake:
     operators: OperatorRequests
     survey: Survey
     tell_live: Callable[[Session], None] = lambda _session: None
+    departures: MinuteLog = field(default_factory=MinuteLog)
     _seen: Usage = field(default_factory=Usage)
     _settling: list[Session] = field(default_factory=list)
     _departed_before: list[Session] = field(default_factory=list)
@@ -117,7 +120,8 @@ class Handshake:
         """A client is gone, or said goodbye: what it held may be free now."""
         pid = session.peer.pid
         if session.held:
-            log.info("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
+            log.debug("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
+            self.departures.count("clients left", session.client, session.held_bytes)
         self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
         self.sessions.close(session)
         self.cells.left(session)

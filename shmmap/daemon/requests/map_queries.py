@@ -84,6 +84,7 @@ class MapQueries:
             id_prefix=cache.id_prefix, segment_prefix=cache.segment_prefix, cells=len(catalogue),
             bounds=catalogue.bounds, layers=self._kinds,
             budget_bytes=cache.ledger.budget_bytes, pid=os.getpid(), events=self.events_path,
+            origin=catalogue.frame.origin, crs=catalogue.frame.crs, unit_m=catalogue.frame.unit_m,
         )  # fmt: skip
 
     def answer(self, message: messages.Request) -> messages.Reply:

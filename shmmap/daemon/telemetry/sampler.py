@@ -119,18 +119,25 @@ class Sampler:
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
-        cache.events.pressure.turn(now_s)
+        cache.events.pressure.step(now_s)
+        cache.events.minutes.step(now_s)
         cache.events.late.turn(now_s)
+        cache.lost.report(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
             self.event_log.beat()
 
-    def _show_used(self) -> None:
-        """Bring hits and last use of some segments that were handed out up to date."""
+    def _show_used(self, now_s: float) -> None:
+        """Bring hits and last use of some segments that were handed out up to date.
+
+        One that others cut short is retired: its cell has failed at the client's, and is loaded again.
+        """
         cache = self.cache
         for _ in range(min(ROWS_AT_ONCE, len(cache.used))):
             resident = cache.used.pop()
             if cache.ledger.resident_named(resident.name) is resident:
+                if cache.retire_if_lost(resident, now_s):
+                    continue
                 cache.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
 
     def _beat(self, now_s: float, *, whole: bool) -> Iterator[None]:
@@ -145,7 +152,7 @@ class Sampler:
             cache.statistics.show_clients(self._rows.of(self.sessions))
             yield
             for _ in range(USED_ROWS_A_BEAT // ROWS_AT_ONCE):
-                self._show_used()
+                self._show_used(now_s)
                 yield
                 if not cache.used:
                     break
@@ -163,4 +170,5 @@ class Sampler:
         cache.statistics.beat(max_rows=0)
         if whole:
             yield
+            cache.statistics.restore(now_s)
             self.on_beat()

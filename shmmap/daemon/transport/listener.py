@@ -19,7 +19,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 from shmmap.daemon.transport.connection import TOO_MUCH, Connection
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
@@ -28,6 +28,7 @@ from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["MEMORY_ALLOWANCE_BYTES", "Connections", "Listener"]
 
+Socket: TypeAlias = socket.socket
 ACCEPTED_AT_ONCE: Final = 16
 ENDED_AT_ONCE: Final = 64
 LEAST_RESERVE: Final = 48
@@ -141,6 +142,15 @@ class Listener:
     most_bytes: int
     hear: Callable[[Connection, bytes, bool], None]
     on_ended: Callable[[Connection], None]
+
+    def move_to(self, other: Socket) -> None:
+        """Listen at another socket; the connections there are stay, and those that wait are accepted."""
+        for _ in range(0, socket.SOMAXCONN, ACCEPTED_AT_ONCE):
+            self._accept()
+        self.watched.unwatch(self.socket.fileno())
+        self.socket.close()
+        self.socket = other
+        self.begin()
 
     def begin(self) -> None:
         """Accept connections from now on."""

@@ -21,6 +21,7 @@ from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_o
 from shmmap.geometry import Area
 from shmmap.logfmt import escaped
 from shmmap.protocol.messages import Holder, Intent
+from shmmap.quantities import format_bytes
 from shmmap.segment.pins import MAX_SLOT
 
 __all__ = ["MOVES_AT_ONCE", "Session", "Sessions"]
@@ -183,6 +184,13 @@ class Sessions:
     def by_slot(self, slot: int) -> Session | None:
         """The session whose lock byte is ``slot``."""
         return self._by_slot.get(slot)
+
+    def largest_holder(self) -> str:
+        """Name, process and bytes of the client that was handed most; empty where none was handed any."""
+        most = max(self, key=lambda session: session.held_bytes, default=None)
+        if most is None or not most.held_bytes:
+            return ""
+        return f"{most.client or most.command} (pid {most.peer.pid}): {format_bytes(most.held_bytes)}"
 
     def spare(self) -> Session | None:
         """The session to give up when there are too many; None when everybody has just one.

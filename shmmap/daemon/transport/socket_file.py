@@ -1,32 +1,111 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Listening at a socket whose file only those may use who are meant to."""
+"""A listening socket and its file: never another program's, and noticed when it is removed."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import stat
+import struct
+from pathlib import Path
+from typing import Final
 
+from shmmap.errors import InstanceBusy
+from shmmap.logfmt import escaped
 from shmmap.segment.taken_name import name_taken
 
-__all__ = ["listen_at", "remove_socket"]
+__all__ = ["SocketFile", "refuse_taken"]
+
+_OTHERWISE: Final = "choose another --endpoint"
+_CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
-def listen_at(path: str, gid: int) -> socket.socket:
-    """Listen at ``path``, in place of a socket that may be left there.
+class SocketFile:
+    """Listens at a path, in place of a socket that a process of this user left there.
 
     Parameters
     ----------
+    path
+        Of the socket.
     gid
         Group that may connect; -1: only this user.
+    passed
+        A listening socket that the service manager passed: its file stays at the end.
+
+    Attributes
+    ----------
+    socket
+        It listens.
 
     Raises
     ------
+    InstanceBusy
+        A process answers there.
     CannotStart
-        One cannot listen there, or there is something else than a socket.
+        One cannot listen there, or something else has the name.
     """
-    remove_socket(path)
+
+    def __init__(self, path: str, gid: int, passed: socket.socket | None = None) -> None:
+        self.path = path
+        self._is_passed = passed is not None
+        self.socket = passed if passed is not None else _listen(path, gid)
+        with contextlib.suppress(OSError):
+            self._status: os.stat_result | None = None
+            self._status = os.lstat(path)
+
+    @property
+    def is_there(self) -> bool:
+        """Whether clients find this socket under its path."""
+        try:
+            found = os.lstat(self.path)
+        except OSError:
+            return False
+        return self._status is not None and os.path.samestat(found, self._status)
+
+    def remove(self) -> None:
+        """Remove the file; another program's of the same name stays."""
+        if self.is_there and not self._is_passed:
+            with contextlib.suppress(OSError):
+                os.unlink(self.path)
+
+    def close(self) -> None:
+        """Listen no more."""
+        self.socket.close()
+
+
+def refuse_taken(path: str) -> bool:
+    """Find out whether a socket may be made at ``path``; True if a stale one of this user is in its place.
+
+    Raises
+    ------
+    InstanceBusy
+        A process answers there; the message names it.
+    CannotStart
+        Something else has the name, or another user's socket.
+    """
+    try:
+        status = os.lstat(path)
+    except OSError:  # nothing is there, or the place itself is wrong: `bind` says what
+        return False
+    if not stat.S_ISSOCK(status.st_mode):
+        raise name_taken("the socket", path, None, otherwise=_OTHERWISE)
+    pid = _answers(path)
+    if pid is not None:
+        raise InstanceBusy(
+            f"the socket cannot be {path}: it is in use by {_program(pid)}",
+            hint=f"stop that program, or {_OTHERWISE}",
+        )
+    if status.st_uid != os.geteuid():
+        raise name_taken("the socket", path, None, otherwise=_OTHERWISE)
+    return True
+
+
+def _listen(path: str, gid: int) -> socket.socket:
+    if refuse_taken(path):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)
     listening = socket.socket(socket.AF_UNIX)
     listening.setblocking(False)
     # the file is made with the umask's mode; nobody may connect before it is right
@@ -38,18 +117,51 @@ def listen_at(path: str, gid: int) -> socket.socket:
         listening.listen(socket.SOMAXCONN)
     except OSError as error:
         listening.close()
-        raise name_taken("the socket", path, error, otherwise="choose another --endpoint") from error
+        raise name_taken("the socket", path, error, otherwise=_OTHERWISE) from error
     finally:
         os.umask(mask)
     return listening
 
 
-def remove_socket(path: str) -> None:
-    """Remove a socket's file; nothing else that may be there."""
-    with contextlib.suppress(OSError):
-        if _is_socket(path):
-            os.unlink(path)
+def _answers(path: str) -> int | None:
+    """Process that has the socket at ``path`` open, 0 where it is not known which; None: nobody has."""
+    for kind in (socket.SOCK_STREAM, socket.SOCK_SEQPACKET, socket.SOCK_DGRAM):
+        with socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK) as probe:
+            try:
+                probe.connect(path)
+                credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+                pid = _CREDENTIALS.unpack(credentials)[0]
+                return pid if pid > 0 and os.path.exists(f"/proc/{pid}") else _owner(path)
+            except (ConnectionRefusedError, FileNotFoundError):
+                return None
+            except OSError as error:
+                if error.errno != errno.EPROTOTYPE:  # else it is of another kind
+                    return _owner(path)
+    return _owner(path)
 
 
-def _is_socket(path: str) -> bool:
-    return stat.S_ISSOCK(os.lstat(path).st_mode)
+def _owner(path: str) -> int:
+    """Process that has an open socket with this path; 0 where the kernel does not show it."""
+    inodes = set()
+    with contextlib.suppress(OSError), open("/proc/net/unix", errors="surrogateescape") as table:
+        for line in table:
+            row = line.rstrip("\n").split(maxsplit=7)
+            if len(row) == 8 and row[7] == path:
+                inodes.add(f"socket:[{row[6]}]")
+    for process in Path("/proc").glob("[0-9]*") if inodes else ():
+        with contextlib.suppress(OSError):
+            if any(os.readlink(fd) in inodes for fd in process.joinpath("fd").iterdir()):
+                return int(process.name)
+    return 0
+
+
+def _program(pid: int) -> str:
+    """A process for a message: its id and its program."""
+    if not pid:
+        return "a process that this user does not see"
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0").split(b"\0")
+        name = os.fsdecode(b" ".join(words[:4]))[:80] or Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        name = ""
+    return f"pid {pid} ({escaped(name)})" if name else f"pid {pid}"

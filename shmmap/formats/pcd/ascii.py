@@ -1,34 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points of ``ascii`` PCD files, as blocks of columns.
-
-Integers are parsed as integers, so 64-bit values are exact; float64 is correctly rounded; float32
-is the correctly rounded float64, rounded once more.
-"""
+"""The points of ``ascii`` PCD files, as blocks of columns."""
 
 from __future__ import annotations
 
-import re
-from array import array
-from collections.abc import Callable, Iterator
-from decimal import Decimal, InvalidOperation
-from typing import Any, Final
+from collections.abc import Iterator
 
-import numpy as np
-from numpy.typing import NDArray
-
-from shmmap.errors import MapDataError
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.header import PcdHeader
 from shmmap.formats.pcd.table import FieldTable, RawBlock
 from shmmap.formats.source_file import SourceFile
+from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
 __all__ = ["ascii_blocks"]
-
-_CHUNK_BYTES: Final = 1 << 18
-_LINE_LIMIT_BYTES: Final = 1 << 20
-_NUMBER: Final = re.compile(
-    rb"[+-]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf(?:inity)?|nan)\Z", re.IGNORECASE
-)
 
 
 def ascii_blocks(
@@ -42,10 +25,10 @@ def ascii_blocks(
         ``bad_row`` with the row (counted from 1) and its byte offset, or ``truncated`` when there
         are fewer rows than points.
     """
-    parser = _AsciiParser(source.path, table)
+    parser = RowParser(source.path, table)
     left = header.points
-    for offset, text in _whole_lines(source):
-        ends = _line_ends(text)
+    for offset, text in whole_lines(source):
+        ends = line_ends(text)
         line = at = 0
         while line < len(ends) and left:
             line = min(line + min(block_points, left), len(ends))
@@ -68,194 +51,3 @@ def ascii_blocks(
         warnings.append(f"{parser.skipped} blank or comment lines among the points ignored")
     if parser.surplus:
         warnings.append(f"{parser.surplus} lines after the last point ignored")
-
-
-def _whole_lines(source: SourceFile) -> Iterator[tuple[int, bytes]]:
-    """Yield (offset, text) with whole lines of the rest of the file; the last may lack its newline."""
-    carry = b""
-    while source.left:
-        offset = source.at - len(carry)
-        text = carry + source.read(min(source.left, _CHUNK_BYTES)).tobytes()
-        end = text.rfind(b"\n") + 1 if source.left else len(text)
-        carry = text[end:]
-        if len(carry) > _LINE_LIMIT_BYTES:
-            raise refusal(
-                "bad_row",
-                f"a line longer than {_LINE_LIMIT_BYTES} bytes",
-                path=source.path,
-                offset=offset + end,
-            )
-        if end:
-            yield offset, text[:end]
-
-
-def _line_ends(text: bytes) -> NDArray[np.intp]:
-    """Offsets just after each line of ``text``, whose last line may lack its newline."""
-    ends = np.flatnonzero(np.frombuffer(text, np.uint8) == 0x0A) + 1
-    return ends if text.endswith(b"\n") else np.append(ends, len(text))
-
-
-class _AsciiParser:
-    """Turns whole lines into columns."""
-
-    def __init__(self, path: str, table: FieldTable) -> None:
-        self.path = path
-        self.table = table
-        self.values = table.values
-        self.rows = 0
-        self.skipped = 0
-        self.surplus = 0
-        self.places: dict[str, int] = {}
-        place = 0
-        for field in table.fields:
-            if not field.padding:
-                self.places[field.name] = place
-            place += field.count
-
-    def parse(self, text: bytes, offset: int) -> tuple[NDArray[Any], ...]:
-        """Return the columns of the points in ``text``, which starts at byte ``offset`` of the file."""
-        tokens = text.split()
-        if b"#" in text or not self._regular(text, len(tokens)):
-            tokens = self._tokens_line_by_line(text, offset)
-        rows = len(tokens) // self.values
-        try:
-            # Python's own literals may have underscores, numbers in files not
-            block = self._columns(tokens, rows, fast=b"_" not in text)
-        except _BadTokenError as bad:
-            raise self._bad_row(text, offset, bad) from None
-        self.rows += rows
-        return block
-
-    def count_surplus(self, text: bytes) -> None:
-        """Count what follows the last point: blank and comment lines are no surprise there either."""
-        for line in text.splitlines():
-            words = line.split()
-            if words and not words[0].startswith(b"#"):
-                self.surplus += 1
-            else:
-                self.skipped += 1
-
-    def _regular(self, text: bytes, tokens: int) -> bool:
-        """Whether every line holds exactly the right number of values: checked without a loop."""
-        codes = np.frombuffer(text, np.uint8)
-        space = (codes == 0x20) | ((codes - np.uint8(9)) < 5)
-        starts = ~space
-        starts[1:] &= space[:-1]
-        ends = _line_ends(text) - 1
-        if tokens != len(ends) * self.values:
-            return False
-        firsts = np.flatnonzero(starts)
-        if len(firsts) != tokens:
-            return False
-        lasts = firsts[self.values - 1 :: self.values]
-        heads = firsts[:: self.values]
-        return bool((lasts <= ends).all() and (heads[1:] > ends[:-1]).all())
-
-    def _tokens_line_by_line(self, text: bytes, offset: int) -> list[bytes]:
-        tokens: list[bytes] = []
-        at, row = offset, self.rows
-        for line in text.split(b"\n"):
-            words = line.split()
-            if not words or words[0].startswith(b"#"):
-                self.skipped += 1
-            else:
-                row += 1
-                if len(words) != self.values:
-                    raise self._row_error(row, at, f"{len(words)} values, {self.values} are needed")
-                tokens += words
-            at += len(line) + 1
-        if not text or text.endswith(b"\n"):
-            self.skipped -= 1  # what follows the last newline is no line
-        return tokens
-
-    def _columns(self, tokens: list[bytes], rows: int, *, fast: bool) -> tuple[NDArray[Any], ...]:
-        block = self.table.empty_block(rows)
-        for axis, field in enumerate(self.table.axes):
-            values = _parse(tokens[self.places[field.name] :: self.values], field.dtype, fast=fast)
-            self.table.put_axis(block[0], axis, values, self.path)
-        for column, field in zip(block[1:], self.table.others, strict=True):
-            for part in range(field.count):
-                place = self.places[field.name] + part
-                values = _parse(tokens[place :: self.values], field.dtype, fast=fast)
-                if field.count == 1:
-                    column[...] = values
-                else:
-                    column[:, part] = values
-        return block
-
-    def _bad_row(self, text: bytes, offset: int, bad: _BadTokenError) -> MapDataError:
-        """Find the line of the bad value, for the message."""
-        at, row = offset, 0
-        for line in text.split(b"\n"):
-            words = line.split()
-            if words and not words[0].startswith(b"#"):
-                if row == bad.row:
-                    break
-                row += 1
-            at += len(line) + 1
-        shown = bad.token[:40].decode("latin-1")
-        return self._row_error(
-            self.rows + bad.row + 1, at, f"{shown!r} is not a number of type {bad.dtype.str[1:]}"
-        )
-
-    def _row_error(self, row: int, offset: int, message: str) -> MapDataError:
-        return refusal("bad_row", f"row {row}: {message}", path=self.path, offset=offset)
-
-
-class _BadTokenError(Exception):
-    """A value that does not fit its type; rows counted from 0 within the text being parsed."""
-
-    def __init__(self, row: int, token: bytes, dtype: np.dtype[Any]) -> None:
-        super().__init__(token)
-        self.row = row
-        self.token = token
-        self.dtype = dtype
-
-
-def _parse(words: list[bytes], dtype: np.dtype[Any], *, fast: bool) -> NDArray[Any]:
-    """Parse all ``words`` as ``dtype``; ``fast`` allows Python's own parsers."""
-    if dtype.kind == "f":
-        parsed = _parse_fast(words, float, np.dtype(np.float64)) if fast else None
-        if parsed is None:
-            parsed = np.array([_number(row, word, dtype) for row, word in enumerate(words)], np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return parsed.astype(dtype)
-    wide = np.dtype(np.int64 if dtype.kind == "i" else np.uint64)
-    parsed = _parse_fast(words, int, wide) if fast else None
-    limits = np.iinfo(dtype)
-    if parsed is None or (len(parsed) and not (limits.min <= parsed.min() and parsed.max() <= limits.max)):
-        parsed = np.array([_integer(row, word, dtype, limits) for row, word in enumerate(words)], wide)
-    return parsed.astype(dtype)
-
-
-def _parse_fast(
-    words: list[bytes], convert: Callable[[bytes], Any], dtype: np.dtype[Any]
-) -> NDArray[Any] | None:
-    """Parse all words by one built-in function, or return None if one of them is unusual."""
-    try:
-        if dtype.kind == "u":
-            # numpy before 2 takes -1 for 2**64 - 1; an array refuses it
-            return np.asarray(array("Q", map(convert, words)))
-        return np.fromiter(map(convert, words), dtype, len(words))
-    except (ValueError, OverflowError):
-        return None
-
-
-def _number(row: int, word: bytes, dtype: np.dtype[Any]) -> float:
-    if not _NUMBER.match(word):
-        raise _BadTokenError(row, word, dtype)
-    return float(word)
-
-
-def _integer(row: int, word: bytes, dtype: np.dtype[Any], limits: np.iinfo[Any]) -> int:
-    """Parse one integer; ``3.0`` and ``4.2e6`` are integers too, some writers print them so."""
-    if not _NUMBER.match(word):
-        raise _BadTokenError(row, word, dtype)
-    try:
-        exact = Decimal(word.decode())
-        fits = exact.is_finite() and exact.adjusted() < 20 and exact == exact.to_integral_value()
-    except InvalidOperation:
-        fits = False
-    if not fits or not limits.min <= int(exact) <= limits.max:
-        raise _BadTokenError(row, word, dtype)
-    return int(exact)

@@ -16,7 +16,7 @@ from shmmap.formats.pcd.table import FieldTable, RawBlock
 from shmmap.formats.scratch import borrow_scratch
 from shmmap.formats.source_file import SourceFile
 
-__all__ = ["binary_blocks", "check_sizes", "compressed_blocks", "field_arrays"]
+__all__ = ["binary_blocks", "check_sizes", "compressed_blocks", "field_arrays", "record_blocks"]
 
 _BLOCK_BYTES: Final = 1 << 20  # of file data per block, at most
 _BYTE: Final = np.dtype(np.uint8)
@@ -26,9 +26,16 @@ def binary_blocks(
     source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int
 ) -> Iterator[RawBlock]:
     """Yield blocks of a ``binary`` body: records of all fields, one point after the other."""
-    points, point_bytes = header.points, header.point_bytes
+    yield from record_blocks(source, header.points, table, table.record, block_points)
+
+
+def record_blocks(
+    source: SourceFile, points: int, table: FieldTable, record: np.dtype[Any], block_points: int
+) -> Iterator[RawBlock]:
+    """Yield blocks of ``points`` records of type ``record``, which has the fields of ``table`` by name."""
     if not points:
         return
+    point_bytes = record.itemsize
     rows = _balanced(points, min(block_points, _BLOCK_BYTES // point_bytes))
     with borrow_scratch() as scratch:
         raw, *columns = scratch.cut(((rows * point_bytes,), _BYTE), *table.block_shapes(rows))
@@ -36,13 +43,8 @@ def binary_blocks(
             count = min(rows, points - start)
             part = raw[: count * point_bytes]
             source.read_into(part)
-            records = part.view(table.record)
             block = tuple(columns) if count == rows else tuple(column[:count] for column in columns)
-            # one strided copy per axis: a copy of (N, 3) at once takes four times as long
-            for axis, field in enumerate(table.axes):
-                table.put_axis(block[0], axis, records[field.name], source.path)
-            for column, field in zip(block[1:], table.others, strict=True):
-                column[...] = records[field.name]
+            table.put_records(block, part.view(record), source.path)
             yield block, ()
 
 

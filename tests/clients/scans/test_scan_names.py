@@ -17,7 +17,7 @@ from shmmap import BadRequest
 def ordered(names: str) -> str:
     """Names of scans with blanks between them, shuffled and put in order."""
     files = [Path(f"{name}.npz") for name in names.split()]
-    np.random.default_rng(0).shuffle(files)  # type: ignore[arg-type]
+    np.random.default_rng(0).shuffle(files)
     return " ".join(path.name.removesuffix(".npz") for path in in_order(files))
 
 

@@ -275,7 +275,7 @@ def test_other_instances_are_named(place: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("shmmap.protocol.endpoint.SYSTEM_RUNTIME_DIR", str(place / "system"))
     with (
         listening(directory / "garage.sock"),
-        pytest.raises(NoSocket, match=r"garage; name one with SHMMAP_INSTANCE"),
+        pytest.raises(NoSocket, match=r"garage; name one: connect"),
     ):
         shmmap.connect()
 

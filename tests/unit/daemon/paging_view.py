@@ -47,6 +47,7 @@ class PagingView:
         )
         self.id_prefix: Final = whole.id_prefix
         self.problems: Final = ()
+        self.opened: Final = None
         self.frame: Final = whole.frame
 
     @property

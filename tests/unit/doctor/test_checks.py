@@ -128,6 +128,10 @@ def test_a_directory_that_is_no_tmpfs(ward: Ward) -> None:
         ("4:memory:/x", "/sys/fs/cgroup/memory/x/memory.limit_in_bytes", str(1 << 30), 1 << 30, "fail"),
         ("4:memory:/x", "/sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712", 1 << 30, "ok"),
         ("3:cpu:/x", "/sys/fs/cgroup/memory/x/memory.limit_in_bytes", str(1 << 20), 1 << 30, "ok"),
+        # what the daemon chooses by itself, it does not find fault with
+        ("0::/a/b", "/sys/fs/cgroup/a/b/memory.max", str(300 << 20), 150 << 20, "ok"),
+        ("0::/a/b", "/sys/fs/cgroup/a/b/memory.max", str(300 << 20), 151 << 20, "fail"),
+        ("0::/a/b", "/sys/fs/cgroup/a/memory.max", str(2 << 30), (2 << 30) - (256 << 20), "ok"),
     ],
 )
 def test_limits_of_the_control_group(
@@ -140,6 +144,18 @@ def test_limits_of_the_control_group(
     assert ("lower the budget" in found.advice) == (state == "fail")
 
 
+def test_what_the_processes_use_beside_the_segments(ward: Ward) -> None:
+    """Measured while the daemon runs: pages of a tmpfs are the segments' own, and not counted again."""
+    ward.file("/proc/self/cgroup", "0::/a\n")
+    ward.file("/sys/fs/cgroup/a/memory.max", f"{300 << 20}\n")
+    for used, state in ((100 << 20, "ok"), (200 << 20, "warn")):
+        ward.file("/sys/fs/cgroup/a/memory.stat", f"anon {used}\nshmem {150 << 20}\nfile {150 << 20}\n")
+        patient = ward.patient(told(budget_bytes=150 << 20), budget_bytes=150 << 20)
+        found = memory.check_memory_limit(patient)
+        assert found.state == state
+        assert f"its processes use {used >> 20} MiB" in found.fact
+
+
 def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
     assert memory.check_cache(ward.patient()).state == "ok"
     seen = told(refused_over_budget_10min=3, budget_bytes=1 << 20)
@@ -147,6 +163,8 @@ def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
     verdict = cache_verdict(seen.counters)
     assert (found.state, found.fact, found.advice) == ("warn", verdict.text, verdict.hint)
     assert found.fact.startswith("TOO SMALL")
+    seen = told(refused_over_budget_10min=3, refused_over_budget_1min=1, budget_bytes=1 << 20)
+    assert memory.check_cache(ward.patient(seen)).state == "fail", "clients lack cells now"
     assert memory.check_cache(ward.patient(told(evictions=3))).state == "ok"
 
 

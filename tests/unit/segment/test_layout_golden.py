@@ -22,7 +22,7 @@ from tests.support.segment_reader import parse
 
 # offset and bytes of everything that is not zero in the header below
 GOLDEN = {
-    0: "53484d4d415000010100020004030201",  # magic, 1.2, byte order
+    0: "53484d4d415000010100030004030201",  # magic, 1.3, byte order
     16: "00100000000000008010000000000000",  # 4096 header bytes, 4224 total
     32: "02000000000000000300000000000000",  # 2 rows of 3 points
     48: "01000000000000002c01000000000000",  # 1 dropped, source of 300 bytes
@@ -48,7 +48,7 @@ GOLDEN = {
     752: "020000000000000000ffeeddccbbaa99",  # 2 bytes, checksum
     768: "2f6d2f612e706364706f696e74736d61",  # /m/a.pcd points ma
     784: "70000000000000000000000000000000",  # p
-    4016: "0000000000000000cb5a799200000000",  # CRC at 4024
+    4016: "0000000000000000e30a1bc700000000",  # CRC at 4024
 }
 GOLDEN_PUBLISH = "5055424c49534800 0807060504030201 1817161514131211" + "00" * 32 + "aecf54c3 00000000"
 
@@ -248,6 +248,15 @@ def test_the_lattice_s_golden_bytes() -> None:
     assert page[216:288] == bytes.fromhex(LATTICE_BYTES)
     assert page[:216] == golden_page()[:216]
     assert page[288:4024] == golden_page()[288:4024]
+    assert unpack_header(memoryview(page), 4224) == header
+
+
+def test_points_outside_the_box_golden_bytes() -> None:
+    header = replace(golden_header(), outside_points=0x0102030405060708)
+    page = pack_header(header)
+    assert page[288:296] == bytes.fromhex("0807060504030201")
+    assert page[:288] == golden_page()[:288]
+    assert page[296:4024] == golden_page()[296:4024]
     assert unpack_header(memoryview(page), 4224) == header
 
 

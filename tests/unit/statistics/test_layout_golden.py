@@ -22,12 +22,12 @@ TWO = (
 )
 LOAD = (Counter("load", "histogram", "ns", "How long"),)
 GOLDEN_START = (
-    "53484d5354415401 0100 0400 04030201"  # magic, 1.4, byte order
+    "53484d5354415401 0100 0500 04030201"  # magic, 1.5, byte order
     "80000000 02000000 a0000000"  # descriptions at 128: 2 of 160 bytes
     "80020000 00400000"  # identity at 640, 16384 bytes each
     "80820000 80040000"  # state at 33408, 1152 bytes each
     "808b0000 00100200 00010000 00000200"  # table 35712, rows at 135168 of 256, at most 131072
-    "7ef9a300"
+    "b223c556"
     "01000000 82000000 00900000 00010000 00010000"  # 1 histogram of 130; clients at 36864, 256 of 256
     "c08b0000 00900100 00020000 40000000"
     + "00" * 24
@@ -185,6 +185,27 @@ def test_long_ids_keep_their_end_and_say_so() -> None:
     assert row.layer_cut
     assert row.id == "ä" * 50 + "end"
     assert row.layer == "l" * 40
+
+
+@pytest.mark.parametrize(
+    "layer", ["ndt(leaf=2.0,min_points=6,regularization=0.01)", "l" * 135, "ä" * 67, "l" * 40]
+)
+def test_a_long_layer_is_whole_where_the_row_has_room(layer: str) -> None:
+    """What its field lacks lies behind the id."""
+    row = unpack_cell(
+        memoryview(pack_cell(CellRow("20_0.pcd", layer, 1, "0" * 16, "resident", 1, 1, ROW.box)))
+    )
+    assert row is not None
+    assert (row.id, row.layer, row.layer_cut, row.whole_layer) == ("20_0.pcd", layer, False, layer)
+    wide = unpack_cell(
+        memoryview(pack_cell(CellRow("x" * 100, layer, 1, "0" * 16, "resident", 1, 1, ROW.box)))
+    )
+    assert wide is not None
+    assert wide.id == "x" * 100
+    assert wide.layer_cut == (len(layer.encode()) > 44)
+    assert wide.whole_layer == layer or (
+        wide.whole_layer == wide.layer + "…" and layer.startswith(wide.layer)
+    )
 
 
 def test_ids_that_are_no_utf8_survive() -> None:

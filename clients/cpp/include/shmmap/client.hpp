@@ -107,6 +107,13 @@ inline std::string variable(const char* name) {
   return value != nullptr ? value : "";
 }
 
+/// Whether a directory that anybody could have made is this user's own.
+inline bool is_private(const std::string& directory) {
+  struct stat status {};
+  return ::lstat(directory.c_str(), &status) == 0 && S_ISDIR(status.st_mode) && status.st_uid == ::geteuid() &&
+         (status.st_mode & 077U) == 0;
+}
+
 /// The sockets to try, the first one first.
 inline std::vector<std::string> endpoints(std::string given) {
   if (given.empty()) given = variable("SHMMAP_ENDPOINT");
@@ -115,9 +122,13 @@ inline std::vector<std::string> endpoints(std::string given) {
   const std::string named = variable("SHMMAP_INSTANCE"), directory = variable("SHMMAP_RUNTIME_DIR");
   const std::string file = "/" + (named.empty() ? "default" : named) + ".sock";
   if (!directory.empty()) return {directory + file};
-  const std::string users = variable("XDG_RUNTIME_DIR");
-  if (users.empty()) return {"/run/shmmap" + file};
-  return {users + "/shmmap" + file, "/run/shmmap" + file};
+  std::vector<std::string> found;
+  const std::string users = variable("XDG_RUNTIME_DIR");  // one that is not absolute is to be ignored
+  if (!users.empty() && users[0] == '/') found.push_back(users + "/shmmap" + file);
+  const std::string fallback = "/tmp/shmmap-" + std::to_string(::geteuid());
+  if (is_private(fallback)) found.push_back(fallback + file);
+  found.push_back("/run/shmmap" + file);
+  return found;
 }
 
 }  // namespace detail

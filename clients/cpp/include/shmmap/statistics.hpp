@@ -73,7 +73,7 @@ struct Histogram {
 
 /// One segment that the daemon keeps.
 struct KeptCell {
-  std::string id, layer, segment;  ///< the end of a long id, the start of a long layer
+  std::string id, layer, segment;  ///< the end of a long id, the start of a layer too long for the row
   enum class State { resident = 1, stale, retired } state = State::resident;
   std::uint64_t version = 0, bytes = 0, points = 0, hits = 0;
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
@@ -372,8 +372,12 @@ class StatisticsReader {
         cell.segment = detail::fixed_text(row + 80, 16);
         cell.state = static_cast<KeptCell::State>(row[96]);
         cell.ahead = (row[97] & 4U) != 0;
-        cell.layer = detail::fixed_text(row + 104, std::min<std::size_t>(read_at<std::uint16_t>(row, 100), 40));
-        cell.id = detail::fixed_text(row + 144, std::min<std::size_t>(read_at<std::uint16_t>(row, 98), 104));
+        const std::size_t layer_bytes = read_at<std::uint16_t>(row, 100);
+        const auto id_bytes = std::min<std::size_t>(read_at<std::uint16_t>(row, 98), 104);
+        cell.id = detail::fixed_text(row + 144, id_bytes);
+        cell.layer = detail::fixed_text(row + 104, std::min<std::size_t>(layer_bytes, 40));
+        if (layer_bytes > 40)  // its rest lies behind the id
+          cell.layer += detail::fixed_text(row + 144 + id_bytes, std::min<std::size_t>(layer_bytes - 40, 104 - id_bytes));
         found.cells.push_back(std::move(cell));
       });
       if (before % 2 == 0 && before == at<std::uint64_t>(file_.bytes(header_->table, 8), 0)) return;

@@ -148,11 +148,14 @@ class OdometryListener:
                     entry = decode_pose(self._subscriber.receive()[0])
                 except BadRequest:
                     continue  # somebody else's message
-                with self._heard:
-                    if entry.stamp_s < self._latest_s - _RESTARTED_S:
-                        self._entries.clear()  # its clock was set back, or it began again
-                        self._latest_s = -math.inf
-                    self._entries.append(entry)
-                    del self._entries[:-_KEPT]
-                    self._latest_s = max(self._latest_s, entry.stamp_s)
-                    self._heard.notify_all()
+                self._take(entry)
+
+    def _take(self, entry: PoseMessage) -> None:
+        with self._heard:
+            if entry.stamp_s < self._latest_s - _RESTARTED_S:
+                self._entries.clear()  # its clock was set back, or it began again
+                self._latest_s = -math.inf
+            self._entries.append(entry)
+            del self._entries[:-_KEPT]
+            self._latest_s = max(self._latest_s, entry.stamp_s)
+            self._heard.notify_all()

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from shmmap.cli.screens.refusals import failure_lines, holder_rows
+from shmmap.cli.screens.refusals import holder_rows
 from shmmap.errors import CellError, LoadFailed, OverBudget
+from shmmap.lacking import failure_lines
 from shmmap.protocol.messages import Holder
 
 FULL = "the budget of 1.0 MiB is in use"

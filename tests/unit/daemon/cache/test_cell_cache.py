@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import pytest
 
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.loading import worker_messages
+from shmmap.daemon.loading import lost_workers, worker_messages
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.worker_pool import Worker
 from shmmap.daemon.records import Failure, Key
@@ -240,6 +240,25 @@ def test_a_signal_without_a_name(puppet: Puppet) -> None:
     puppet.say(worker_messages.Ended(-39))
     puppet.channel.close()
     assert ["signal 39" in failure.message for failure in one.cells_of(1).failed] == [True]
+
+
+@pytest.mark.parametrize("kills", [0, 1])
+def test_a_loader_that_is_killed(puppet: Puppet, monkeypatch: pytest.MonkeyPatch, kills: int) -> None:
+    """If the kernel has killed for lack of memory, the file is not to blame: it need not change."""
+    one = puppet.one
+    monkeypatch.setattr(lost_workers, "out_of_memory_kills", lambda: one.scheduler.lost.oom_kills + kills)
+    monkeypatch.setattr(lost_workers, "memory_limit_bytes", lambda: 300 << 20)
+    ask(one, 1)
+    job = puppet.queue(4)[0]
+    puppet.say(worker_messages.Ended(-signal.SIGKILL))
+    (failed,) = one.cells_of(1).failed
+    assert failed.code == "load_failed"
+    allowed = "out of memory: the kernel killed the loader (the control group allows 300 MiB)"
+    told = allowed if kills else "the loader was killed (signal SIGKILL): by a person or a program"
+    assert failed.message == f"{job.path}: {told}"
+    (failure,) = one.scheduler.loads.failures.values()
+    assert (failure.stamp is None) is bool(kills)
+    puppet.channel.close()
 
 
 def test_done_without_a_segment(puppet: Puppet) -> None:

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
-from shmmap.daemon.events.log import REMEMBERED, EventLog, PressureEvents
+import logging
+
+import pytest
+
+from shmmap.daemon.events.log import REMEMBERED, EventLog, MinuteLog, PressureEvents
 from shmmap.protocol import events as e
 
 MEMORY = (100, 90, 80, 70)
@@ -55,8 +59,51 @@ def test_pressure_is_told_once_a_second() -> None:
     pressure = PressureEvents(log_of(sent), lambda: MEMORY)
     for tenth in range(25):
         pressure.refused(f"{tenth}.pcd", "points", "over_budget", tenth / 10)
-    pressure.turn(2.5)
-    pressure.turn(3.0)
-    pressure.turn(9.0)
+    pressure.step(2.5)
+    pressure.step(3.0)
+    pressure.step(9.0)
     told = [(event.id, event.refused) for event in sent if isinstance(event, e.Pressure)]
     assert told == [("0.pcd", 1), ("10.pcd", 10), ("20.pcd", 10), ("24.pcd", 4)]
+
+
+def test_what_happens_often_is_a_line_a_minute(caplog: pytest.LogCaptureFixture) -> None:
+    """The first at once; then what has come since, however much it is."""
+    minutes = MinuteLog()
+    with caplog.at_level(logging.INFO, "shmmap"):
+        minutes.count("cells evicted", "budget", 100)
+        minutes.step(5.0)
+        for number in range(10_000):
+            minutes.count("cells evicted", "budget" if number % 10 else "request", 10)
+            minutes.count("clients left", f"client {number % 5}", 1)
+            minutes.step(5.0 + number * 0.005)
+        assert [line.split(" of=")[0] for line in caplog.messages] == [
+            "cells evicted count=1 bytes=100",
+            "clients left count=1 bytes=1",
+        ]
+        minutes.step(65.0)
+        minutes.step(66.0)
+        assert caplog.messages[2:] == [
+            'cells evicted count=10000 bytes=100000 of="9000 budget, 1000 request"',
+            'clients left count=9999 bytes=9999 of="2000 client 1, 2000 client 2, 2000 client 3 and 2 more"',
+        ]
+        minutes.step(1e6)
+        assert len(caplog.messages) == 4, "where nothing happens, nothing is said"
+
+
+@pytest.mark.parametrize(
+    ("code", "setting"),
+    [("over_budget", "--budget"), ("quota", "--session-quota"), ("no_space", "--shm-dir")],
+)
+def test_refusals_are_a_line_a_minute_with_holder_and_setting(
+    caplog: pytest.LogCaptureFixture, code: str, setting: str
+) -> None:
+    pressure = PressureEvents(log_of([]), lambda: MEMORY, lambda: "planner (pid 7): 3.0 MiB")
+    with caplog.at_level(logging.WARNING, "shmmap"):
+        for step in range(700):
+            pressure.refused(f"{step}.pcd", "points", code, step / 10)
+    first, second = caplog.messages
+    assert first.startswith(f"cells refused for lack of memory count=1 code={code} last=0.pcd layer=points")
+    assert second.startswith(f"cells refused for lack of memory count=600 code={code} last=600.pcd")
+    for line in (first, second):
+        assert 'most_is_held_by="planner (pid 7): 3.0 MiB"' in line
+        assert setting in line

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
+from shmmap.daemon.host.cgroup_memory import memory_limit_bytes, out_of_memory_kills
 
 
 def tree(root: Path, cgroup: str, mounts: str, limits: dict[str, str]) -> str:
@@ -67,3 +67,10 @@ def test_nothing_there(tmp_path: Path) -> None:
 def test_of_this_process() -> None:
     limit = memory_limit_bytes()
     assert limit is None or limit > 1 << 20
+
+
+def test_processes_killed_for_lack_of_memory(tmp_path: Path) -> None:
+    (tmp_path / "vmstat").write_text("oom_kill_disable 7\nnr_free_pages 1\noom_kill 3\n")
+    assert out_of_memory_kills(str(tmp_path / "vmstat")) == 3
+    assert out_of_memory_kills(str(tmp_path / "none")) == 0
+    assert out_of_memory_kills() >= 0

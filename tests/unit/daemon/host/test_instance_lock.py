@@ -73,12 +73,49 @@ def test_a_file_left_by_a_killed_process_is_no_hindrance(tmp_path: Path) -> None
     InstanceLock(str(path)).release()
 
 
-def test_a_file_with_anything_in_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("left", [b"", b"1\n", b"99999999", bytes(16)])
+def test_what_a_daemon_or_a_power_cut_left_is_replaced(tmp_path: Path, left: bytes) -> None:
     path = tmp_path / "a.lock"
-    path.write_bytes(b"\xff" * 1000)
+    path.write_bytes(left)
     lock = InstanceLock(str(path))
     assert path.read_text() == f"{os.getpid()}\n"
     lock.release()
+
+
+def test_another_program_s_file_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a.lock"
+    path.write_text("precious")
+    with pytest.raises(CannotStart, match="there is a file of"):
+        InstanceLock(str(path))
+    assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize("left", ["", "1\n"])
+def test_refused_for_another_reason(tmp_path: Path, left: str) -> None:
+    """Nothing is changed: the file may be another program's after all."""
+    path = tmp_path / "a.lock"
+    if left:
+        path.write_text(left)
+
+    def check() -> None:
+        raise InstanceBusy("its socket is in use")
+
+    with pytest.raises(InstanceBusy, match="its socket"):
+        InstanceLock(str(path), check)
+    assert (path.read_text() if path.exists() else "") == left
+
+
+def test_a_lock_file_that_a_cleaner_removed(tmp_path: Path) -> None:
+    """It is made again, and hinders a second daemon as before."""
+    path = tmp_path / "a.lock"
+    lock = InstanceLock(str(path))
+    path.unlink()
+    lock.restore()
+    lock.restore()
+    with pytest.raises(InstanceBusy, match=f"pid {os.getpid()}"):
+        InstanceLock(str(path))
+    lock.release()
+    assert not path.exists()
 
 
 def test_a_predecessor_whose_file_was_removed_leaves_its_successor_s_alone(tmp_path: Path) -> None:

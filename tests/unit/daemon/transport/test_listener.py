@@ -27,7 +27,7 @@ from shmmap.daemon.transport.connection import (
 )
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.listener import LEAST_SHARE, MEMORY_ALLOWANCE_BYTES, Connections, Listener
-from shmmap.daemon.transport.socket_file import listen_at
+from shmmap.daemon.transport.socket_file import SocketFile
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.daemon.transport.zmtp import GREETING, framed
 from shmmap.errors import Busy
@@ -71,7 +71,7 @@ class Loop:
         self.counts = Counts()
         self.heard: list[tuple[Connection, bytes, bool]] = []
         self.ended: list[Connection] = []
-        self.socket = listen_at(self.path, -1)
+        self.socket = SocketFile(self.path, -1).socket
         self.context: zmq.Context[Any] = zmq.Context()
         self.held: list[socket.socket] = []
         self.listener = Listener(

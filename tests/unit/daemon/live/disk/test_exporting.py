@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import plyfile
 import pytest
 from numpy.typing import NDArray
 
@@ -17,9 +18,8 @@ from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.map_files import MapSettings
 from shmmap.dividing.frame import Translation
 from shmmap.errors import BadRequest, MapDataError
-from shmmap.formats.open3d_reader import read_with_open3d
+from shmmap.formats.cloud import read_cloud
 from tests.support.live_drive import RESOLUTION
-from tests.support.open3d_package import open3d_or_skip
 from tests.support.pcd_files import read_pcd
 from tests.support.slow_occupancy import Voxel
 from tests.support.stored_live_map import contents, stored_drive
@@ -143,15 +143,18 @@ def test_far_from_the_origin(
 
 
 def test_others_read_the_ply_file(directory: Path) -> None:
-    open3d_or_skip()
     stored_drive(directory, 2)
     made = exported(directory, "ply")
     assert made is not None
-    columns, warnings = read_with_open3d(made.path, ".ply")
-    assert warnings == ()
+    cloud = read_cloud(made.path)
+    assert cloud.warnings == ()
+    vertex = plyfile.PlyData.read(made.path)["vertex"]
     ours = read_ply(Path(made.path))
-    assert np.array_equal(columns["xyz"], np.column_stack([ours[axis] for axis in "xyz"]))
-    assert np.array_equal(columns["intensity"], ours["intensity"])
+    for axis, name in enumerate("xyz"):
+        assert np.array_equal(cloud.xyz[:, axis], ours[name])
+        assert np.array_equal(vertex[name], ours[name])
+    assert np.array_equal(cloud.columns["intensity"], ours["intensity"])
+    assert np.array_equal(vertex["intensity"], ours["intensity"])
 
 
 def test_voxels_that_are_neither(directory: Path) -> None:

@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a file says of its coordinate system: its name, its units in the plane and in height.
+
+Read from WKT (OGC 01-009 and ISO 19162, so WKT 1 and 2) and from GeoTIFF keys (OGC 19-008), as LAS files have
+them.  No projection library: a unit's length stands in the text, and codes of units are few.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+__all__ = ["FEET", "METRE", "UNITS", "CoordinateSystem", "LengthUnit", "geokey_system", "wkt_system"]
+
+
+class LengthUnit(NamedTuple):
+    """A unit of length and how many metres it has; 0 where its length is not known."""
+
+    name: str
+    metres: float
+
+
+METRE: Final = LengthUnit("metre", 1.0)
+FEET: Final = {
+    "ft": LengthUnit("international foot", 0.3048),
+    "us-ft": LengthUnit("US survey foot", 1200 / 3937),
+}
+"""Feet by the names that options have; they differ by 2 mm in a kilometre."""
+
+UNITS: Final = ("auto", "m", *FEET)
+"""What options for units may be: ``auto`` is what each file says of itself."""
+
+_SAME: Final = 5e-8  # lengths in files are rounded; the two feet differ by 6e-7
+
+
+@dataclass(frozen=True, slots=True)
+class CoordinateSystem:
+    """What a file says of its coordinate system.
+
+    Attributes
+    ----------
+    name
+        As the file has it, with its EPSG code where that is said.
+    geographic
+        Whether x and y are degrees.
+    plane, height
+        Units of x and y, and of z; None where nothing is said.
+    epsg
+        Code of the whole, or of its part in the plane; 0 where there is none.
+    """
+
+    name: str = ""
+    geographic: bool = False
+    plane: LengthUnit | None = None
+    height: LengthUnit | None = None
+    epsg: int = 0
+
+    @property
+    def units(self) -> tuple[LengthUnit, LengthUnit]:
+        """Units in the plane and in height: metres where nothing is said, heights as the plane."""
+        plane = self.plane or METRE
+        return plane, self.height or (METRE if self.geographic else plane)
+
+    @property
+    def label(self) -> str:
+        """The name with its code, for people."""
+        code = f"EPSG:{self.epsg}" if self.epsg else ""
+        return f"{self.name} ({code})" if self.name and code else self.name or code
+
+
+def _length(name: str, metres: float) -> LengthUnit:
+    """Return the unit of a length, under the name that it is known by."""
+    for known in (METRE, *FEET.values()):
+        if math.isfinite(metres) and abs(metres - known.metres) < _SAME * known.metres:
+            return known
+    return LengthUnit(name or "unit", metres if math.isfinite(metres) and metres > 0 else 0.0)
+
+
+# --- WKT ------------------------------------------------------------------------------------------
+
+_TOKEN: Final = re.compile(r'\s*(?:"((?:[^"]|"")*)"|([\[(])|([\])])|,|([^\s,"\[\]()]+))')
+_MAX_TEXT: Final = 1 << 20
+_MAX_DEPTH: Final = 64
+_PLANE: Final = frozenset(
+    ("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS", "GEOCCS", "DERIVEDPROJCRS")
+)
+_DEGREES: Final = frozenset(("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS"))
+_GEODETIC: Final = frozenset(("GEODCRS", "GEODETICCRS"))
+_HEIGHT: Final = frozenset(("VERT_CS", "VERTCS", "VERTCRS", "VERTICALCRS"))
+_COMPOUND: Final = frozenset(("COMPD_CS", "COMPOUNDCRS"))
+_AROUND: Final = frozenset(("BOUNDCRS", "SOURCECRS", "FITTED_CS", "COORDINATEMETADATA"))
+_AXIS: Final = frozenset(("AXIS",))
+_UNITS: Final = frozenset(("UNIT", "LENGTHUNIT"))
+
+
+@dataclass(slots=True)
+class _Node:
+    """One bracket of WKT: its keyword, texts and words in it, and brackets in it."""
+
+    keyword: str
+    words: list[str] = field(default_factory=list)
+    nodes: list[_Node] = field(default_factory=list)
+
+    def all(self, keywords: frozenset[str]) -> list[_Node]:
+        return [node for node in self.nodes if node.keyword in keywords]
+
+
+def wkt_system(text: str) -> CoordinateSystem | None:
+    """Return what WKT of any kind says; None where it is no WKT of a coordinate system."""
+    roots = _trees(text[:_MAX_TEXT])
+    return _system(roots[0] if len(roots) == 1 else _Node("COMPD_CS", [], roots))
+
+
+def _trees(text: str) -> list[_Node]:
+    """Return the outermost brackets: one, or as ESRI writes it a system and its heights."""
+    roots: list[_Node] = []
+    stack: list[_Node] = []
+    word, at = "", 0
+    while found := _TOKEN.match(text, at):
+        at = found.end()
+        quoted, opened, closed, plain = found.groups()
+        if opened:
+            if not word or len(stack) >= _MAX_DEPTH:
+                break
+            node = _Node(word.upper())
+            if stack:
+                stack[-1].words.pop()
+                stack[-1].nodes.append(node)
+            stack.append(node)
+            word = ""
+        elif closed:
+            if not stack:
+                break
+            node = stack.pop()
+            if not stack:
+                roots.append(node)
+        elif quoted is not None or plain:
+            word = plain or ""
+            if stack:
+                stack[-1].words.append(quoted.replace('""', '"') if quoted is not None else plain)
+    return roots
+
+
+def _system(node: _Node) -> CoordinateSystem | None:
+    name = node.words[0] if node.words else ""
+    epsg = _epsg(node)
+    if node.keyword in _COMPOUND:
+        parts = [part for part in map(_system, node.nodes) if part is not None]
+        plane = next((part for part in parts if part.plane is not None or part.geographic), None)
+        height = next((part.height for part in parts if part.height is not None), None)
+        if not parts:
+            return None
+        return CoordinateSystem(
+            name=name or parts[0].name,
+            geographic=plane is not None and plane.geographic,
+            plane=plane.plane if plane is not None else None,
+            height=height,
+            epsg=epsg or (plane.epsg if plane is not None else 0),
+        )
+    if node.keyword in _AROUND:
+        inner = [part for part in map(_system, node.nodes) if part is not None]
+        return inner[0] if inner else None
+    units = _units(node)
+    if node.keyword in _HEIGHT:
+        return CoordinateSystem(name=name, height=units[0] if units else None, epsg=epsg)
+    cartesian = any("cartesian" in map(str.lower, part.words) for part in node.all(frozenset(("CS",))))
+    if node.keyword in _DEGREES or (node.keyword in _GEODETIC and not cartesian):
+        of_heights = [unit for axis in node.all(_AXIS) for unit in axis.all(frozenset(("LENGTHUNIT",)))]
+        height = units[0] if of_heights else None
+        return CoordinateSystem(name=name, geographic=True, height=height, epsg=epsg)
+    if node.keyword in _PLANE or node.keyword in _GEODETIC:
+        height = units[2] if len(units) > 2 else None
+        return CoordinateSystem(name=name, plane=units[0] if units else None, height=height, epsg=epsg)
+    return None
+
+
+def _units(node: _Node) -> list[LengthUnit]:
+    """Units of length of a system's axes: of each, where axes say theirs, else of all."""
+    of_axes = [unit for axis in node.all(_AXIS) for unit in axis.all(_UNITS)]
+    units = []
+    for unit in of_axes or node.all(_UNITS):
+        try:
+            metres = float(unit.words[1])
+        except (IndexError, ValueError):
+            metres = _by_name(unit.words[0]) if unit.words else 0.0
+        units.append(_length(unit.words[0] if unit.words else "", metres))
+    return units
+
+
+def _epsg(node: _Node) -> int:
+    for one in node.all(frozenset(("AUTHORITY", "ID"))):
+        if len(one.words) > 1 and one.words[0].upper() == "EPSG" and one.words[1].isdigit():
+            return int(one.words[1][:9])
+    return 0
+
+
+def _by_name(text: str) -> float:
+    """Metres of a unit that is named in a text; 0 where none is."""
+    plain = text.lower().replace("_", " ")
+    if re.search(r"us[ -]?(survey )?f(oo|ee)?t|ftus|foot us|feet us|survey f(oo|ee)t", plain):
+        return FEET["us-ft"].metres
+    if re.search(r"\bf(oo|ee)?t\b|\(ft\)", plain):
+        return FEET["ft"].metres
+    return 1.0 if re.search(r"\bmet(re|er)s?\b|\(m\)", plain) else 0.0
+
+
+# --- GeoTIFF keys ---------------------------------------------------------------------------------
+
+_MODEL, _CITATION, _GEOG_TYPE, _GEOG_CITATION, _GEOG_UNIT = 1024, 1026, 2048, 2049, 2052
+_PROJECTED_TYPE, _PROJECTED_CITATION, _PROJECTED_UNIT, _PROJECTED_UNIT_SIZE = 3072, 3073, 3076, 3077
+_VERTICAL_TYPE, _VERTICAL_CITATION, _VERTICAL_UNIT = 4096, 4097, 4099
+_GEOGRAPHIC_MODEL: Final = 2
+_ASCII_TAG, _DOUBLE_TAG = 34737, 34736
+_USER_DEFINED: Final = 32767
+_UNIT_CODES: Final = {
+    9001: METRE,
+    9002: FEET["ft"],
+    9003: FEET["us-ft"],
+    9005: LengthUnit("Clarke's foot", 0.3047972654),
+    9014: LengthUnit("fathom", 1.8288),
+    9030: LengthUnit("nautical mile", 1852.0),
+    9035: LengthUnit("US survey mile", 5280 * 1200 / 3937),
+    9036: LengthUnit("kilometre", 1000.0),
+    9093: LengthUnit("statute mile", 1609.344),
+    9095: LengthUnit("British foot", 0.3048007491),
+    1025: LengthUnit("millimetre", 0.001),
+    1033: LengthUnit("centimetre", 0.01),
+}
+# State planes of the United States, whose unit follows from the code: NAD27, NAD83, NAD83(HARN).
+_STATE_PLANES: Final = (range(2222, 2290), range(2867, 2931), range(32001, 32059))
+_STATE_PLANES_FT: Final = (
+    *range(2222, 2225), *range(2251, 2254), 2256, 2265, 2266, 2269, 2270, 2273, *range(2280, 2283),
+    *range(2867, 2870), *range(2896, 2899), 2901, 2909, 2910, 2913, 2914, *range(2921, 2924),
+)  # fmt: skip
+
+
+def geokey_system(directory: bytes, doubles: bytes, text: bytes) -> CoordinateSystem | None:
+    """Return what GeoTIFF keys say: their directory (34735), doubles (34736) and texts (34737).
+
+    None where there is no sound directory.
+    """
+    if len(directory) < 8 or len(directory) % 2:
+        return None
+    shorts = struct.unpack(f"<{len(directory) // 2}H", directory)
+    count = min(shorts[3], (len(shorts) - 4) // 4)
+    numbers: dict[int, float] = {}
+    texts: dict[int, str] = {}
+    for key in range(count):
+        number, tag, length, value = shorts[4 + 4 * key : 8 + 4 * key]
+        if tag == 0:
+            numbers[number] = value
+        elif tag == _DOUBLE_TAG and 8 * value + 8 <= len(doubles):
+            (numbers[number],) = struct.unpack_from("<d", doubles, 8 * value)
+        elif tag == _ASCII_TAG:
+            texts[number] = text[value : value + length].decode("utf-8", "replace").strip("\0| ")
+    geographic = numbers.get(_MODEL) == _GEOGRAPHIC_MODEL
+    projected = int(numbers.get(_PROJECTED_TYPE, 0))
+    code = projected or (int(numbers.get(_GEOG_TYPE, 0)) if geographic else 0)
+    names = [texts.get(key, "") for key in (_PROJECTED_CITATION, _CITATION, _GEOG_CITATION)]
+    height = _coded(numbers, _VERTICAL_UNIT)
+    if height is None and (metres := _by_name(texts.get(_VERTICAL_CITATION, ""))):
+        height = _length(texts[_VERTICAL_CITATION], metres)
+    plane = None
+    if not geographic:
+        plane = _coded(numbers, _PROJECTED_UNIT, _PROJECTED_UNIT_SIZE) or _coded(numbers, _GEOG_UNIT)
+    if plane is None and any(projected in codes for codes in _STATE_PLANES):
+        plane = FEET["ft" if projected in _STATE_PLANES_FT else "us-ft"]
+    if plane is None and not geographic and (metres := _by_name(" ".join(names[:2]))):
+        plane = _length(names[0] or names[1], metres)
+    return CoordinateSystem(
+        name=next(filter(None, names if not geographic else names[::-1]), ""),
+        geographic=geographic,
+        plane=plane,
+        height=height,
+        epsg=code if code not in (0, _USER_DEFINED) else 0,
+    )
+
+
+def _coded(numbers: dict[int, float], key: int, size_key: int = 0) -> LengthUnit | None:
+    code = int(numbers.get(key, 0))
+    if code in (0, 9101, 9102):  # degrees and radians: the key is about angles
+        return None
+    if code == _USER_DEFINED and size_key in numbers:
+        return _length("", numbers[size_key])
+    return _UNIT_CODES.get(code, LengthUnit(f"unit EPSG:{code}", 0.0))

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plain text clouds, a point a line: XYZ in its variants, PTS, and tables with named columns (TXT, CSV, ASC).
+
+Values are separated by white space, commas or semicolons.  Columns are named by a header, a comment or the
+first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``); without one x, y and z come
+first, and what the others are follows from their number, which is said.  All values are float64.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.columns import ColumnSpec, column_names
+from shmmap.errors import MapDataError
+from shmmap.formats.causes import refusal
+from shmmap.formats.coordinate_system import CoordinateSystem
+from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
+from shmmap.formats.pcd.table import FieldTable
+from shmmap.formats.source_file import SourceFile, open_regular
+from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
+
+__all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]
+
+TEXT_SUFFIXES: Final = (".pts", ".xyz", ".xyzn", ".xyzrgb")
+TABLE_SUFFIXES: Final = (".txt", ".csv", ".asc")
+"""Read where they are named; in a directory they may be anything."""
+
+_HEAD_BYTES: Final = 1 << 16  # the first point must begin within these
+_COMMENT: Final = re.compile(rb"(?m)^[ \t]*(?:#|//|%)[^\r\n]*")
+_NO_ROW: Final = re.compile(rb"(?m)^[ \t\r\v\f]*(?:$|#|//|%)")
+_UNIT: Final = re.compile(r"[\[(].*")
+_NORMALS: Final = ("nx", "ny", "nz")
+_COLOURS: Final = ("red", "green", "blue")
+_UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
+"""What columns after x, y and z are, by their number, as PTS has them."""
+_NORMAL_LENGTHS: Final = (0.99, 1.01)
+_LOOKED_AT: Final = 32  # rows
+_SHOWN: Final = 60
+
+
+@dataclass(slots=True)
+class _Layout:
+    """How the file is laid out, as its first lines show.
+
+    ``names`` are those of the columns, x, y and z among them; ``separator`` is empty for white space.
+    """
+
+    names: list[str]
+    data_at: int
+    separator: bytes = b""
+    trailing: bool = False
+    announced: int | None = None
+    guess: str = ""
+
+
+class TextReader:
+    """A text file, opened, its first lines understood and its points counted.
+
+    Attributes
+    ----------
+    points
+        Lines with a point.
+    columns
+        ``xyz`` first, then every other column of the file, in its order; float64.
+    warnings
+        Oddities of the file.
+
+    Raises
+    ------
+    MapDataError
+        ``bad_row``, ``no_xyz``, ``bad_header``, ``truncated`` and the causes of files that cannot be opened,
+        with the byte offset and, of a row, its line.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        suffix = os.path.splitext(self.path)[1].lower()
+        self._fd = open_regular(self.path)
+        try:
+            self._source = SourceFile(self._fd, self.path)
+            head = self._source.peek(min(self._source.size, _HEAD_BYTES))
+            self._bare_cr = b"\r" in head and b"\n" not in head
+            if self._bare_cr:
+                head = head.replace(b"\r", b"\n")
+            self._layout = _Lines(head, self.path, suffix, self._source.size).layout()
+            places = [(AXES.index(name) if name in AXES else 3) for name in self._layout.names]
+            others = column_names(name for name in self._layout.names if name not in AXES)
+            rest = iter(others)
+            fields = tuple(
+                PcdField(AXES[place] if place < 3 else next(rest), np.dtype("<f8"), 1, False, name)
+                for place, name in zip(places, self._layout.names, strict=True)
+            )
+            self._table = FieldTable(fields)
+            self.points = sum(self._rows(text) for _, text in self._texts())
+            self._check_announced()
+        except BaseException:
+            self.close()
+            raise
+        self.columns: tuple[ColumnSpec, ...] = self._table.columns
+        self.crs: CoordinateSystem | None = None
+        self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self.encoding = self.version = ""
+        self.warnings: tuple[str, ...] = (self._layout.guess,) if self._layout.guess else ()
+
+    def __enter__(self) -> TextReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
+
+    def blocks(self, block_points: int, start: int = 0) -> Iterator[dict[str, NDArray[Any]]]:
+        """Yield the columns of the points from ``start`` on, at most ``block_points`` rows at a time.
+
+        Raises
+        ------
+        MapDataError
+            ``bad_row``: not the first row's number of values, or one that is no number.
+        """
+        parser = RowParser(self.path, self._table, self._line_at)
+        names = [spec.name for spec in self.columns]
+        for offset, text in self._texts():
+            plain = self._plain(parser, text, offset)
+            ends = line_ends(plain)
+            for first in range(0, len(ends), block_points):
+                last = min(first + block_points, len(ends))
+                begin, stop = int(ends[first - 1]) if first else 0, int(ends[last - 1])
+                if start and (rows := self._rows(plain[begin:stop])) <= start:
+                    start -= rows
+                    continue
+                block = parser.parse(plain[begin:stop], offset + begin)
+                if len(block[0]) > start:
+                    yield dict(zip(names, (column[start:] for column in block), strict=True))
+                start = 0
+
+    def _texts(self) -> Iterator[tuple[int, bytes]]:
+        """Yield (offset, text) of whole lines from the first point on."""
+        self._source.at = min(self._layout.data_at, self._source.size)
+        return whole_lines(self._source, bare_cr=self._bare_cr)
+
+    def _rows(self, text: bytes) -> int:
+        """Lines of ``text`` that have a point."""
+        body = text.removesuffix(b"\n")
+        return body.count(b"\n") + 1 - sum(1 for _ in _NO_ROW.finditer(body))
+
+    def _plain(self, parser: RowParser, text: bytes, offset: int) -> bytes:
+        """Return as many bytes with the same values, separated by spaces, and comments after ``#``."""
+        if b"#" in text or b"//" in text or b"%" in text:
+            text = _COMMENT.sub(lambda found: b"#".ljust(len(found.group())), text)
+        separator = self._layout.separator
+        if not separator:
+            return text
+        if self._layout.trailing:
+            text = re.sub(separator + rb"(?=[ \t]*\r?$)", b" ", text, flags=re.MULTILINE)
+        values = len(self._layout.names)
+        empty = re.search(rb"(?m)(?:^|%s)[ \t]*(?:(?=%s)|(?<=%s)\r?$)" % ((separator,) * 3), text)
+        if empty is not None or text.count(separator) != (values - 1) * self._rows(text):
+            at = 0
+            for line in text.split(b"\n"):
+                words = line.split(separator)
+                is_row = line.strip() and not line.lstrip().startswith(b"#")
+                if is_row and (len(words) != values or any(len(word.split()) != 1 for word in words)):
+                    what = f"{values} values separated by {separator.decode()!r}"
+                    raise parser.row_error(0, offset + at, f"{_shown(line)} is not {what}")
+                at += len(line) + 1
+        return text.replace(separator, b" ")
+
+    def _check_announced(self) -> None:
+        announced = self._layout.announced
+        if announced is not None and announced != self.points:
+            raise refusal(
+                "truncated" if announced > self.points else "bad_header",
+                f"the first line announces {announced} points, {self.points} lines of points follow",
+                path=self.path,
+                offset=self._source.size if announced > self.points else 0,
+            )
+
+    def _line_at(self, offset: int) -> int:
+        """Number of the line that begins at a byte of the file, counted from 1."""
+        line, at = 1, 0
+        newline = b"\r" if self._bare_cr else b"\n"
+        while part := os.pread(self._fd, min(_HEAD_BYTES, offset - at), at):
+            line += part.count(newline)
+            at += len(part)
+        return line
+
+
+class _Lines:
+    """The first lines of a file: comments, a count, names, the first row of numbers."""
+
+    def __init__(self, head: bytes, path: str, suffix: str, file_bytes: int) -> None:
+        self.head = head
+        self.path = path
+        self.suffix = suffix
+        self.file_bytes = file_bytes
+
+    def layout(self) -> _Layout:
+        """Find out how the file is laid out."""
+        if not self.head:
+            raise self._error("empty_file", "the file is empty (0 bytes)", 0)
+        if self.head.startswith((b"\xff\xfe", b"\xfe\xff")):
+            raise self._error("bad_row", "UTF-16 text is not read: save it as UTF-8 or ASCII", 0)
+        at = 3 if self.head.startswith(b"\xef\xbb\xbf") else 0
+        named, named_at = b"", 0
+        comments: list[bytes] = []
+        announced: int | None = None
+        for line in self.head[at:].split(b"\n"):
+            start, at = at, at + len(line) + 1
+            text = line.strip()
+            if not text:
+                continue
+            if found := _COMMENT.match(text):
+                comments.append(found.group().lstrip(b" \t#/%"))
+                continue
+            words = re.split(rb"[\s,;]+", text.strip(b",;"))
+            if not all(map(NUMBER.match, words)):
+                if named or NUMBER.match(words[0]):
+                    raise self._error("bad_row", f"{_shown(text)} is not a row of numbers", start)
+                named, named_at = text, start
+                continue
+            if announced is None and not named and len(words) == 1 and words[0].isdigit():
+                announced = int(words[0][:18])
+                continue
+            if self.suffix == ".pts" and announced is None:
+                raise self._error("bad_header", "the first line is not the number of points", start)
+            layout = self._of_row(text, start)
+            layout.announced = announced
+            self._name(layout, comments, named, named_at)
+            return layout
+        if self.file_bytes > len(self.head):
+            raise self._error("bad_row", f"no row of numbers within {len(self.head)} bytes", 0)
+        if named:
+            raise self._error("bad_row", f"{_shown(named)} is not a row of numbers", named_at)
+        if self.suffix == ".pts" and announced is None:
+            raise self._error("bad_header", "the first line is not the number of points", 0)
+        return _Layout(list(AXES), self.file_bytes, announced=announced)
+
+    def _error(self, cause: str, message: str, offset: int, hint: str = "") -> MapDataError:
+        return refusal(cause, message, path=self.path, offset=offset, hint=hint)
+
+    def _of_row(self, text: bytes, start: int) -> _Layout:
+        """Find out what separates the values of the first row, and their number."""
+        separator = b";" if b";" in text else b"," if b"," in text else b""
+        words = text.split(separator or None)
+        trailing = bool(separator) and not words[-1].strip()
+        words = words[:-1] if trailing else words
+        if any(b"," in word or len(word.split()) > 1 for word in words):
+            raise self._error(
+                "bad_row", f"{_shown(text)} has two kinds of separators", start,
+                hint="separate values by white space, commas or semicolons, and write decimals with a point",
+            )  # fmt: skip
+        if any(not word.strip() for word in words):
+            raise self._error("bad_row", f"{_shown(text)} has an empty value", start)
+        if not 3 <= len(words) <= MAX_FIELDS:
+            raise self._error(
+                "no_xyz", f"{_shown(text)} has {len(words)} values; 3 to {MAX_FIELDS} can be read", start,
+            )  # fmt: skip
+        return _Layout([""] * len(words), start, separator, trailing)
+
+    def _name(self, layout: _Layout, comments: list[bytes], named: bytes, named_at: int) -> None:
+        """Name the columns: by the line before the rows, by a comment, else by their number."""
+        count = len(layout.names)
+        for text in (named, *comments[::-1]):
+            if text and (names := _header_names(text, layout.separator, count)):
+                layout.names = names
+                return
+        if named:
+            raise self._error(
+                "bad_header", f"{_shown(named)} names no {count} columns, x, y and z once each", named_at,
+                hint="name the coordinates x, y and z, or leave the line out",
+            )  # fmt: skip
+        others = count - 3
+        names_of_others: Sequence[str] = _UNNAMED.get(others, ())
+        if others == 3 and (self.suffix == ".xyzn" or self._normals(layout)):
+            names_of_others = _NORMALS
+        if not names_of_others:
+            names_of_others = [f"column_{place}" for place in range(4, count + 1)]
+        layout.names = [*AXES, *names_of_others]
+        if others and not (others == 3 and self.suffix in (".xyzn", ".xyzrgb")):
+            taken = ", ".join(names_of_others)
+            layout.guess = f"no header names the columns: after x, y and z they are taken as {taken}"
+
+    def _normals(self, layout: _Layout) -> bool:
+        """Whether columns 4 to 6 of the first rows are vectors of length 1, not all along an axis."""
+        if self.suffix == ".xyzrgb":
+            return False
+        vectors = []
+        for line in self.head[layout.data_at :].split(b"\n")[:-1][:_LOOKED_AT]:
+            words = line.replace(layout.separator or b" ", b" ").split()[3:6]
+            if len(words) == 3 and all(map(NUMBER.match, words)):
+                vectors.append([float(word) for word in words])
+        if not vectors or not any(0 < abs(value) < 1 for value in vectors[0]):
+            return False
+        lengths = np.linalg.norm(np.array(vectors), axis=1)
+        return bool((lengths > _NORMAL_LENGTHS[0]).all() and (lengths < _NORMAL_LENGTHS[1]).all())
+
+
+def _header_names(text: bytes, separator: bytes, count: int) -> list[str]:
+    """Return ``count`` names out of a header, x, y and z among them; none where it does not name them."""
+    plain = text.decode("utf-8", "replace").strip()
+    mark = separator.decode()
+    words = plain.split(mark) if mark and mark in plain else re.split(r"[\s,;]+", plain)
+    if len(words) == count + 1 and not words[-1].strip():
+        words.pop()
+    names = [word.strip().strip("\"'").strip() for word in words]
+    if len(names) != count:
+        return []
+    for axis in AXES:
+        bare = [_UNIT.sub("", name).strip().lower() for name in names]
+        if bare.count(axis) != 1:
+            return []
+        names[bare.index(axis)] = axis
+    return names
+
+
+def _shown(line: bytes) -> str:
+    text = line.strip()
+    return repr(text[:_SHOWN].decode("utf-8", "replace")) + ("..." if len(text) > _SHOWN else "")

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an answer lacks, in the words of the command line and of warnings.
+
+That is cells that failed, that are being loaded, or that are empty, and places where the map has none.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
+
+from shmmap.errors import LoadTimeout, ShmmapError, ShmmapWarning, UnknownCell
+from shmmap.quantities import counted, format_bytes, format_metres
+
+if TYPE_CHECKING:
+    from shmmap.client.cell_set import CellSet, PendingLayer
+    from shmmap.client.client import Client
+    from shmmap.errors import CellError
+    from shmmap.geometry import Area
+    from shmmap.protocol.messages import Holder, Welcome
+
+__all__ = [
+    "NOT_COVERED",
+    "area_text",
+    "extent_text",
+    "failure_lines",
+    "judge",
+    "near_cells_hint",
+    "no_cell_there",
+    "pending_lines",
+    "unknown_ids",
+]
+
+NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
+_NAMED_CELLS: Final = 3
+_MOST_CELLS: Final = 20_000  # to look at each for one that looks alike takes a second at most
+_MOST_LINES: Final = 10  # of a warning
+
+_Bounds = tuple[float, float, float, float]
+
+
+def judge(
+    client: Client, found: CellSet, area: Area | None, *, waited: bool, strict: bool, new: bool = True
+) -> None:
+    """Say what an answer lacks: as a `ShmmapWarning` where the program asked, or as an error.
+
+    Parameters
+    ----------
+    client
+        Whose answer it is.
+    area
+        What was asked about; None: ids.
+    waited
+        Whether the daemon was given time to load: otherwise that cells are pending is no news.
+    strict
+        Raise it.
+    new
+        Whether all cells were to come; False: those that are not held.
+
+    Raises
+    ------
+    CellError
+        Of a cell that failed, that is still pending (`LoadTimeout`), or where there is none (`UnknownCell`).
+    """
+    if strict:
+        if (error := _error_of(client, found, area, new)) is not None:
+            raise error
+        return
+    lines = failure_lines(found.failed)
+    if waited:
+        lines += pending_lines(found.pending)
+    if not found.covered:
+        lines.append(f"{NOT_COVERED} (ask again later)")
+    if unknown := unknown_ids(found.failed):
+        lines.append(f"hint: {near_cells_hint(client, unknown)}")
+    if found.complete and new:
+        nothing = _nothing(client, found, area)
+        lines += [f"{message} ({hint})" if hint else message for message, hint in nothing]
+    if not lines:
+        return
+    if len(lines) > _MOST_LINES:
+        lines[_MOST_LINES:] = [f"... and {len(lines) - _MOST_LINES} more"]
+    if found.failed or (found.pending and waited):
+        lines.insert(0, f"{len({cell.id for cell in found}):,} of {_asked(found):,} cells are there:")
+    warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
+
+
+def _error_of(client: Client, found: CellSet, area: Area | None, new: bool) -> ShmmapError | None:
+    if found.failed:
+        return found.failed[0]
+    if found.pending:
+        first, more = found.pending[0], len(found.pending) - 1
+        return LoadTimeout(
+            f"{first.id} ({first.layer}): still being loaded" + (f", and {more} more" if more else ""),
+            cell_id=first.id,
+            layer=first.layer,
+            hint="ask again, or wait longer: wait=SECONDS",
+        )
+    if not found.covered:
+        return LoadTimeout(NOT_COVERED, hint="ask again later")
+    nothing = _nothing(client, found, area) if new else []
+    return next((UnknownCell(message, hint=hint) for message, hint in nothing), None)
+
+
+def _nothing(client: Client, found: CellSet, area: Area | None) -> list[tuple[str, str]]:
+    """Where a complete answer has nothing in it, what is said and the hint."""
+    if not found.cells:
+        return [no_cell_there(client.welcome, area)] if area is not None else []
+    rows: dict[str, int] = {}
+    for cell in found.cells:
+        rows[cell.layer] = rows.get(cell.layer, 0) + cell.points
+    empty = [layer for layer, points in rows.items() if not points]
+    cells = counted(len({cell.id for cell in found.cells}), "cell")
+    return [(f"{', '.join(empty)}: no points in {cells}", "")] if empty else []
+
+
+def _asked(found: CellSet) -> int:
+    ids = {cell.id for cell in found}
+    ids.update(cell.id for cell in found.pending)
+    ids.update(error.cell_id for error in found.failed)
+    return len(ids)
+
+
+def _level_of_program() -> int:
+    """Return how far up the stack the program's own code is."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("shmmap."):
+        level, frame = level + 1, frame.f_back
+    return level
+
+
+# --- failed and pending -------------------------------------------------------------------------------
+
+
+def pending_lines(pending: Iterable[PendingLayer]) -> list[str]:
+    """Return one line for each layer of a cell that is still being loaded."""
+    return [f"pending: {one.id} ({one.layer})" for one in pending]
+
+
+def failure_lines(failed: Iterable[CellError]) -> list[str]:
+    """Return one line for each cause, and below it what to do and who uses the memory."""
+    causes: dict[tuple[str, str, str], list[CellError]] = {}
+    for error in failed:
+        # a file's message begins with its path, which the cell's id is
+        reason = error.message.removeprefix(_named(error)).removeprefix(f"{error.cell_id}: ")
+        causes.setdefault((error.code, error.layer, reason), []).append(error)
+    lines = []
+    for (code, layer, reason), errors in causes.items():
+        if len(errors) == 1:
+            named = _named(errors[0]) if errors[0].message.startswith(_named(errors[0])) else ""
+            lines.append(f"failed: {named}{reason} [{code}]")
+        else:
+            names = [error.cell_id.rpartition("/")[2] for error in errors]
+            more = ", ..." if len(names) > _NAMED_CELLS else ""
+            shown = ", ".join(names[:_NAMED_CELLS]) + more
+            lines.append(f"failed: {len(errors):,} cells ({layer}): {reason} [{code}]: {shown}")
+        lines += [f"  {errors[0].hint}"] if errors[0].hint else []
+        lines += _holder_lines(errors)
+    return lines
+
+
+def unknown_ids(failed: Iterable[CellError]) -> list[str]:
+    """Return the ids that the map does not have, each once."""
+    return list(dict.fromkeys(error.cell_id for error in failed if error.code == UnknownCell.code))
+
+
+def _named(error: CellError) -> str:
+    return f"{error.cell_id} ({error.layer}): "
+
+
+def _holder_lines(errors: Iterable[CellError]) -> list[str]:
+    """Who uses memory, the most first; each cell's failure tells it again."""
+    most: dict[int, Holder] = {}
+    for error in errors:
+        for holder in error.holders:
+            known = most.get(holder.session)
+            if holder.bytes and (known is None or known.bytes < holder.bytes):
+                most[holder.session] = holder
+    ranked = sorted(most.values(), key=lambda holder: -holder.bytes)
+    return [
+        f"  in use: {format_bytes(one.bytes)} in {counted(one.cells, 'cell')} by {_who(one)}"
+        for one in ranked
+    ]
+
+
+def _who(holder: Holder) -> str:
+    if not holder.session:
+        return "a process that did not open them through the client library"
+    return f"{holder.client or holder.command or 'a client'}, pid {holder.pid or '?'}"
+
+
+# --- where there is nothing ---------------------------------------------------------------------------
+
+
+def area_text(area: Area) -> str:
+    """Return an area as a sentence names it: ``"within 40 m of (10, 20)"``."""
+    from shmmap.geometry import Box, Circle
+
+    if isinstance(area, Box):
+        text = f"in {extent_text(area.bounds)}"
+    elif isinstance(area, Circle):
+        text = f"within {format_metres(area.radius)} m of ({format_metres(area.x)}, {format_metres(area.y)})"
+    else:
+        centre = f"({format_metres(area.x)}, {format_metres(area.y)})"
+        text = f"in the square of half-side {format_metres(area.radius)} m about {centre}"
+    if area.z is not None:
+        text += f", z {format_metres(area.z.min)} .. {format_metres(area.z.max)} m"
+    return text
+
+
+def extent_text(box: _Bounds) -> str:
+    """Return a rectangle: ``"x -60 .. 60 m, y -60 .. 60 m"``."""
+    min_x, min_y, max_x, max_y = map(format_metres, box)
+    return f"x {min_x} .. {max_x} m, y {min_y} .. {max_y} m"
+
+
+def no_cell_there(welcome: Welcome, area: Area) -> tuple[str, str]:
+    """Say that no cell of the map touches an area, and where the map is; returns that and a hint."""
+    spans = f"the map spans {extent_text(welcome.bounds)}" if welcome.bounds else "the map has no cells"
+    hint = ""
+    if any(welcome.origin):
+        x, y, z = map(format_metres, welcome.origin)
+        hint = (
+            "`divide` shifted the points close to the origin: subtract"
+            f" ({x}, {y}, {z}) from coordinates of the cloud"
+        )
+    return f"no cell {area_text(area)}; {spans}", hint
+
+
+def near_cells_hint(client: Client, unknown: Sequence[str]) -> str:
+    """Return a hint for ids that the map does not have: those that look alike, or where ids are found."""
+    import difflib  # one millisecond, for those who misspell
+
+    if not unknown:
+        return ""
+    few = client.welcome.cells <= _MOST_CELLS
+    names = [cell.id.rpartition("/")[2] for cell in client.metadata()] if few else []
+    near: dict[str, None] = {}
+    for one in unknown[:3]:
+        near.update(dict.fromkeys(difflib.get_close_matches(one.rpartition("/")[2], names, n=1, cutoff=0.8)))
+    if near:
+        return f"did you mean {', '.join(near)}?"
+    return "`shmmap query --circle X,Y,R` prints the ids of the cells around a place"

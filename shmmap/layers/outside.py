@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points outside their cell's box: the cell was moved, and the map's metadata was not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["OutsideBox"]
+
+
+class OutsideBox:
+    """Counts points farther outside a box than float32 steps there; next to nothing where there are none.
+
+    Attributes
+    ----------
+    count
+        Points outside so far.
+    """
+
+    def __init__(self, box: tuple[float, float, float, float]) -> None:
+        self._box = box
+        # what wrote the file may have rounded to float32 on either side of the border
+        step = float(np.spacing(np.float32(max(map(abs, box)))))
+        self._low = np.array(box[:2]) - step
+        self._high = np.array(box[2:]) + step
+        self.count = 0
+
+    def add(self, xyz: NDArray[Any], bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+        """Count those of a block (N, 3); ``bounds`` are of all points up to now, this block's included."""
+        low, high = bounds[0][:2], bounds[1][:2]
+        if not ((low < self._low).any() or (high > self._high).any()):
+            return
+        xy = xyz[:, :2]
+        self.count += int(np.count_nonzero(((xy < self._low) | (xy > self._high)).any(axis=1)))

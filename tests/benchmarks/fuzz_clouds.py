@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mutated PLY, text and LAS files against their readers: only success or `MapDataError` may come out.
+
+Each child process reads thousands of mutated files under a limit of address space (the file's size plus
+200 MB above what the process has when it starts), so that an allocation that the file does not justify is a
+`MemoryError`, hence a finding; so is any other exception, a crash, a read of ten seconds, or a success whose
+columns have not as many rows as there are points.  PLY that is read whole is compared with `plyfile` where
+that reads it, too.  The input of a finding is kept and its path printed.
+
+    python -m tests.benchmarks.fuzz_clouds [--seconds 60] [--seed N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import random
+import resource
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from pathlib import Path
+
+import laspy
+import numpy as np
+import plyfile
+
+from shmmap.errors import MapDataError
+from shmmap.formats.block_reader import open_blocks
+from shmmap.formats.causes import CAUSES
+from shmmap.formats.cloud import read_cloud
+from tests.support.ply_bytes import random_ply
+
+ALLOWED_BYTES = 200 << 20
+MOST_S = 10
+WORDS = [
+    *(b"0", b"1", b"-1", b"255", b"4294967295", b"18446744073709551616", b"1e9", b"nan", b"inf", b"9" * 400),
+    *(b"ply", b"format", b"element", b"vertex", b"property", b"list", b"comment", b"obj_info", b"end_header"),
+    *(
+        b"ascii",
+        b"binary_little_endian",
+        b"binary_big_endian",
+        b"char",
+        b"uint8",
+        b"short",
+        b"ushort",
+        b"int",
+    ),
+    *(b"uint", b"float", b"double", b"x", b"y", b"z", b"X", b"\xff", b"\x00", b"\n", b"\r", b",", b";", b"#"),
+    *(b"//X Y Z", b"x,y,z", b"1,5", b"\t", b" "),
+]
+Seed = tuple[str, bytes]
+
+
+def seeds(folder: Path) -> list[Seed]:
+    """Well-formed files of every kind."""
+    rng = random.Random(7)
+    files: list[Seed] = [(".ply", random_ply(rng)) for _ in range(60)]
+    files.append((".ply", random_ply(rng, rows=3000)))
+    rows = [" ".join(f"{rng.uniform(-50, 50):.3f}" for _ in range(7)) for _ in range(40)]
+    text = "\n".join(rows).encode() + b"\n"
+    for suffix, head in (
+        (".xyz", b""),
+        (".pts", b"40\n"),
+        (".txt", b"//X Y Z I R G B\n"),
+        (".asc", b"# x\n\n"),
+    ):
+        files.append((suffix, head + text))
+    files.append((".csv", b"x,y,z,i,r,g,b\r\n" + text.replace(b" ", b",").replace(b"\n", b"\r\n")))
+    files.append((".csv", b"z;y;x;i;r;g;b\n" + text.replace(b" ", b"; ")))
+    for form, suffix in ((0, ".las"), (3, ".laz"), (6, ".las"), (7, ".laz")):
+        header = laspy.LasHeader(point_format=form, version="1.4")
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr('PROJCS["a",UNIT["foot",0.3048]]'))
+        las = laspy.LasData(header)
+        las.x = las.y = las.z = np.arange(50.0)
+        las.write(str(folder / f"seed{suffix}"))
+        files.append((suffix, (folder / f"seed{suffix}").read_bytes()))
+    return files
+
+
+def mutate(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
+    """Change a file in one to a few ways, its header more often than the rest."""
+    out = bytearray(data)
+    end = max(out.find(b"end_header") + 12, 60)
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
+        at = rng.randrange(max(1, min(len(out), end if rng.random() < 0.6 else len(out))))
+        match rng.randrange(8):
+            case 0 if out:
+                out[at % len(out)] ^= 1 << rng.randrange(8)
+            case 1:
+                del out[at : at + rng.choice((1, 2, 7, 64, 4096))]
+            case 2:
+                out[at:at] = rng.randbytes(rng.choice((1, 2, 8, 100)))
+            case 3:
+                out[at:at] = bytes(out[at : at + rng.choice((1, 8, 64))]) * rng.choice((1, 2, 50))
+            case 4:  # another word at a word's place
+                words = bytes(out[:end]).split(b" ")
+                words[rng.randrange(len(words))] = rng.choice(WORDS)
+                out[:end] = b" ".join(words)
+            case 5:
+                other = rng.choice(pool)
+                out[at:] = other[rng.randrange(len(other) + 1) :]
+            case 6:
+                form, values = rng.choice(
+                    (("<I", (0, 1, 2**31, 2**32 - 1)), ("<d", (0.0, 1e300, float("nan"))))
+                )
+                piece = struct.pack(form, rng.choice(values))
+                out[at : at + len(piece)] = piece
+            case _:
+                lines = bytes(out[:end]).split(b"\n")
+                rng.shuffle(lines)
+                out[:end] = b"\n".join(lines)
+    return bytes(out)
+
+
+def check(path: Path, data: bytes, rng: random.Random) -> str:
+    """Read one file; returns the outcome's name, raises whatever must not happen."""
+    path.write_bytes(data)
+    try:
+        cloud = read_cloud(path, keep_non_finite=True)
+        with open_blocks(str(path), path.suffix) as reader:
+            start = rng.randrange(cloud.points + 1)
+            rows = 0
+            for block in reader.blocks(rng.choice((7, 512, 65536)), start):
+                if {len(values) for values in block.values()} != {len(block["xyz"])}:
+                    raise AssertionError("columns of different lengths")
+                rows += len(block["xyz"])
+            if rows != cloud.points - start:
+                raise AssertionError(f"{rows} rows from {start} on of {cloud.points}")
+    except MapDataError as error:
+        if error.cause not in CAUSES:
+            raise AssertionError(f"cause {error.cause} is not listed") from error
+        return error.cause
+    if {len(values) for values in cloud.columns.values()} != {cloud.points}:
+        raise AssertionError("columns of different lengths")
+    return compare(data, cloud.columns) if path.suffix == ".ply" else "read"
+
+
+def compare(data: bytes, columns: dict[str, np.ndarray]) -> str:
+    """Compare with `plyfile`, which refuses more."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            vertex = plyfile.PlyData.read(io.BytesIO(data))["vertex"]
+            theirs = {one.name: np.asarray(vertex[one.name]) for one in vertex.properties}
+    except Exception:  # whatever it refuses, and how
+        return "read"
+    for name, values in theirs.items():
+        if name in columns and values.dtype != object:
+            ours = columns[name].astype(values.dtype)
+            if not np.array_equal(ours, values, equal_nan=values.dtype.kind == "f"):
+                raise AssertionError(f"plyfile reads {name} otherwise")
+    return "compared"
+
+
+def child(folder: Path, seed: int, seconds: float) -> int:
+    """Fuzz for ``seconds``; the input of a finding stays in ``folder``."""
+    rng = random.Random(seed)
+    pool = seeds(folder)
+    outcomes: dict[str, int] = {}
+    for suffix, data in pool:
+        if check(folder / f"input{suffix}", data, rng) not in ("read", "compared"):
+            raise AssertionError("a seed is refused")
+    for old in folder.iterdir():
+        old.unlink()
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * resource.getpagesize() + ALLOWED_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    signal.alarm(0)
+    deadline = time.monotonic() + seconds
+    count, slowest = 0, 0.0
+    while time.monotonic() < deadline:
+        started = time.monotonic()
+        suffix, data = rng.choice(pool)
+        path = folder / f"input{suffix}"
+        signal.alarm(MOST_S)
+        outcome = check(path, mutate(data, rng, [one for kind, one in pool if kind == suffix]), rng)
+        signal.alarm(0)
+        path.unlink()
+        slowest = max(slowest, time.monotonic() - started)
+        outcomes[outcome] = outcomes.get(outcome, 0) + 1
+        count += 1
+    table = " ".join(f"{name}={number}" for name, number in sorted(outcomes.items()))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"seed {seed}: {count} inputs, slowest {slowest * 1e3:.0f} ms, peak {peak:.0f} MB: {table}")
+    return 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--seconds", type=float, default=60.0, help="how long to fuzz (default 60)")
+    parser.add_argument("--seed", type=int, default=None, help="first seed (default: from the clock)")
+    parser.add_argument("--child", type=Path, default=None, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child is not None:
+        try:
+            return child(options.child, options.seed, options.seconds)
+        except Exception:
+            traceback.print_exc()
+            return 1
+    seed = time.time_ns() % 10**9 if options.seed is None else options.seed
+    deadline = time.monotonic() + options.seconds
+    while (left := deadline - time.monotonic()) > 0:
+        folder = Path(tempfile.mkdtemp(prefix="fuzz_clouds."))
+        command = [sys.executable, "-X", "faulthandler", "-W", "error", "-m", "tests.benchmarks.fuzz_clouds"]
+        command += ["--child", str(folder), "--seed", str(seed), "--seconds", f"{min(left, 30):.3f}"]
+        done = subprocess.run(command, check=False, env=os.environ)
+        if done.returncode:
+            kept = next(folder.iterdir(), folder)
+            print(f"FOUND with seed {seed} (exit {done.returncode}): {kept}", flush=True)
+            return 1
+        shutil.rmtree(folder)
+        seed += 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

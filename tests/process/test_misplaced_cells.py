@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells that were moved without their metadata are named: log, status, doctor, inspect, and in Python."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap import ShmmapWarning
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.divided_map import DividedMap, random_points
+
+MOVED = "0_0.pcd"
+
+
+def cli(one: DaemonProcess | None, *words: str | Path) -> tuple[int, str]:
+    place: tuple[str, ...] = ()
+    if one is not None:
+        place = ("--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir)
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap.cli", *map(str, words), *place],
+        env={**{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def finding(one: DaemonProcess) -> dict[str, Any]:
+    told = json.loads(cli(one, "doctor", "--json")[1])
+    return next(finding for finding in told["findings"] if finding["name"] == "map")
+
+
+def move(made: DividedMap, name: str, by: float) -> None:
+    """Move a cell's points along x, and leave its entry in the metadata as it is."""
+    columns = random_points(np.random.default_rng(4), made.corners[name], 300)
+    columns["x"] += np.float32(by)
+    made.write_cell(name, made.corners[name], columns)
+
+
+def count(client: shmmap.Client) -> int:
+    return int(client.stats().counters["cells_outside_box"])
+
+
+def test_moved_cells_are_named_everywhere(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    move(divided_map, MOVED, 1000.0)
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
+        with pytest.warns(ShmmapWarning, match=rf"{MOVED}: 300 of the cell's points lie outside its box"):
+            cells = client.around(0, 0, 30).cells
+        assert len(cells) > 1
+        assert count(client) == 1
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # once a cell
+            del cells
+            client.around(0, 0, 30)
+            client.around(0, 0, 30, layers=["voxel(leaf=2.0)"])
+        assert one.log.count("points outside the cell's box") == 1
+        assert divided_map.id(MOVED) in one.log
+        assert "1 cell with points outside the cell's box" in cli(one, "status")[1]
+        assert (finding(one)["state"], "points of 1 cell lie outside" in finding(one)["fact"]) == (
+            "warn",
+            True,
+        )
+        code, said = cli(None, "inspect", divided_map.root)
+        assert code == 0
+        assert f"{MOVED} has points outside its box x 0 .. 20, y 0 .. 20" in said
+        told = json.loads(cli(None, "inspect", divided_map.root, "--json")[1])
+        assert [Path(one["path"]).name for one in told["map"]["outside_box"]] == [MOVED]
+        divided_map.change(MOVED, seed=5)  # the file is right again
+        client.reload()
+        client.around(0, 0, 30)
+        assert count(client) == 0
+    assert finding(one)["state"] == "ok"
+
+
+def test_known_after_a_warm_restart_and_gone_with_the_cell(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    move(divided_map, MOVED, -15.0)
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client, warnings.catch_warnings():
+        warnings.simplefilter("ignore", ShmmapWarning)
+        client.around(0, 0, 30)
+    one.leave()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        assert count(client) == 1
+        divided_map.remove_cell(MOVED)
+        divided_map.write_metadata()
+        client.reload()
+        client.around(0, 0, 10)
+        assert count(client) == 0
+
+
+def test_a_sound_map_says_nothing(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(client.around(0, 0, 100).cells) == 36
+        assert count(client) == 0
+    assert "outside" not in one.log
+    code, said = cli(one, "status")
+    assert (code, "outside" in said) == (0, False)
+    assert json.loads(cli(None, "inspect", divided_map.root, "--json")[1])["map"]["outside_box"] == []
