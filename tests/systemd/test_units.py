@@ -14,7 +14,8 @@ import pytest
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
-from shmmap.daemon.live.relay import END_S, START_S
+from shmmap.daemon.live.relay import END_S
+from shmmap.daemon.main import LIVE_ALONE_S
 from shmmap.errors import (
     BadRequest,
     CannotStart,
@@ -176,7 +177,7 @@ def test_what_can_get_better_is_tried_for_ever_after_a_growing_pause(path: Path,
 def test_there_is_time_to_load_and_to_save_live_maps(path: Path) -> None:
     """The daemon gives up first, and says why."""
     service = parsed(path)["Service"]
-    assert int(service["TimeoutStartSec"]) > START_S
+    assert int(service["TimeoutStartSec"]) > LIVE_ALONE_S
     assert int(service["TimeoutStopSec"]) > END_S
 
 

@@ -55,7 +55,8 @@ def on_map(scan: Points) -> NDArray[np.float64]:
 
 
 def within(scan: Points, metres: float) -> Points:
-    return scan[np.linalg.norm(scan, axis=1) < metres]
+    near: Points = scan[np.linalg.norm(scan, axis=1) < metres]
+    return near
 
 
 def aligned(

@@ -150,7 +150,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
 @pytest.mark.parametrize(
     ("document", "ends"),
     [
-        (LAYOUT, [header.FIXED.size + header.LATTICE.size, layout.COLUMN.size, publish_block.PUBLISH.size]),
+        (LAYOUT, [header.OUTSIDE_AT + 8, layout.COLUMN.size, publish_block.PUBLISH.size]),
         (
             STATISTICS,
             [
