@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+from pathlib import Path
 from collections.abc import Iterator
 
 import pytest
@@ -93,8 +94,8 @@ def test_following_a_vehicle(user: Terminal) -> None:
     assert int(numbers[2]) > 10_000
 
 
-def test_from_cpp(user: Terminal) -> None:
-    """The program is part of an example; it counts the points that the three lines of Python count."""
+def test_from_cpp(user: Terminal, tmp_path: Path) -> None:
+    """The program counts what the three lines of Python count; what is shown compiles as it stands."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is missing")
     build, run = README.commands("cpp-run")
@@ -102,6 +103,11 @@ def test_from_cpp(user: Terminal) -> None:
     user.run(build)
     python = user.python(README.blocks["points"])
     assert user.run(run).startswith(python.replace("\n", " in "))
+    shown = tmp_path / "drive.cpp"
+    shown.write_text("\n".join(README.blocks["cpp"]) + "\n", encoding="utf-8")
+    user.run(
+        f"g++ -std=c++17 -c -Wall -Wextra -Werror $(shmmap cpp --includes) '{shown}' -o '{tmp_path}/drive.o'"
+    )
 
 
 def test_a_layer(user: Terminal) -> None:

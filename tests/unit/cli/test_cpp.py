@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import re
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -100,5 +99,3 @@ def test_pages_show_the_first_program_as_it_is() -> None:
     program = (CPP / "examples" / "first_cells.cpp").read_text(encoding="utf-8")
     whole = read_page("clients/cpp/README.md").blocks["first-cells"]
     assert program.partition("\n")[2].splitlines() == whole
-    part = "\n".join(read_page("README.md").blocks["cpp"])
-    assert f"\n{textwrap.indent(part, '  ')}\n" in program
