@@ -296,7 +296,8 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
         stack.callback(toucher.end)
         readers = Honest(one.endpoint, max(1, args.readers // 5), 5, args.stopped)
         client = stack.enter_context(shmmap.connect(one.endpoint))
-        beside, served, named_s = [], 0, float("inf")
+        beside: list[float] = []
+        served, named_s = 0, float("inf")
         began = time.perf_counter()
         number = 8 + args.scans
         while len(beside) < args.scans or time.perf_counter() < began + args.stopped + 5.0:

@@ -296,7 +296,7 @@ def test_the_end_waits_for_no_reader_s_files(served: Served) -> None:
         begun.set()
         goes_on.wait()
 
-    served.live.files.load = slow  # type: ignore[method-assign, assignment]
+    served.live.files.load = slow  # type: ignore[method-assign]
     try:
         for session in range(1, 9):
             served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk"), session)
