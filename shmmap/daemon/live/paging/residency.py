@@ -9,8 +9,8 @@ next (`next_load`, `ready`, `next_save`, `next_eviction`) and reports when it wa
   first.
 - A scan is never dropped: for a chunk that is not in memory it waits, and scans are applied in the order in
   which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
-- A chunk that was written is saved before it is given up, and is durable after `Limits.checkpoint_s`;
-  one that is written while it is saved is dirty again.
+- A chunk that was written is saved before it is given up (when memory is half full, before its room is
+  needed), and is durable after `Limits.checkpoint_s`; one that is written while it is saved is dirty again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import enum
 import math
 from collections import deque
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Final
 
 import numpy as np
@@ -39,6 +39,8 @@ IN_VAIN_S: Final = 1.0
 """The same, where nothing was found the last time and no client has moved."""
 REVIEWED_OF_NEWS: Final = 32
 """All are also gone over when one in so many came or changed since."""
+SAVED_AHEAD_OF: Final = 32
+"""Of the chunks that were changed longest ago, so many are looked at for one that nothing wants."""
 FOUND_AT_ONCE: Final = 64, 16
 """Chunks that are found to be given up at once: so many, or one in so many; their order gets old."""
 
@@ -402,12 +404,25 @@ class Residency:
         old = takewhile(lambda one: one.dirty_since_s <= due_s, self._dirty.values())
         due = next((one for one in old if one.retry_s <= now_s), None)
         victim = self._next_victim(now_s, State.DIRTY)
-        best = victim or due
+        best = victim or due or self._next_to_leave(now_s)
         if best is not None:
             best.state, best.leaving = State.SAVING, best is victim
             del self._dirty[best.key]
             self.saving += 1
         return best
+
+    def _next_to_leave(self, now_s: float) -> Chunk | None:
+        """One that nothing wants, once memory is half full: its room is there at once when it is needed."""
+        if not self._fills_up or self._short(now_s) is not _Short.NO:
+            return None
+        oldest = islice(self._dirty.values(), SAVED_AHEAD_OF)
+        return next(
+            (one for one in oldest if one.retry_s <= now_s and not self.is_wanted(one, now_s)), None
+        )
+
+    @property
+    def _fills_up(self) -> bool:
+        return 2 * (self.chunk_bytes + self.beside_bytes) > self.limits.budget_bytes
 
     def saved(self, chunk: Chunk, version: int, now_s: float) -> None:
         """A chunk's file has this version; it may have been written since."""
@@ -473,6 +488,8 @@ class Residency:
         if self._dirty and self.saving < self.limits.saves:  # else there is when one has been saved
             first = next(iter(self._dirty.values()))
             times.append(max(first.dirty_since_s + self._save_after_s, first.retry_s, self._save_s))
+            if self._fills_up:
+                times.append(max(now_s + REVIEW_S, self._save_s))
         if self._short(now_s) is not _Short.NO:
             times.append(now_s + REVIEW_S)
         return max(now_s, min(times, default=math.inf))
