@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,7 @@ __all__ = ["KINDS", "SYSTEM_CONFIG_FILE", "Setting", "installed_config_file", "r
 KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 """What a value of a type is called."""
 SYSTEM_CONFIG_FILE: Final = "/etc/shmmap/shmmap.toml"
+MAX_BYTES: Final = 1 << 20
 _KEY: Final = re.compile(r"""\s*(?:"([^"]+)"|'([^']+)'|([A-Za-z0-9_-]+))\s*[.=]|\s*\[+\s*([A-Za-z0-9_-]+)""")
 
 
@@ -48,8 +50,14 @@ def read_settings_file(path: str) -> dict[str, Setting]:
         It cannot be read, or is no TOML.
     """
     try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
+            why = "not a regular file" if not stat.S_ISREG(status.st_mode) else "too large for settings"
+            raise ConfigError(f"{path}: {why}", origin=path, hint="`shmmap config init FILE` writes one")
         text = Path(path).read_text(encoding="utf-8")
         settings: dict[str, Any] = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{path}: it is nested too deeply", origin=path) from None
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}", origin=path, hint="`shmmap config init FILE` writes one"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -68,3 +69,17 @@ def test_which_file_is_installed(tmp_path: Path) -> None:
     assert installed_config_file({"HOME": str(tmp_path)}) in ("", "/etc/shmmap/shmmap.toml")
     (tmp_path / ".config").symlink_to(tmp_path)
     assert installed_config_file({"HOME": str(tmp_path)}) == f"{tmp_path}/.config/shmmap/shmmap.toml"
+
+
+@pytest.mark.parametrize("what", ["pipe", "directory", "deep", "large", "link to a pipe"])
+def test_what_is_no_file_of_settings(tmp_path: Path, what: str) -> None:
+    file = tmp_path / "shmmap.toml"
+    if "pipe" in what:
+        os.mkfifo(tmp_path / "pipe")
+        file.symlink_to("pipe")
+    elif what == "directory":
+        file.mkdir()
+    else:
+        file.write_text("a = " + "[" * 5000 + "]" * 5000 if what == "deep" else "#" * ((1 << 20) + 1))
+    with pytest.raises(ConfigError, match=str(file)):
+        read_settings_file(str(file))
