@@ -127,13 +127,13 @@ def test_a_loader_that_computes_is_no_hindrance_to_points(
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
     one = inner(small_map.root, workers=1)
     slow, quick = one.session(), one.session()
-    one.ask(slow, Selected(1, ("0_0.pcd",), layers=("voxel(leaf=1.0)",), wait=300.0))
+    one.ask(slow, Selected(1, ("0_0.pcd",), layers=("voxel(leaf=1.0)",), wait=900.0))
     one.run_until(lambda: [worker.layers for worker in one.pool] == [1])
-    one.ask(quick, Selected(2, ("20_20.pcd",), wait=300.0))
+    one.ask(quick, Selected(2, ("20_20.pcd",), wait=900.0))
     assert names(one.cells_of(2)) == ["20_20.pcd"]
     assert [key.layer for key in one.settled] == ["points"]
     one.run_until(lambda: all(worker.ready for worker in one.pool))
-    one.offset_s += 31.0
+    one.offset_s += 301.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
 
 
@@ -163,7 +163,7 @@ def test_a_parent_that_vanishes_again_and_again(
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
     one = inner(small_map.root)
     wanted = ("0_0.pcd", "20_20.pcd")
-    one.ask(one.session(), Selected(1, wanted, wait=300.0))
+    one.ask(one.session(), Selected(1, wanted, wait=900.0))
     for _ in range(3):
         one.run_until(lambda: [worker.ready and len(worker.queue) for worker in one.pool] == [2])
         (worker,) = one.pool

@@ -182,12 +182,12 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     one.stop_clock()  # the cells handed out first stay in their grace
     one.ask(session, Area(1, CircleMessage(0, 0, 5), wait=30.0))
     assert len(one.cells_of(1).cells) == 4
-    one.ask(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=300.0))
+    one.ask(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=900.0))
     one.run_until(lambda: one.scheduler.room.hungry)
     (worker,) = one.pool
     os.kill(worker.pid, signal.SIGKILL)
     one.run_until(lambda: worker not in list(one.pool))
-    one.offset_s += 31.0
+    one.offset_s += 301.0
     reply = one.cells_of(2)
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert "SIGKILL" in reply.failed[0].message
@@ -248,7 +248,7 @@ def test_very_many_refusals_are_told_one_at_a_time(inner: Inner, tmp_path: Path)
     made = make_map(tmp_path / "many", columns=12, rows=12, points=5)
     one = inner(str(made.root), budget_bytes=1 << 20)
     one.ledger.overhead_bytes = one.ledger.budget_bytes  # nothing fits, and nothing can make room
-    one.ask(one.session(), Area(1, EVERYWHERE, wait=300.0))
+    one.ask(one.session(), Area(1, EVERYWHERE, wait=900.0))
     left = [len(one.loads)]
     while left[-1]:
         one.scheduler.pump(one.now_s())
@@ -278,7 +278,7 @@ def test_who_has_the_memory_is_found_out_some_a_turn(
 
     monkeypatch.setattr(Holders, "users_among", lambda _self, *told: noted(*told))
     one.hold_answers = True
-    one.ask(one.session("asks"), Area(2, EVERYWHERE, wait=300.0))
+    one.ask(one.session("asks"), Area(2, EVERYWHERE, wait=900.0))
     one.run_until(lambda: one.due)
     turns = []
     for _ in one.due.pop(0):
