@@ -2,7 +2,8 @@
 """What a process may have no more of: descriptors, threads, memory; the limit is named with its value.
 
 libzmq ends the process where it gets no descriptor or thread (``epoll.cpp``, ``thread.cpp``), so whether
-there are enough is found out before, by taking them for a moment.
+there are enough is found out before, by taking them for a moment.  Descriptors are taken as objects that
+close them when they go: an exception from a signal handler may come after any of them.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import _thread
 import errno
 import os
+import select
 import time
 from typing import Final
 
@@ -29,16 +31,14 @@ def check_files(count: int, what: str) -> None:
     LimitReached
         It may not; ``what`` needs them.
     """
-    fds: list[int] = []
+    held: list[select.epoll] = []
     try:
-        try:
-            for _ in range(count):
-                fds.append(os.eventfd(0))  # noqa: PERF401  those that there are have to be closed
-        finally:
-            for fd in fds:
-                os.close(fd)
+        for _ in range(count):
+            held.append(select.epoll())  # noqa: PERF401  how many there were is said
     except OSError as error:
-        limit = no_files_left(error, f"{what} needs {count} more descriptors, {len(fds)} are left: ")
+        left = len(held)
+        held.clear()
+        limit = no_files_left(error, f"{what} needs {count} more descriptors, {left} are left: ")
         if limit is None:
             raise
         raise limit from None
@@ -63,7 +63,7 @@ def no_files_left(error: Exception, what: str = "") -> LimitReached | None:
 
 def _may_open_none() -> bool:
     try:
-        os.close(os.eventfd(0))
+        select.epoll()
     except OSError as error:
         return error.errno == errno.EMFILE
     return False
