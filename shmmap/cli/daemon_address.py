@@ -65,7 +65,8 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
     """Return the instance that the options mean, and the directory of its segments.
 
     What a socket is named after need not be the instance's name, and its segments may be anywhere: where the
-    statistics of that name are not those of the daemon at this socket, the socket is asked.
+    statistics of that name are not those of the daemon at this socket, the socket is asked.  An instance's
+    name alone means the one with these statistics, wherever it listens.
 
     Raises
     ------
@@ -73,7 +74,7 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
         No daemon has this socket, and the one of that name has another.
     """
     named, by_name = _named_socket(args), (instance(args), shm_dir(args))
-    if _is_at(*by_name, named):
+    if _is_at(*by_name, named if _endpoint_setting(args) or _setting(args, "runtime_dir") else ""):
         return by_name
     found = _asked(args, named) if named else None
     if found is None and named:  # it does not answer, or this user may not ask: whose statistics name it?

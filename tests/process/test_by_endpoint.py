@@ -86,6 +86,15 @@ def test_another_daemon_of_the_socket_s_name_is_not_meant(
         assert (done.returncode, str(namesake.pid) in done.stdout) == (69, False), done
 
 
+def test_the_instance_and_its_directory_are_enough(other_name: DaemonProcess) -> None:
+    """It listens where nobody looks who knows its name alone; its statistics have that name."""
+    options = ("--instance", other_name.instance, "--shm-dir", other_name.shm_dir)
+    for words in ("health",), ("status",), ("top", "--once"), ("metrics",):
+        done = shmmap(*words, *options)
+        assert done.returncode == 0, (words, done)
+    assert f"pid {other_name.pid}," in shmmap("health", *options).stdout
+
+
 def test_what_a_live_daemon_has_is_not_to_be_removed(other_name: DaemonProcess, tmp_path: Path) -> None:
     """Not even while it has no statistics: neither the instance that is examined, nor another one."""
     query = shmmap("query", "--endpoint", other_name.endpoint, "--circle", "0,0,5")
