@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +46,13 @@ def private_tmpfs(tmp_path: Path) -> Iterator[Callable[[str], str]]:
     yield mount
     for path in mounted:
         subprocess.run(["umount", path], check=True)
+
+
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """Make a directory for sockets: ``tmp_path`` may be too long for them, by a user's name or a worker's."""
+    with tempfile.TemporaryDirectory(prefix="shmmap-test-") as path:
+        yield Path(path)
 
 
 @pytest.fixture

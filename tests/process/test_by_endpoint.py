@@ -95,7 +95,7 @@ def test_the_instance_and_its_directory_are_enough(other_name: DaemonProcess) ->
     assert f"pid {other_name.pid}," in shmmap("health", *options).stdout
 
 
-def test_what_a_live_daemon_has_is_not_to_be_removed(other_name: DaemonProcess, tmp_path: Path) -> None:
+def test_what_a_live_daemon_has_is_not_to_be_removed(other_name: DaemonProcess, short_path: Path) -> None:
     """Not even while it has no statistics: neither the instance that is examined, nor another one."""
     query = shmmap("query", "--endpoint", other_name.endpoint, "--circle", "0,0,5")
     assert query.returncode == 0
@@ -103,7 +103,8 @@ def test_what_a_live_daemon_has_is_not_to_be_removed(other_name: DaemonProcess, 
     os.unlink(f"{other_name.shm_dir}/shmmap.{other_name.instance}.statistics")
     for options in (["--endpoint", other_name.endpoint], ["--instance", other_name.instance], []):
         words = ("doctor", "--json", *options, "--shm-dir", other_name.shm_dir)
-        done = shmmap(*words, XDG_RUNTIME_DIR=str(tmp_path))
+        done = shmmap(*words, XDG_RUNTIME_DIR=str(short_path))
+        assert done.stdout, (options, done.returncode, done.stderr)
         (told,) = [one for one in json.loads(done.stdout)["findings"] if one["name"] == "leftovers"]
         assert (told["state"], "rm " in told["advice"]) == ("warn", False), told
     other_name.send(signal.SIGCONT)

@@ -283,12 +283,12 @@ def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:
         (["prepare", "broken.pcd", "--layer", "ndt"], 2),
     ],
 )
-def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path) -> None:
+def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path, short_path: Path) -> None:
     (tmp_path / "broken.pcd").write_bytes(b"\0" * 100)
     (tmp_path / "empty").mkdir()
     environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")} | {
         "PYTHONPATH": str(ROOT),
-        "XDG_RUNTIME_DIR": str(tmp_path),
+        "XDG_RUNTIME_DIR": str(short_path),
         "SHMMAP_SHM_DIR": "/dev/shm",
         "SHMMAP_INSTANCE": f"test-{os.getpid()}-unused",
     }

@@ -58,13 +58,13 @@ def test_a_name_that_is_squatted(daemon: DaemonFactory, divided_map: DividedMap)
 
 
 def test_a_second_daemon_with_another_runtime_directory(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, tmp_path: Path
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, short_path: Path
 ) -> None:
     """It would take the segments of the first one for leftovers, and remove them when it is stopped."""
     one = daemon(divided_map.root)
     assert len(connect(one).area(circle(0, 0, 25)).cells) == 12
     segments = one.segments()
-    place = tmp_path / "run"
+    place = short_path / "run"
     one.arguments = ["--runtime-dir", str(place)]
     assert one.run_to_end() == 75
     assert f"another daemon (pid {one.pid}, listening at {one.endpoint})" in one.log
