@@ -8,6 +8,7 @@
 //   find_package(shmmap REQUIRED)
 //   add_executable(shmmap_map_loader autoware_node.cpp)
 //   target_link_libraries(shmmap_map_loader shmmap::shmmap rclcpp::rclcpp ${autoware_map_msgs_TARGETS})
+//   install(TARGETS shmmap_map_loader DESTINATION lib/${PROJECT_NAME})
 //
 //   ros2 run PACKAGE shmmap_map_loader --ros-args -r __ns:=/shmmap -p wait:=10.0
 //
