@@ -145,7 +145,8 @@ class MapLoaderNode : public rclcpp::Node {
 
 int main(int count, char** words) {
   rclcpp::init(count, words);
-  rclcpp::executors::MultiThreadedExecutor executor;
+  // requests wait for cells and for a daemon: each takes a thread meanwhile
+  rclcpp::executors::MultiThreadedExecutor executor(rclcpp::ExecutorOptions(), 8);
   const auto node = std::make_shared<shmmap_example::MapLoaderNode>();
   executor.add_node(node);
   executor.spin();
