@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import time
@@ -97,45 +98,52 @@ class MapInMemory:
             if limit is not None:
                 raise CannotStart(limit.message, hint=limit.hint) from error
             raise ConfigError(said, key="shm_dir") from error
-        self.statistics.set("pin_source", list(PinSource).index(pins.source))
-        self.statistics.set("last_reload_unix_ns", time.time_ns())
-        self.statistics.set("map_problems", len(catalogue.problems))
-        ledger = Ledger(budget)
-        ledger.overhead_bytes = self.statistics.size_bytes
-        self.statistics.reserve = ledger.add_overhead
-        self.event_log = EventLog(epoch)
-        self.sessions = Sessions()
-        reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
-        evictor = Evictor(reclaimer, POLICIES[config.eviction])
-        self.cache = CellCache(
-            catalogue, evictor, self.statistics, self.event_log,
-            instance=config.instance, mode=mode, gid=gid,
-        )  # fmt: skip
-        self.watched = WatchedDescriptors()
-        cache = (config.cache_dir, str(config.cache_bytes)) if config.cache_dir else ()
-        parent = PreparedParent((directory.path, str(loader_bytes(group_limit)), *cache), self.watched, early)
-        parent.start()  # it imports what loaders need while this process gets ready
-        pool = WorkerPool(config.loaders(), directory, parent, config.load_timeout_s, self.watched)
-        self.map_switch = MapSwitch(self.cache)
-        self.scheduler = Scheduler(
-            self.cache,
-            self.map_switch,
-            pool,
-            clock=time.monotonic,
-            prefetch_share=config.prefetch_share,
-            ride_out_s=config.ride_out_s,
-        )
-        Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced).take_over(time.monotonic())
-        self.cache.tell_all()
-        self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
-        if pins.fd >= 0:
-            self.watched.watch(
-                pins.fd, lambda: self.scheduler.room.hear_of_closes(time.monotonic()), "memory"
+        with contextlib.ExitStack() as undo:
+            undo.callback(self.statistics.close)  # its name must not stay when something else fails
+            self.statistics.set("pin_source", list(PinSource).index(pins.source))
+            self.statistics.set("last_reload_unix_ns", time.time_ns())
+            self.statistics.set("map_problems", len(catalogue.problems))
+            ledger = Ledger(budget)
+            ledger.overhead_bytes = self.statistics.size_bytes
+            self.statistics.reserve = ledger.add_overhead
+            self.event_log = EventLog(epoch)
+            self.sessions = Sessions()
+            reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
+            evictor = Evictor(reclaimer, POLICIES[config.eviction])
+            self.cache = CellCache(
+                catalogue, evictor, self.statistics, self.event_log,
+                instance=config.instance, mode=mode, gid=gid,
+            )  # fmt: skip
+            self.watched = WatchedDescriptors()
+            cache = (config.cache_dir, str(config.cache_bytes)) if config.cache_dir else ()
+            parent = PreparedParent(
+                (directory.path, str(loader_bytes(group_limit)), *cache), self.watched, early
             )
-        if self.cache.names.fd >= 0:
-            self.watched.watch(
-                self.cache.names.fd, lambda: self.scheduler.room.names_vanished(time.monotonic()), "memory"
+            parent.start()  # it imports what loaders need while this process gets ready
+            pool = WorkerPool(config.loaders(), directory, parent, config.load_timeout_s, self.watched)
+            self.map_switch = MapSwitch(self.cache)
+            self.scheduler = Scheduler(
+                self.cache,
+                self.map_switch,
+                pool,
+                clock=time.monotonic,
+                prefetch_share=config.prefetch_share,
+                ride_out_s=config.ride_out_s,
             )
+            Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced).take_over(time.monotonic())
+            self.cache.tell_all()
+            self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
+            if pins.fd >= 0:
+                self.watched.watch(
+                    pins.fd, lambda: self.scheduler.room.hear_of_closes(time.monotonic()), "memory"
+                )
+            if self.cache.names.fd >= 0:
+                self.watched.watch(
+                    self.cache.names.fd,
+                    lambda: self.scheduler.room.names_vanished(time.monotonic()),
+                    "memory",
+                )
+            undo.pop_all()
 
     def close(self, *, keep: bool) -> None:
         """End the loaders, and take every name away or leave those of the segments to the next life."""

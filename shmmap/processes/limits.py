@@ -54,7 +54,9 @@ def limit_behind(error: BaseException) -> Limit | None:
             f"no more files may be open: RLIMIT_NOFILE is {_value(resource.RLIMIT_NOFILE)}",
             "raise it (ulimit -n, LimitNOFILE=)",
         )
+    limited = {_value(resource.RLIMIT_DATA), _value(resource.RLIMIT_AS)} != {"unlimited"}
     is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM
+    is_memory = is_memory or (limited and isinstance(error, SystemError))  # now and then CPython's word
     if is_memory or (isinstance(error, ImportError) and any(text in str(error) for text in _MEMORY)):
         data, space = _value(resource.RLIMIT_DATA), _value(resource.RLIMIT_AS)
         return Limit(

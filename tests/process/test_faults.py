@@ -245,6 +245,6 @@ def test_a_limit_that_keeps_the_daemon_from_starting_is_named(
     daemon: DaemonFactory, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root, command=["prlimit", "--fsize=16384"], start=False)
-    assert one.run_to_end() == 78
-    assert "File too large" in one.log
+    assert one.run_to_end() == 71
+    assert "RLIMIT_FSIZE is 16,384 bytes" in one.log
     assert "LimitFSIZE=" in one.log

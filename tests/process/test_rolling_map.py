@@ -164,7 +164,8 @@ def test_a_drive_from_files(live_daemon: LiveDaemon, words: Words, tmp_path: Pat
     assert 0 < usage["active"] <= len(right)
     assert not chunks.keys() & {"dirty", "saving"}, "all of it is on the disk"
     assert sum(chunks.values()) >= len({(x >> 6, y >> 6, z >> 6) for x, y, z in right})
-    lines = done.stderr.splitlines()
+    pairs, *lines = done.stderr.splitlines()
+    assert pairs.startswith("shmmap-rolling: 6 scans have poses")
     assert len(lines) == 6
     assert lines[0].startswith("scan_0: 150 points, ")
     assert " too low or high; " in lines[0]

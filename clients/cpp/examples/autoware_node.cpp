@@ -8,6 +8,7 @@
 //   find_package(shmmap REQUIRED)
 //   add_executable(shmmap_map_loader autoware_node.cpp)
 //   target_link_libraries(shmmap_map_loader shmmap::shmmap rclcpp::rclcpp ${autoware_map_msgs_TARGETS})
+//   install(TARGETS shmmap_map_loader DESTINATION lib/${PROJECT_NAME})
 //
 //   ros2 run PACKAGE shmmap_map_loader --ros-args -r __ns:=/shmmap -p wait:=10.0
 //
@@ -144,7 +145,8 @@ class MapLoaderNode : public rclcpp::Node {
 
 int main(int count, char** words) {
   rclcpp::init(count, words);
-  rclcpp::executors::MultiThreadedExecutor executor;
+  // requests wait for cells and for a daemon: each takes a thread meanwhile
+  rclcpp::executors::MultiThreadedExecutor executor(rclcpp::ExecutorOptions(), 8);
   const auto node = std::make_shared<shmmap_example::MapLoaderNode>();
   executor.add_node(node);
   executor.spin();

@@ -161,7 +161,7 @@ def run(args: argparse.Namespace) -> int:
 
     try:
         return _serve(args)
-    except (OSError, RuntimeError, MemoryError, ImportError) as error:
+    except (OSError, RuntimeError, MemoryError, ImportError, SystemError) as error:
         if (limit := limit_behind(error)) is None:
             raise
         from shmmap.errors import CannotStart
