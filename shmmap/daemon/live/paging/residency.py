@@ -416,9 +416,7 @@ class Residency:
         if not self._fills_up or self._short(now_s) is not _Short.NO:
             return None
         oldest = islice(self._dirty.values(), SAVED_AHEAD_OF)
-        return next(
-            (one for one in oldest if one.retry_s <= now_s and not self.is_wanted(one, now_s)), None
-        )
+        return next((one for one in oldest if one.retry_s <= now_s and not self.is_wanted(one, now_s)), None)
 
     @property
     def _fills_up(self) -> bool:
