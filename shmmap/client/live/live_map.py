@@ -323,6 +323,8 @@ def _points(what: str, values: ArrayLike) -> NDArray[np.float64]:
         if np.ma.is_masked(values):
             raise ValueError("some are masked")
         return np.asarray(values, np.float64).reshape(-1, 3)
+    except OverflowError as error:
+        raise BadRequest(f"{what}: a number of metres is not finite") from error
     except (TypeError, ValueError) as error:
         raise BadRequest(f"{what}: need numbers of the shape (N, 3): {error}") from None
 

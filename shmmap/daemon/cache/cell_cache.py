@@ -339,6 +339,7 @@ class CellCache:
             return False
         self.lost.add(resident, removed=size < 0, now_s=now_s)
         self.reclaimer.retire(resident, now_s, "damaged")
+        self.reclaimer.never_revive(resident.key)
         return True
 
     def close(self, *, keep: bool = False) -> None:

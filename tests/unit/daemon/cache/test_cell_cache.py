@@ -141,6 +141,7 @@ def puppet(inner: Inner, small_map: DividedMap) -> Iterator[Puppet]:
     yield one
     one.process.kill()
     one.process.wait()
+    one.channel.close()
 
 
 def ask(one: InnerDaemon, request: int) -> None:

@@ -70,3 +70,16 @@ def test_the_name_it_had_before(inner: Inner, small_map: DividedMap) -> None:
             assert load(one, 2) is not first
         assert one.ledger.retired
     one.run_until(lambda: not one.ledger.retired)
+
+
+def test_what_others_cut_short_never_comes_back(inner: Inner, small_map: DividedMap) -> None:
+    """Its cell is loaded again at once, although the damaged segment is still mapped by a reader."""
+    one = inner(small_map.root)
+    first = load(one, 1)
+    path = f"{one.shm_dir}{first.name}"
+    with open(path, "rb"):
+        os.chmod(path, 0o600)  # an ordinary user may not write what it made read-only
+        os.truncate(path, 0)
+        assert one.cache.retire_if_lost(first, one.now_s())
+        assert load(one, 2) is not first
+    one.run_until(lambda: not one.ledger.retired)

@@ -99,6 +99,7 @@ class World:
     def stop(self) -> None:
         """As at the end of the service: save what is to be saved."""
         self.until(lambda: self.map.all_durable, save_all=True)
+        self.map.finish(None)
         self.map.close()
         self.map.memory.close()
 
@@ -301,7 +302,7 @@ def test_reload_before_save(
         assert world.map.residency.saving == len(marks.keys), "all of it is on its way to the disk"
         world.turn()
         world.send(marks, at)
-        assert world.map.residency.saving == len(marks.keys), "and still is"
+        assert world.map.residency.saving >= len(marks.keys), "and still is, with what came instead, if any"
     finally:
         folder.goes_on.set()
     world.map.residency.asked_bytes = 0
