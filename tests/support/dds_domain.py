@@ -33,7 +33,9 @@ URI: Final = (
 def dds_domain() -> Iterator[int]:
     """Have a domain to oneself; the kernel gives it back whatever becomes of this process."""
     for number in _DOMAINS:
-        fd = os.open(_LOCKS / f"shmmap-test-dds-domain-{os.getuid()}-{number}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        fd = os.open(
+            _LOCKS / f"shmmap-test-dds-domain-{os.getuid()}-{number}.lock", os.O_RDWR | os.O_CREAT, 0o600
+        )
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
