@@ -134,7 +134,9 @@ def test_a_daemon_without_privileges_serves_the_group(
     ) as reader:
         before = reader.checksums()
         evicted = client.ask("evict")
-        assert (evicted[2], evicted[3]) == (len(handles) - 1, 1)
+        # the one that its own user has removed above is counted until the daemon has noticed
+        assert evicted[2] in (len(handles) - 2, len(handles) - 1)
+        assert evicted[3] == 1
         assert reader.checksums() == before
     one.until_segments(0, lambda: client.ask("stats"))
     assert client.ask("reload")[3:6] == [0, 0, 0]
