@@ -132,7 +132,7 @@ def test_the_daemon_has_no_rights_it_does_not_need(fresh: BootedSystemd) -> None
     done = shmmap(fresh, *layer, user="alice")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "voxel" in done.stdout
-    assert fresh.shell("find /var/cache/shmmap/numba -name '*.nbc'") != ""
+    assert fresh.shell("find /var/cache/shmmap/numba -name '*.kernel'") != ""
     pid = fresh.properties("shmmapd")["MainPID"]
     lines = fresh.shell(f"cat /proc/{pid}/status").splitlines()
     status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
@@ -275,6 +275,9 @@ def test_live_maps_have_a_place_and_the_rights_that_they_need(fresh: BootedSyste
     """)
     done = shmmap(fresh, "status", "--json", user="alice")
     assert [row["name"] for row in json.loads(done.stdout)["live"]] == ["lidar"], done.stderr
+    waiting = Patience()  # points are served before live maps are
+    while waiting(fresh.shell("ls -d /dev/shm/shmmap-live.default.marks || true") == ""):
+        pass
     places = "/var/lib/shmmap /var/lib/shmmap/state/default /var/lib/shmmap/state/default/live/lidar"
     assert fresh.shell(f"stat -c '%a %U:%G' {places} /dev/shm/shmmap-live.default.marks").splitlines() == [
         "755 root:root",
