@@ -334,6 +334,7 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
     assert on_disk(one) == expected(scans)
 
 
+@pytest.mark.root
 def test_what_did_not_get_to_the_disk_is_told(
     live_daemon: LiveDaemon, words: Words, private_tmpfs: Callable[[str], str], tmp_path: Path
 ) -> None:

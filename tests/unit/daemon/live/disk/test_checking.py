@@ -247,11 +247,11 @@ def device(path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", [".chunk", "manifest.json", ".chunk.abcd.tmp"])
-@pytest.mark.parametrize("kind", [pipe, folder_with_something, loop, device])
+@pytest.mark.parametrize(
+    "kind", [pipe, folder_with_something, loop, pytest.param(device, marks=pytest.mark.root)]
+)
 def test_what_cannot_be_read_is_quarantined(tmp_path: Path, what: str, kind: Callable[[Path], None]) -> None:
     """It may be as good as ever: a check changes nothing, and a repair gives it another name."""
-    if kind is device and os.geteuid():
-        pytest.skip("needs root")
     stored_drive(tmp_path)
     path = largest(tmp_path) if what == ".chunk" else tmp_path / what
     if path.exists():
