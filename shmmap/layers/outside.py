@@ -33,5 +33,14 @@ class OutsideBox:
         low, high = bounds[0][:2], bounds[1][:2]
         if not ((low < self._low).any() or (high > self._high).any()):
             return
-        xy = xyz[:, :2]
-        self.count += int(np.count_nonzero(((xy < self._low) | (xy > self._high)).any(axis=1)))
+        outside = np.zeros(len(xyz), np.bool_)
+        for axis in (0, 1):
+            column = np.ascontiguousarray(xyz[:, axis])
+            if column.dtype.kind != "f":
+                column = column.astype(np.float64)
+            # limits in the points' own type, rounded outwards: a comparison of two types is much slower
+            least = np.nextafter(column.dtype.type(self._low[axis]), column.dtype.type(-np.inf))
+            most = np.nextafter(column.dtype.type(self._high[axis]), column.dtype.type(np.inf))
+            outside |= column < least
+            outside |= column > most
+        self.count += int(np.count_nonzero(outside))

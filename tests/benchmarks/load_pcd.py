@@ -103,7 +103,7 @@ def kept(load: Callable[[str, int], object], directory: str = SHM) -> Round:
 
 
 def ours(path: str, out: int) -> None:
-    build_points(path, out, cell_id=path, box=(0.0, 0.0, CELL_M, CELL_M))
+    build_points(path, out, cell_id=path, box=(-1e5, -1e5, 1e5, 1e5))
 
 
 def copy(path: str, out: int) -> None:

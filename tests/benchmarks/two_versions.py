@@ -108,7 +108,7 @@ for line in sys.stdin:
     for file in files:
         fd = directory.create()
         before = time.perf_counter()
-        build_points(file, fd, cell_id=file, box=(0.0, 0.0, 20.0, 20.0))
+        build_points(file, fd, cell_id=file, box=(-1e5, -1e5, 1e5, 1e5))
         took += time.perf_counter() - before
         os.close(fd)
     print(took * 1e6, flush=True)
