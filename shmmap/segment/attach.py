@@ -159,13 +159,16 @@ class AttachedSegment:
         The column table (`shmmap.segment.layout.ColumnRow`).
     raw : (total_bytes,) uint8
         All of its bytes.
+    outside_points : int
+        Points outside the cell's box.
     """
 
-    __slots__ = ("_header", "columns", "raw")
+    __slots__ = ("_header", "columns", "outside_points", "raw")
 
-    def __init__(self, columns: list[ColumnRow], raw: NDArray[np.uint8]) -> None:
+    def __init__(self, columns: list[ColumnRow], raw: NDArray[np.uint8], outside_points: int = 0) -> None:
         self.columns = columns
         self.raw = raw
+        self.outside_points = outside_points
         self._header: SegmentHeader | None = None
 
     @property
@@ -175,11 +178,6 @@ class AttachedSegment:
         if header is None:
             header = self._header = unpack_header(self.raw.data, len(self.raw))
         return header
-
-    @property
-    def outside_points(self) -> int:
-        """Points outside the cell's box; cheaper than the header."""
-        return int(OUTSIDE.unpack_from(self.raw.data, OUTSIDE_AT)[0])
 
     def column(self, index: int) -> NDArray[np.generic]:
         """Return column number ``index`` as a zero-copy array."""
@@ -201,7 +199,7 @@ class AttachedSegment:
             There is not so much memory.
         """
         try:
-            return AttachedSegment(self.columns, self.raw.copy())
+            return AttachedSegment(self.columns, self.raw.copy(), self.outside_points)
         except MemoryError:
             raise no_memory_left(len(self.raw)) from None
 
@@ -342,6 +340,7 @@ def attach(
         if PAGE_BYTES < header_bytes <= size:
             page = os.pread(fd, header_bytes, offset)
         _, columns = read_columns(memoryview(page), size)
+        (outside,) = OUTSIDE.unpack_from(page, OUTSIDE_AT)
         memory = map_file(fd, end, populate=populate)
         if on_mapped is not None:
             on_mapped(memory)
@@ -350,7 +349,7 @@ def attach(
         raise SegmentError(f"segment {name} cannot be read: {_reason(error)}") from None
     finally:
         file.give_back()
-    return AttachedSegment(columns, _bytes_of(memory, offset, end, sinks=sinks))
+    return AttachedSegment(columns, _bytes_of(memory, offset, end, sinks=sinks), outside)
 
 
 def _reason(error: Exception) -> str:
