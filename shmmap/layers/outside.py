@@ -24,14 +24,15 @@ class OutsideBox:
         self._box = box
         # what wrote the file may have rounded to float32 on either side of the border
         step = float(np.spacing(np.float32(max(map(abs, box)))))
-        self._low = np.array(box[:2]) - step
-        self._high = np.array(box[2:]) + step
+        self._low = box[0] - step, box[1] - step
+        self._high = box[2] + step, box[3] + step
         self.count = 0
 
     def add(self, xyz: NDArray[Any], bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """Count those of a block (N, 3); ``bounds`` are of all points up to now, this block's included."""
-        low, high = bounds[0][:2], bounds[1][:2]
-        if not ((low < self._low).any() or (high > self._high).any()):
+        (low_x, low_y), (high_x, high_y) = bounds[0][:2].tolist(), bounds[1][:2].tolist()
+        inside_x = low_x >= self._low[0] and high_x <= self._high[0]
+        if inside_x and low_y >= self._low[1] and high_y <= self._high[1]:
             return
         outside = np.zeros(len(xyz), np.bool_)
         for axis in (0, 1):
