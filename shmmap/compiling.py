@@ -106,7 +106,7 @@ def compiled(*signatures: Any, brief: bool = False, **settings: Any) -> Callable
         try:
             source = Path(function.__code__.co_filename).read_bytes()
         except OSError:
-            pass  # without its source nobody knows whether what was kept is still right
+            pass  # without its source it is not known whether what was kept is still right
         else:
             kernel._cache = _KernelFiles(function, source)
         with register_dispatcher(kernel):

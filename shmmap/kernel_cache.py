@@ -6,7 +6,7 @@ They are in ``NUMBA_CACHE_DIR`` where that is set, else in ``$CACHE_DIRECTORY/ke
 
 Nothing depends on them: what is missing, damaged, of another version or not to be trusted is compiled
 again, and where nothing can be written kernels are compiled in each process.  A kernel is code that this
-process will run, so directory and file have to belong to this user or to root, and nobody else may write
+process will run, so directory and file have to belong to this user or to root, and no other account may write
 there.
 
 A file: 8 bytes of magic, the SHA-256 of what the kernel was made from, the SHA-256 of the kernel, the kernel.

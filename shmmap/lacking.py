@@ -171,7 +171,7 @@ def _named(error: CellError) -> str:
 
 
 def _holder_lines(errors: Iterable[CellError]) -> list[str]:
-    """Who uses memory, the most first; each cell's failure tells it again."""
+    """Who uses memory, the most first; each cell's failure says it again."""
     most: dict[int, Holder] = {}
     for error in errors:
         for holder in error.holders:

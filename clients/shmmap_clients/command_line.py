@@ -163,7 +163,7 @@ def _ended_as_interrupted() -> Iterator[list[int]]:
         yield ended_by
     finally:
         for number in handled:
-            if signal.getsignal(number) is end:  # nobody has put another one there
+            if signal.getsignal(number) is end:  # no other handler was installed since
                 signal.signal(number, signal.SIG_DFL)
 
 

@@ -67,7 +67,7 @@ def read_chunk(fd: int, name: str = "chunk") -> ChunkView | None:
     Parameters
     ----------
     fd
-        Its file, open for reading.  (Nobody but the writer maps a chunk: its file is cut to nothing when it
+        Its file, open for reading.  (Only the writer maps a chunk: its file is cut to nothing when it
         is given up.)
     name
         What errors call it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handles to cells: each segment is mapped once in a client, and unmapped where nobody is disturbed.
+"""Handles to cells: each segment is mapped once in a client, and unmapped where no thread is disturbed.
 
 Cells and views end wherever the last reference to them is dropped, in any thread and in the middle of
 anything.  What happens then is built in, appending to a deque or putting into a `queue.SimpleQueue`: it takes

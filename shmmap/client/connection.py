@@ -96,7 +96,7 @@ class Connection:
         self._greeting = True
         stop_orphans()
         self._watch = ConnectionWatch(self, f"ipc://{self.path}", _OPTIONS, waiting)
-        # also when nobody calls close(); not at the end of the program, where threads may be using it
+        # also without a call of close(); not at the end of the program, where threads may be using it
         self._finalizer = weakref.finalize(self, self._watch.stop)
         self._finalizer.atexit = False
         self._socket = self._watch.socket

@@ -154,7 +154,7 @@ def check_socket(path: str, deadline_s: float) -> None:
             try:
                 probe.connect(path)
                 break
-            except BlockingIOError:  # its queue of connections is full; the kernel tells no more
+            except BlockingIOError:  # its queue of connections is full; the kernel reports no more
                 if time.monotonic() >= deadline_s:
                     raise _no_answer(path) from None
                 time.sleep(_FULL_S)

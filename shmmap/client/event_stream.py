@@ -114,7 +114,7 @@ class EventStream:
         except BaseException:
             self._connection.close()
             raise
-        # also when nobody calls close(); not at the end of the program, where a thread may be using it
+        # also without a call of close(); not at the end of the program, where a thread may be using it
         self._finalizer = weakref.finalize(self, self._watch.stop)
         self._finalizer.atexit = False
         self._socket = self._watch.socket

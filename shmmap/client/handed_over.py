@@ -40,7 +40,7 @@ _COPY_HINT: Final = (
 _PLUMBING: Final = frozenset(
     f"multiprocessing.{name}" for name in ("connection", "forkserver", "queues", "reduction", "spawn")
 )
-"""Modules that unpickle, and lose whoever waits for what did not."""
+"""Modules that unpickle in a thread, and leave their caller waiting for what could not be."""
 
 
 class _Gone:
@@ -57,7 +57,7 @@ class _Gone:
 
 @cache
 def _boot() -> str:
-    """Name this run of this machine, which containers share; empty where the kernel does not tell."""
+    """Name this run of this machine, which containers share; empty where the kernel does not report it."""
     try:
         with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:
             return file.read().strip()

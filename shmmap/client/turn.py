@@ -36,7 +36,7 @@ class Turn:
 def closed(what: str, hint: str) -> BaseException:
     """Return the error of a request to what is closed.
 
-    While the interpreter ends, that ends the thread that asked without a word: nobody waits for it.
+    While the interpreter ends, that ends the asking thread silently: nothing waits for it.
     """
     main = threading.main_thread()
     if not main.is_alive() and threading.get_ident() != main.ident:

@@ -159,7 +159,7 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
 
 
 def answering_at(path: str) -> dict[str, int]:
-    """Ask whoever listens at a socket: the process of the daemon there, by its instance."""
+    """Ask the process that listens at a socket: the process of the daemon there, by its instance."""
     from shmmap.client.client import connect
     from shmmap.client.discovery import is_served
 

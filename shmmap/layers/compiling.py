@@ -31,9 +31,7 @@ def compile_kernels(*, wait: bool = True) -> None:
         try:
             lock = stack.enter_context(mark.with_suffix(".lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except (
-            OSError
-        ):  # another process is at it, or nothing can be kept: whoever needs a kernel compiles it
+        except OSError:  # another process is at it, or nothing can be kept: each process compiles its own
             return
         from shmmap.layers import (
             height_kernels,

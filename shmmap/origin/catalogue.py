@@ -99,7 +99,7 @@ class Catalogue:
         self.problems = tuple(problems)
         self.opened: OpenedDirectories | None = None
         self.frame: MapFrame = UNKNOWN_FRAME
-        """Where the map frame lies in the world, see `MapFrame`; whoever reads the map sets it."""
+        """Where the map frame lies in the world, see `MapFrame`; the reader of the map sets it."""
 
     def _refuse_bad(self, boxes: NDArray[np.float64]) -> None:
         bad = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 __all__ = ["far_cells_notes"]
 
-_APART_M: Final = 200.0  # cells this far apart, and so many times their size, are not one map's
+_APART_M: Final = 200.0  # cells this far apart, and ten times their size, are not one map's
 _APART_CELLS: Final = 10
 _FEW: Final = 3  # cells, or one in a hundred of all: more are another part of the map
 _NAMED: Final = 3

@@ -64,7 +64,7 @@ def read_apart(
     map_path
         The map, for messages.
     words
-        What the process is told, as JSON: a `MapDirectory`, and the descriptors of its directories by path.
+        What the process is given, as JSON: a `MapDirectory`, and the descriptors of its directories by path.
     before
         An earlier state: what has not changed is shared with it.
     descriptors

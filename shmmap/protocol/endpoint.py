@@ -32,7 +32,7 @@ def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
     """Directories a client looks in, in order: the user's own, then the system's.
 
     ``XDG_RUNTIME_DIR`` is ignored where it is not absolute, as its specification has it.  The directory in
-    /tmp counts where it is there and is nobody else's.
+    /tmp counts where it is there and belongs to this user.
     """
     own = environ.get("XDG_RUNTIME_DIR", "")
     found = [f"{own}/shmmap"] if own.startswith("/") else []

@@ -240,7 +240,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     marks_dir
         Where files of marks are to lie; empty for who does not map.
     slot
-        Of no use: nobody locks chunks any more.
+        Of no use: chunks are not locked any more.
     mapper, next_scan
         The mapper's number, and the least that a new scan of it may have.
     most_marks_bytes

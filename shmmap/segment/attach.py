@@ -79,7 +79,7 @@ def map_file(fd: int, nbytes: int, *, populate: bool = False, private: bool = Fa
     populate
         Let the kernel map every page now.
     private
-        Readable and writable: the kernel copies a page when it is first written, and nobody else sees that.
+        Readable and writable: the kernel copies a page at its first write, which only this process sees.
 
     Raises
     ------
@@ -131,7 +131,7 @@ class _Mapping:
             "typestr": "|u1",
             "version": 3,
         }
-        # into the first of the queues that there are then; where there is none, nobody has it any more
+        # into the first of the queues that there are then; where there is none, it is unmapped here
         self.__del__ = partial(any, map(SimpleQueue.put, sinks, (memory,)))
 
 

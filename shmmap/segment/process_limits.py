@@ -24,7 +24,7 @@ _PIDS: Final = "/sys/fs/cgroup"
 
 
 def check_files(count: int, what: str) -> None:
-    """Find out whether this process may open so many files more.
+    """Find out whether this process may open this many files more.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def _may_open_none() -> bool:
 
 
 def check_threads(count: int, what: str) -> None:
-    """Find out whether so many threads more may be started.
+    """Find out whether this many threads more may be started.
 
     Raises
     ------

@@ -55,7 +55,7 @@ class CellRow:
     load_ns
         How long loading it took.
     ahead
-        It was fetched ahead, and nobody has asked for it yet.
+        It was fetched ahead, and not asked for yet.
     """
 
     id: str

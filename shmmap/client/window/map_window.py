@@ -144,7 +144,7 @@ class MapWindow:
             if self._owns_client:
                 self._client.close()
             raise
-        # also when nobody calls close(); at the end of the program Python stops the thread
+        # also without a call of close(); at the end of the program Python stops the thread
         self._finalizer = weakref.finalize(self, self._follower.stop)
         self._finalizer.atexit = False
 

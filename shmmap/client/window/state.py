@@ -166,7 +166,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         )
 
 
-EMPTY: Final = WindowState(covered=False)  # nobody has said what the map has there
+EMPTY: Final = WindowState(covered=False)  # what the map has there is not known yet
 
 
 def moved(state: WindowState, pose: Intent, update_distance: float) -> bool:

@@ -325,7 +325,7 @@ class CellCache:
         return self._retire_lost(names, now_s)
 
     def look_for_some(self, now_s: float) -> bool:
-        """Look for a few segments after so many names vanished that the kernel lost count."""
+        """Look for a few segments, after more names vanished than the kernel reported."""
         return self._retire_lost([one.name for one in islice(self._unsure, LOOKS_FOR_NAMES)], now_s)
 
     def _retire_lost(self, names: Iterable[str], now_s: float) -> bool:

@@ -185,7 +185,7 @@ class Reclaimer:
     def _vanished(self, retired: Retired) -> None:
         """Release the bytes of a segment whose name others removed.
 
-        Its readers keep its memory, and nobody can find out until when.
+        Its readers keep its memory, and until when cannot be found out.
         """
         self._forget(retired)
         self.ledger.freed(retired.resident.name)

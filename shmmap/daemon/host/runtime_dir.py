@@ -20,7 +20,7 @@ def make_runtime_dir(path: Path, gid: int) -> None:
     Raises
     ------
     CannotStart
-        It cannot be made, or in /tmp somebody else has made it.
+        It cannot be made, or in /tmp another account has made it.
     """
     if str(path) == fallback_runtime_dir():
         _make_private(path)

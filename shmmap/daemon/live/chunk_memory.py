@@ -203,7 +203,7 @@ class ChunkMemory:
         state["sequence"] += 2
         fd = chunk.unmap()
         try:
-            os.ftruncate(fd, 0)  # before its name goes: else a kill here would leave what nobody finds
+            os.ftruncate(fd, 0)  # before its name goes: else a kill here would leave memory without a name
         finally:
             os.close(fd)
         with contextlib.suppress(FileNotFoundError):

@@ -73,7 +73,7 @@ class FileThreads:
         wait(list(self._running), timeout=seconds, return_when=FIRST_COMPLETED)
 
     def close(self, seconds: float = CLOSE_S) -> list[Any]:
-        """Wait until all is done, at most so long; returns what came of it and was not told, but errors."""
+        """Wait until all is done, or time is over; returns what is not reported yet, errors left out."""
         done, _ = wait(list(self._running), timeout=seconds)
         self._threads.shutdown(wait=False, cancel_futures=True)
         untold = [outcome for future in done for outcome in future.result()]

@@ -79,9 +79,9 @@ class End(msgspec.Struct, array_like=True, tag="end"):
 
 
 class Begun(msgspec.Struct, array_like=True, tag="begun"):
-    """Each map is served, or has a problem; so many are, and so many chunks were found in memory.
+    """Each map is served, or has a problem: how many are served, how many chunks were found in memory.
 
-    The error is why none can be, as long as nobody changes the settings or ends another daemon.
+    The error is why none can be, as long as the settings stay and another daemon runs.
     """
 
     maps: int

@@ -25,7 +25,7 @@ LEAST_BYTES: Final = 4 << 20
 
 
 def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_bytes: int) -> int:
-    """Return what so many live maps need of the file system in which the cells are: at least, or as set."""
+    """Return what this many live maps need of the file system of the cells: at least, or as set."""
     if not maps:
         return 0
     path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)

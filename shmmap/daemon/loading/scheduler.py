@@ -51,7 +51,7 @@ class Scheduler:
     loads
         What is wanted, queued and under way, and what failed.
     prefetcher, room, misplaced, lost
-        Wishes for what nobody has asked for yet; asks the cache for room; counts cells with points outside
+        Loads what was not asked for yet; asks the cache for room; counts cells with points outside
         their box; replaces workers.
     on_settled
         Called with a key when its load ended, in whichever way.

@@ -124,7 +124,7 @@ def _listen(path: str, gid: int) -> socket.socket:
 
 
 def _answers(path: str) -> int | None:
-    """Process that has the socket at ``path`` open, 0 where it is not known which; None: nobody has."""
+    """Process that has the socket at ``path`` open, 0 where it is not known which; None: no process has."""
     for kind in (socket.SOCK_STREAM, socket.SOCK_SEQPACKET, socket.SOCK_DGRAM):
         with socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK) as probe:
             try:

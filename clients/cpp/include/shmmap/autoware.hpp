@@ -152,7 +152,7 @@ class HeldCells {
         client_.emplace(options_.client);
       } catch (const Unreachable& error) {
         if (error.code() == "no_permission" || Clock::now() >= until || !is_wanted()) throw;
-        ::poll(nullptr, 0, 20);  // nobody says when it listens
+        ::poll(nullptr, 0, 20);  // it does not announce when it listens
       }
     }
     std::vector<Held> have;

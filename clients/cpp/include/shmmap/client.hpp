@@ -394,7 +394,7 @@ class Client {
         disconnect();
         if (error.code() == "no_answer" || error.code() == "no_permission" || Clock::now() >= deadline) throw;
         check_waiting();
-        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // nobody says when it listens
+        if (!std::exchange(may_be_back, false)) ::poll(nullptr, 0, look_again.count());  // it does not announce when it listens
       }
     }
   }

@@ -78,7 +78,7 @@ struct KeptCell {
   std::uint64_t version = 0, bytes = 0, points = 0, hits = 0;
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
   std::int64_t last_use_monotonic_ns = 0, load_ns = 0;
-  bool ahead = false;  ///< fetched ahead, and nobody has asked for it yet
+  bool ahead = false;  ///< fetched ahead, and not asked for yet
 };
 
 /// One client of the daemon.

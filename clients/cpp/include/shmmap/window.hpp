@@ -156,7 +156,7 @@ class Window {
   ///
   /// Waits until nothing is missing, at most `wait` seconds, and no longer than half a second where what is missing
   /// does not fit in the daemon's memory, or cannot be reached.  Throws BadRequest, and whatever keeps the daemon from
-  /// being asked: Unreachable at once where nobody listens and `wait` is below 20 ms, else when that time is over, and
+  /// being asked: Unreachable at once where no daemon listens and `wait` is below 20 ms, else when that time is over, and
   /// `no_answer` where it has been silent for `Options::patience` seconds.  The window keeps what it has.
   WindowUpdate move_to(const Intent& pose, double wait = default_wait) {
     check_pose(pose);
@@ -328,7 +328,7 @@ class Window {
         error_ = error;  // NOLINT(cppcoreguidelines-slicing): its code says what it was
         if (!stale_since_) stale_since_ = Clock::now();
         if (dynamic_cast<const Unreachable*>(&error) == nullptr) not_before_ = Client::after(0.1);
-        pause_until = Clock::now() + Client::look_again;  // nobody says when it listens
+        pause_until = Clock::now() + Client::look_again;  // it does not announce when it listens
         if (not_before_ > pause_until || error.code() == "no_permission" || error.code() == "no_answer" ||
             pause_until >= until)
           throw;

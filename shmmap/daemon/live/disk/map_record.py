@@ -57,7 +57,7 @@ _RESOLUTION_M: Final = (1e-4, 1e3)
 _NOT_DECODED: Final = (
     msgspec.MsgspecError, ValueError, ConfigError, RecursionError, MemoryError, OverflowError, struct.error,
 )  # fmt: skip
-"""What decoders raise of bytes that nobody has written like that."""
+"""What decoders raise for damaged bytes."""
 
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62) - 1)]
 """Of a file that may have been changed: never negative, and something can be added."""

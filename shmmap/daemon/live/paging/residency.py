@@ -38,11 +38,11 @@ REVIEW_S: Final = 0.1
 IN_VAIN_S: Final = 1.0
 """The same, where nothing was found the last time and no client has moved."""
 REVIEWED_OF_NEWS: Final = 32
-"""All are also gone over when one in so many came or changed since."""
+"""All are also reviewed when one chunk in this many came or changed since."""
 SAVED_AHEAD_OF: Final = 32
-"""Of the chunks that were changed longest ago, so many are looked at for one that nothing wants."""
+"""How many of the chunks changed longest ago are looked at for one that nothing wants."""
 FOUND_AT_ONCE: Final = 64, 16
-"""Chunks that are found to be given up at once: so many, or one in so many; their order gets old."""
+"""How many chunks one review finds: at least the first, or one in the second; their order gets old."""
 
 
 class _Short(enum.IntEnum):

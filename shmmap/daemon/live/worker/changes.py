@@ -57,7 +57,7 @@ class Changes:
         return self._changed.get(key, 0) > since
 
     def newer(self, since: int, most: int) -> list[ChunkKey] | None:
-        """Chunks in memory that changed after ``since``, the last one first; None for more than so many."""
+        """Chunks in memory that changed after ``since``, the last one first; None for more than ``most``."""
         found: list[ChunkKey] = []
         for key, number in reversed(self._changed.items()):
             if number <= since:

@@ -105,7 +105,7 @@ class _Worker:
                     one.failed(error, now_s)
         if not self._begun and all(one.problem for one in self._opening.values()):
             self._begun = True
-            self._tell(now_s)  # before: who is told that the daemon is ready finds how they are
+            self._tell(now_s)  # before READY is said: then the maps' state can be read
             self._send(messages.Begun(len(self._maps), self._chunks, *self._refusal()))
 
     @property
@@ -285,7 +285,7 @@ class _Worker:
 
 
 def _limits(settings: LiveSettings, budget_bytes: int, maps: int) -> Limits:
-    """What one of so many maps may take; what is beside its chunks leaves them a quarter of the memory."""
+    """What one of this many maps may take; what is beside its chunks leaves them a quarter of the memory."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     with contextlib.suppress(OSError, ValueError):
         limit = min(limit, int(Path("/proc/sys/vm/max_map_count").read_text()))

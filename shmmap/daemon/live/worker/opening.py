@@ -104,7 +104,7 @@ class OpeningMap:
         outcome: tuple[Folder, MapFiles] | Exception
         try:
             outcome = open_files(self.settings)
-        except Exception as error:  # noqa: BLE001  whatever is in a file must end nobody else's map
+        except Exception as error:  # noqa: BLE001  a damaged file must not end another map
             outcome = error
         self._outcome.append(outcome)
         self._wake()

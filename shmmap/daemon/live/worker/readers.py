@@ -110,7 +110,7 @@ class Readers:
         self.lists.left(session)
 
     def close(self) -> None:
-        """Answer nothing more: nobody waits for a disk that readers asked for."""
+        """Answer nothing more: the end does not wait for a disk that readers asked for."""
         self.lists.is_closed = True
         self._threads.close(0.0)
 

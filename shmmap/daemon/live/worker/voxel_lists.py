@@ -55,7 +55,7 @@ _Part = tuple[NDArray[np.int32], NDArray[np.int16]]
 
 @dataclass(frozen=True, slots=True)
 class Later:
-    """A request goes on after so many seconds."""
+    """Seconds after which a request goes on."""
 
     seconds: float
 
@@ -295,5 +295,5 @@ class VoxelLists:
 
 
 def _pages(nbytes: int) -> int:
-    """Memory that so many bytes of a file take."""
+    """Memory that this many bytes of a file take."""
     return -(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
