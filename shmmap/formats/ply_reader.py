@@ -11,7 +11,6 @@ import os
 import re
 import struct
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
@@ -23,7 +22,7 @@ from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.binary import record_blocks
 from shmmap.formats.pcd.table import FieldTable
 from shmmap.formats.ply_header import HEADER_LIMIT_BYTES, PlyElement, PlyHeader, parse_ply_header
-from shmmap.formats.source_file import SourceFile, open_regular
+from shmmap.formats.source_file import FileReader, SourceFile
 from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
 __all__ = ["PlyReader"]
@@ -39,7 +38,7 @@ _COUNTERS: Final = {
 Block = tuple[NDArray[Any], ...]
 
 
-class PlyReader:
+class PlyReader(FileReader):
     """A PLY file, opened and its header checked.
 
     Attributes
@@ -59,8 +58,7 @@ class PlyReader:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = os.fspath(path)
-        self._fd = open_regular(self.path)
+        super().__init__(os.fspath(path))
         try:
             self._source = SourceFile(self._fd, self.path)
             head = self._source.peek(min(self._source.size, _FIRST_READ_BYTES))
@@ -80,20 +78,6 @@ class PlyReader:
         self.encoding = self._header.format
         record = self._table.record
         self._record = record.newbyteorder(">") if self.encoding == "binary_big_endian" else record
-
-    def __enter__(self) -> PlyReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._fd >= 0:
-            os.close(self._fd)
-        self._fd = -1
 
     @property
     def warnings(self) -> tuple[str, ...]:

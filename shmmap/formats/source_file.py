@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import os
 import stat
-from typing import Any, NoReturn
+from types import TracebackType
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import xxhash
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 
 from shmmap.formats.causes import refusal
 
-__all__ = ["SourceFile", "open_regular"]
+__all__ = ["FileReader", "SourceFile", "open_regular"]
+
+_Self = TypeVar("_Self", bound="FileReader")
 
 
 def open_regular(path: str) -> int:
@@ -38,6 +41,34 @@ def open_regular(path: str) -> int:
         kind = "a directory, not a file" if stat.S_ISDIR(mode) else "not a regular file"
         raise refusal("not_regular", kind, path=path)
     return fd
+
+
+class FileReader:
+    """A reader that has a file open until it is closed, or its ``with`` block ends.
+
+    Raises
+    ------
+    MapDataError
+        As `open_regular`.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self._fd = open_regular(path)
+
+    def __enter__(self: _Self) -> _Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._fd >= 0:
+            os.close(self._fd)
+        self._fd = -1
 
 
 class SourceFile:

@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +23,7 @@ from shmmap.formats.causes import refusal
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.pcd.table import FieldTable
-from shmmap.formats.source_file import SourceFile, open_regular
+from shmmap.formats.source_file import FileReader, SourceFile
 from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
 
 __all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]
@@ -61,7 +60,7 @@ class _Layout:
     guess: str = ""
 
 
-class TextReader:
+class TextReader(FileReader):
     """A text file, opened, its first lines understood and its points counted.
 
     Attributes
@@ -81,9 +80,8 @@ class TextReader:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = os.fspath(path)
+        super().__init__(os.fspath(path))
         suffix = os.path.splitext(self.path)[1].lower()
-        self._fd = open_regular(self.path)
         try:
             self._source = SourceFile(self._fd, self.path)
             head = self._source.peek(min(self._source.size, _HEAD_BYTES))
@@ -109,20 +107,6 @@ class TextReader:
         self.bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.encoding = self.version = ""
         self.warnings: tuple[str, ...] = (self._layout.guess,) if self._layout.guess else ()
-
-    def __enter__(self) -> TextReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._fd >= 0:
-            os.close(self._fd)
-        self._fd = -1
 
     def blocks(self, block_points: int, start: int = 0) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the columns of the points from ``start`` on, at most ``block_points`` rows at a time.
