@@ -11,18 +11,12 @@ counts or digest are wrong.  The input of a finding is kept and its path printed
 
 from __future__ import annotations
 
-import argparse
 import math
-import os
 import random
 import resource
-import shutil
 import struct
-import subprocess
 import sys
-import tempfile
 import time
-import traceback
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +26,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.reader import PcdReader
+from tests.support.fuzz_children import fuzz_in_children, print_outcomes
 from tests.support.pcd_bytes import CODES, Field, Number, column, lzf_decode, lzf_encode, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
@@ -184,38 +179,13 @@ def child(folder: Path, seed: int, seconds: float) -> int:
         slowest = max(slowest, time.monotonic() - started)
         outcomes[outcome] = outcomes.get(outcome, 0) + 1
         count += 1
-    table = " ".join(f"{name}={number}" for name, number in sorted(outcomes.items()))
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"seed {seed}: {count} inputs, slowest {slowest * 1e3:.0f} ms, peak {peak:.0f} MB: {table}")
+    print_outcomes(seed, count, slowest, outcomes)
     return 0
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--seconds", type=float, default=60.0, help="how long to fuzz (default 60)")
-    parser.add_argument("--seed", type=int, default=None, help="first seed (default: from the clock)")
-    parser.add_argument("--child", type=Path, default=None, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.child is not None:
-        try:
-            return child(options.child, options.seed, options.seconds)
-        except Exception:
-            traceback.print_exc()
-            return 1
-    seed = time.time_ns() % 10**9 if options.seed is None else options.seed
-    deadline = time.monotonic() + options.seconds
-    while (left := deadline - time.monotonic()) > 0:
-        folder = Path(tempfile.mkdtemp(prefix="fuzz_pcd."))
-        command = [sys.executable, "-X", "faulthandler", "-W", "error", "-m", "tests.benchmarks.fuzz_pcd"]
-        command += ["--child", str(folder)]
-        command += ["--seed", str(seed), "--seconds", f"{min(left, 30):.3f}"]
-        done = subprocess.run(command, check=False, env=os.environ)
-        if done.returncode:
-            print(f"FOUND with seed {seed} (exit {done.returncode}): {folder / 'input.pcd'}", flush=True)
-            return 1
-        shutil.rmtree(folder)
-        seed += 1
-    return 0
+    """Fuzz until the time is over."""
+    return fuzz_in_children("fuzz_pcd", __doc__, child)
 
 
 if __name__ == "__main__":
