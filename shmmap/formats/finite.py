@@ -46,11 +46,17 @@ def _reduce(extreme: np.ufunc, rows: NDArray[Any]) -> list[float]:
 
 
 class Bounds:
-    """Bounds of all finite points seen so far, float64, metres."""
+    """Bounds of all finite points seen so far, float64, metres.
+
+    Attributes
+    ----------
+    low, high
+        Least and greatest x, y, z; infinite, the wrong way round, before any point.
+    """
 
     def __init__(self) -> None:
-        self._low = [math.inf] * 3
-        self._high = [-math.inf] * 3
+        self.low = [math.inf] * 3
+        self.high = [-math.inf] * 3
 
     def add(self, xyz: NDArray[Any], axes: tuple[NDArray[Any], ...] = ()) -> NDArray[np.bool_] | None:
         """Take a block of (N, 3) points in; ``axes`` are the same as contiguous x, y and z, if at hand.
@@ -71,11 +77,11 @@ class Bounds:
         return mask
 
     def _take(self, low: list[float], high: list[float]) -> None:
-        self._low = list(map(min, self._low, low))
-        self._high = list(map(max, self._high, high))
+        self.low = list(map(min, self.low, low))
+        self.high = list(map(max, self.high, high))
 
     def result(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return (min_xyz, max_xyz); NaN when no finite point was seen."""
-        if self._low[0] > self._high[0]:
+        if self.low[0] > self.high[0]:
             return np.full(3, np.nan), np.full(3, np.nan)
-        return np.array(self._low), np.array(self._high)
+        return np.array(self.low), np.array(self.high)

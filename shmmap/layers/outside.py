@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,10 @@ class OutsideBox:
         self._high = box[2] + step, box[3] + step
         self.count = 0
 
-    def add(self, xyz: NDArray[Any], bounds: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        """Count those of a block (N, 3); ``bounds`` are of all points up to now, this block's included."""
-        (low_x, low_y), (high_x, high_y) = bounds[0][:2].tolist(), bounds[1][:2].tolist()
-        inside_x = low_x >= self._low[0] and high_x <= self._high[0]
-        if inside_x and low_y >= self._low[1] and high_y <= self._high[1]:
+    def add(self, xyz: NDArray[Any], low: Sequence[float], high: Sequence[float]) -> None:
+        """Count those of a block (N, 3); the bounds are of all points up to now, this block's included."""
+        inside_x = low[0] >= self._low[0] and high[0] <= self._high[0]
+        if inside_x and low[1] >= self._low[1] and high[1] <= self._high[1]:
             return
         outside = np.zeros(len(xyz), np.bool_)
         for axis in (0, 1):

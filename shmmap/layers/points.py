@@ -72,7 +72,7 @@ def build_points(
         writer = _started(reader, rows, segment_fd, reserve, cell_id, box, frame_id)
         outside = OutsideBox(box)
         for block in reader.blocks():
-            outside.add(block[0], reader.bounds)
+            outside.add(block[0], *reader.extremes)
             if not reader.dropped:  # else this pass can only count
                 _append(writer, block)
         if reader.dropped:

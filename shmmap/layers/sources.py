@@ -63,7 +63,7 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
         arrays = [np.empty(shape, spec.dtype) for shape, spec in zip(shapes, specs, strict=True)]
         at, outside = 0, OutsideBox(box)
         for block in reader.blocks():
-            outside.add(block[0], reader.bounds)
+            outside.add(block[0], *reader.extremes)
             end = at + len(block[0])
             if end > rows:
                 break

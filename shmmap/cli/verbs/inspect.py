@@ -199,7 +199,7 @@ def _as_map(path: str, found: list[CloudDescription]) -> dict[str, Any] | None:
     for one, box in cells:
         corners = np.array(one.bounds)
         checked = OutsideBox(box)
-        checked.add(corners, (corners[0], corners[1]))
+        checked.add(corners, *corners.tolist())
         if checked.count:
             outside.append({"path": one.path, "box": list(box)})
     far = far_cells_notes(
