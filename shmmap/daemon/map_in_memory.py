@@ -30,9 +30,9 @@ from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
-from shmmap.processes.limits import limit_behind
 from shmmap.segment.directory import ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix
+from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -96,7 +96,7 @@ class MapInMemory:
                 raise CannotStart(said, hint="free some, or enlarge it") from error
             limit = limit_behind(error)
             if limit is not None:
-                raise CannotStart(limit.message, hint=limit.hint) from error
+                raise limit from error
             raise ConfigError(said, key="shm_dir") from error
         with contextlib.ExitStack() as undo:
             undo.callback(self.statistics.close)  # its name must not stay when something else fails

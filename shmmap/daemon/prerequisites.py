@@ -15,8 +15,8 @@ from shmmap.daemon.pins.probe import PinSource, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.errors import ConfigError
 from shmmap.logfmt import log
-from shmmap.processes.limits import file_size_limit
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.process_limits import file_size_limit
 
 __all__ = [
     "access_of_segments",

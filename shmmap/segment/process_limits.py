@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process may have no more of: descriptors, threads, memory; the limit is named with its value.
+"""What a process may have no more of: descriptors, threads, memory, bytes of a file; the limit is named.
+
+The kernel's own words ("Resource temporarily unavailable", "File too large") name none.
 
 libzmq ends the process where it gets no descriptor or thread (``epoll.cpp``, ``thread.cpp``), so whether
 there are enough is found out before, by taking them for a moment.  Descriptors are taken as objects that
@@ -17,10 +19,49 @@ from typing import Final
 
 from shmmap.errors import LimitReached
 
-__all__ = ["check_files", "check_threads", "no_files_left", "no_memory_left", "no_threads_left"]
+__all__ = [
+    "check_files",
+    "check_threads",
+    "file_size_limit",
+    "limit_behind",
+    "no_files_left",
+    "no_memory_left",
+    "no_threads_left",
+]
 
 _GONE_S: Final = 0.0001
-_PIDS: Final = "/sys/fs/cgroup"
+_GROUPS: Final = "/sys/fs/cgroup"
+_NO_ROOM: Final = ("Cannot allocate memory", "failed to map segment")
+"""What the dynamic loader says of a library for which there is no memory."""
+
+
+def file_size_limit() -> int | None:
+    """Bytes that a file of this process may have (RLIMIT_FSIZE); None where there is no limit."""
+    import resource  # a client needs none of it as a rule
+
+    soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    return None if soft == resource.RLIM_INFINITY else soft
+
+
+def limit_behind(error: BaseException) -> LimitReached | None:
+    """Return the error that names the limit which any other error comes of; None where it comes of none."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EMFILE, errno.ENFILE):
+        return no_files_left(OSError(number, ""))
+    if number == errno.EAGAIN or "can't start new thread" in str(error):
+        return no_threads_left("no more processes or threads may be started: ")
+    if number == errno.EFBIG:
+        most = file_size_limit()
+        return LimitReached(
+            f"a file may not be larger: RLIMIT_FSIZE is {'not set' if most is None else f'{most:,} bytes'}",
+            hint="raise it above the size of the largest segment: ulimit -f, in a unit LimitFSIZE=",
+        )
+    is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM
+    # short of memory, CPython may lose the exception itself
+    is_memory = is_memory or (isinstance(error, SystemError) and bool(_memory_limits()))
+    if is_memory or (isinstance(error, ImportError) and any(text in str(error) for text in _NO_ROOM)):
+        return no_memory_left()
+    return None
 
 
 def check_files(count: int, what: str) -> None:
@@ -117,28 +158,34 @@ def no_threads_left(what: str = "") -> LimitReached:
 
 
 def _group_limit() -> str | None:
-    """What the control group of this process allows."""
+    """What the control group of this process allows, or the strictest of those above it."""
+    limits = []
     try:
         with open("/proc/self/cgroup", encoding="utf-8") as file:
             paths = [line.rstrip("\n").split(":", 2) for line in file]
-        for _, controllers, path in paths:
-            if controllers in ("", "pids"):
-                directory = f"{_PIDS}{'/pids' if controllers else ''}{path.rstrip('/')}"
+    except (OSError, ValueError):
+        return None
+    for _, controllers, path in paths:
+        if controllers not in ("", "pids"):
+            continue
+        directory = f"{_GROUPS}{'/pids' if controllers else ''}{path.rstrip('/')}"
+        while directory.startswith(_GROUPS):
+            try:
                 with open(f"{directory}/pids.max", encoding="utf-8") as file:
                     most = file.read().strip()
-                if most != "max":
-                    return f"{most} in the control group (pids.max)"
-    except (OSError, ValueError):
-        pass
-    return None
+                limits += [int(most)] if most.isdecimal() else []
+            except (OSError, ValueError):
+                pass
+            directory = os.path.dirname(directory)
+    return f"{min(limits)} in the control group (pids.max)" if limits else None
 
 
-def no_memory_left(nbytes: int) -> LimitReached:
+def no_memory_left(nbytes: int | None = None) -> LimitReached:
     """Return the error of a process that gets no more memory of its own, with what limits it."""
     limits = ", ".join(_memory_limits()) or "no limit is set"
+    what = "more private memory is" if nbytes is None else f"{nbytes} bytes of private memory are"
     return LimitReached(
-        f"{nbytes} bytes of private memory are not to be had ({limits})",
-        hint="raise the limit: ulimit -d and -v, or free memory",
+        f"{what} not to be had ({limits})", hint="raise the limit: ulimit -d and -v, or free memory"
     )
 
 

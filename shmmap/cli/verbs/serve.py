@@ -157,16 +157,15 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal says stop."""
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy's threads would spin, and nobody could be forked
-    from shmmap.processes.limits import limit_behind
+    from shmmap.segment.process_limits import limit_behind
 
     try:
         return _serve(args)
     except (OSError, RuntimeError, MemoryError, ImportError, SystemError) as error:
         if (limit := limit_behind(error)) is None:
             raise
-        from shmmap.errors import CannotStart
-
-        raise CannotStart(limit.message, hint=limit.hint) from None
+        limit.hint += "; the daemon and a loader need about 30 threads and 1 GiB"
+        raise limit from None
 
 
 def _serve(args: argparse.Namespace) -> int:

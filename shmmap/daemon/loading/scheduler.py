@@ -26,8 +26,8 @@ from shmmap.failpoints import step
 from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
-from shmmap.processes.limits import limit_behind
 from shmmap.processes.start_child import how_ended
+from shmmap.segment.process_limits import limit_behind
 from shmmap.segment.version import Stamp
 
 __all__ = ["Scheduler"]

@@ -33,12 +33,12 @@ from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.origin.opened_directories import OpenedDirectories
-from shmmap.processes.limits import limit_behind
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
+from shmmap.segment.process_limits import limit_behind
 from shmmap.segment.verify import verify_file
 
 __all__ = ["WorkerSettings", "limit_memory", "work"]

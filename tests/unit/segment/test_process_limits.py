@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from shmmap.processes.limits import limit_behind
+from shmmap.segment.process_limits import limit_behind
 
 
 @pytest.mark.parametrize(
@@ -20,9 +20,9 @@ from shmmap.processes.limits import limit_behind
         (RuntimeError("can't start new thread"), ("RLIMIT_NPROC", "TasksMax=")),
         (OSError(errno.EFBIG, "File too large"), ("RLIMIT_FSIZE", "LimitFSIZE=")),
         (OSError(errno.EMFILE, "Too many open files"), ("RLIMIT_NOFILE", "ulimit -n")),
-        (MemoryError(), ("RLIMIT_DATA", "RLIMIT_AS", "ulimit -d")),
-        (OSError(errno.ENOMEM, "Cannot allocate memory"), ("RLIMIT_DATA", "LimitDATA=")),
-        (ImportError("libfoo.so: failed to map segment from shared object"), ("RLIMIT_DATA",)),
+        (MemoryError(), ("private memory", "no limit is set", "ulimit -d")),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), ("private memory", "ulimit -d and -v")),
+        (ImportError("libfoo.so: failed to map segment from shared object"), ("private memory",)),
     ],
 )
 def test_a_limit_is_named(error: Exception, names: tuple[str, ...]) -> None:
@@ -41,7 +41,7 @@ def test_other_errors_come_of_no_limit(error: Exception) -> None:
 
 def test_its_value_is_that_of_the_process() -> None:
     code = (
-        "import errno, resource; from shmmap.processes.limits import limit_behind, file_size_limit\n"
+        "import errno, resource; from shmmap.segment.process_limits import limit_behind, file_size_limit\n"
         "assert file_size_limit() == 4096\n"
         "print(limit_behind(OSError(errno.EFBIG, '')).message)\n"
         "print(limit_behind(RuntimeError('can\\'t start new thread')).message)"
@@ -56,4 +56,4 @@ def test_its_value_is_that_of_the_process() -> None:
     )
     size, threads = done.stdout.splitlines()
     assert size.endswith("RLIMIT_FSIZE is 4,096 bytes")
-    assert threads.endswith("RLIMIT_DATA 1,073,741,824 bytes"), "a thread's stack is part of it"
+    assert threads.endswith("1024 MiB of data (RLIMIT_DATA)"), "a thread's stack is part of it"
