@@ -292,9 +292,10 @@ class Scheduler:
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
-            limit = limit_behind(error)
+            code = failure_code(error)
+            limit = limit_behind(error) if code not in SPACE_CODES else None  # of shared memory there is none
             why = f"{limit.message} ({limit.hint})" if limit is not None else str(error.strerror)
-            self._fail(load, failure_code(error), f"its segment cannot be published: {why}", None, now_s)
+            self._fail(load, code, f"its segment cannot be published: {why}", None, now_s)
             return
         self.misplaced.note(key.cell_id, index, done.outside)
         took_ns = int((now_s - load.started_s) * 1e9)
