@@ -85,7 +85,7 @@ def cloud_suffix(path: str | os.PathLike[str]) -> str:
         os.close(open_regular(name))
         raise refusal(
             "unsupported_format",
-            f"files called {suffix or 'without a suffix'} are not read",
+            f"files that end in {suffix} are not read" if suffix else "files without a suffix are not read",
             path=name,
             hint=f"readable are {', '.join(READABLE_SUFFIXES)}; convert it to one of them",
         )

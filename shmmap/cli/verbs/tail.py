@@ -51,8 +51,8 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Print the events of the last minute, then new ones as they happen: cells loaded, "
         "changed, evicted, failed, retried; cells refused for lack of memory; cells that a moving client had "
         "to wait for; reloads; turns of the daemon's loop that took long; clients that connect and leave; "
-        "the daemon's start and end; what is wrong with live maps.  That a live map changes is "
-        "told with --json alone, twice a second.",
+        "the daemon's start and end; what is wrong with live maps.  Changes of "
+        "live maps, up to two a second, are printed with --json only.",
         json=_JSON,
     )
     parser.add_argument(
