@@ -39,7 +39,7 @@ _LISTED_AT_ONCE: Final = 1000
 
 
 class BucketStore:
-    """A `shmmap.origin.remote.store.Store` below a URL; see `shmmap.origin.remote.opened_store.open_store`."""
+    """A `shmmap.origin.remote.store.Store` below a URL; `opened_store.open_store` makes it."""
 
     def __init__(
         self, where: StoreUrl, *, patience: Patience, insecure_http: bool, instance_credentials: bool
