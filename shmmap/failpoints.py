@@ -55,8 +55,20 @@ LIVE_STEPS: Final = (
     "live.flushed",
 )
 ORIGIN_STEPS: Final = (
+    "publish.object",
+    "publish.shard",
+    "publish.root",
+    "version.entry",
     "version.switch",
     "version.switched",
+    "restore.entry",
+    "restore.looked",
+    "prune.entry",
+    "prune.listed",
+    "prune.object",
+    "fetch.cell",
+    "fetch.whole",
+    "fetch.renamed",
 )
 CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.map")
 
