@@ -55,7 +55,7 @@ LIVE_STEPS: Final = (
     "live.flushed",
 )
 ORIGIN_STEPS: Final = (
-    "publish.object",
+    "publish.send",
     "publish.shard",
     "publish.root",
     "version.entry",

@@ -51,6 +51,7 @@ from shmmap.prepare.run import Failure, PrepareProgress, neighbours_of
 from shmmap.prepare.task_pool import TaskPool
 from shmmap.publishing.known_objects import write_known_objects
 from shmmap.publishing.messages import CellSent, CellToSend, NotSent, PublishSettings, decode_sent
+from shmmap.publishing.sending import send_object
 from shmmap.publishing.shards import CellObjects, divide_into_shards, shard_side
 from shmmap.publishing.worker import TASKS_AHEAD
 
@@ -134,7 +135,7 @@ def publish_map(
     id_prefix
         What ids begin with; empty: as before, at first ``/<last part of the URL>/``.
     resend
-        Send every object again, as if none were there.
+        Send every object again, as if none were there, and make that a version.
     workers
         How many processes make layers.
 
@@ -165,22 +166,23 @@ def publish_map(
         if write_known_objects(known.name, before.layers):
             settings = msgspec.structs.replace(settings, known=known.name)
         before.layers.clear()
-        if resend or (before.root is None and next(iter(store.list("blobs/")), None) is None):
-            settings = msgspec.structs.replace(settings, is_first=True)
+        has_none = before.root is None and next(iter(store.list("blobs/")), None) is None
+        look = not (resend or has_none)
+        settings = msgspec.structs.replace(settings, is_first=not look)
         objects = _send_cells(catalogue, names, settings, workers, progress, result)
     if result.failures:
         return result
     result.objects = len(catalogue) * len(names)
     result.bytes = objects.nbytes
-    root = _send_shards(catalogue, objects, side, store, before, names, prefix, progress, result)
+    root = _send_shards(catalogue, objects, side, store, before, names, prefix, progress, result, look=look)
     unpacked = pack_root(root)
     result.map_version = map_version_of(unpacked)
-    if before.root is not None and unpacked == pack_root(before.root):
+    if before.root is not None and unpacked == pack_root(before.root) and not resend:
         assert before.state.current is not None  # noqa: S101  where there is a root
         result.root = before.state.current.root
         progress.done(len(catalogue))
         return result
-    entry = _send_root(store, unpacked, before.state, began_s, result)
+    entry = _send_root(store, unpacked, before.state, began_s, result, look=look)
     add_version(store, entry, before.state)
     result.version = result.current = entry.version
     progress.done(len(catalogue))
@@ -292,6 +294,8 @@ def _send_shards(
     prefix: str,
     progress: PrepareProgress,
     result: Published,
+    *,
+    look: bool,
 ) -> Root:
     """Send the shards that are new, and return the root."""
 
@@ -306,8 +310,8 @@ def _send_shards(
         frame = pack_frame(unpacked)
         digest = sha256(frame).digest()
         step("publish.shard")
-        store.put(blob_path(digest), frame)
-        return _SentShard(key, len(shard), len(frame), digest, True)
+        is_new = send_object(store, blob_path(digest), frame, look=look)
+        return _SentShard(key, len(shard), len(frame), digest, is_new)
 
     rows: list[_SentShard] = []
     progress.stage("index", len(catalogue))
@@ -342,13 +346,15 @@ def _send_shards(
     )
 
 
-def _send_root(store: Store, unpacked: bytes, seen: CurrentState, began_s: float, result: Published) -> Entry:
+def _send_root(
+    store: Store, unpacked: bytes, seen: CurrentState, began_s: float, result: Published, *, look: bool
+) -> Entry:
     frame = pack_frame(unpacked)
     result.root = sha256(frame).hexdigest()
     step("publish.root")
-    store.put(blob_path(bytes.fromhex(result.root)), frame)
-    result.sent_objects += 1
-    result.sent_bytes += len(frame)
+    if send_object(store, blob_path(bytes.fromhex(result.root)), frame, look=look):
+        result.sent_objects += 1
+        result.sent_bytes += len(frame)
     if time.monotonic() - began_s > _LONGEST_S:
         raise CannotWrite(
             f"publishing to {store.url} took longer than a day: the version is not made current",

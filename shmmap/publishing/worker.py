@@ -12,7 +12,6 @@ import signal
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from hashlib import sha256
 from typing import Final
 
 from shmmap.errors import InternalError, MapDataError, ShmmapError
-from shmmap.failpoints import step
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
@@ -43,6 +41,7 @@ from shmmap.publishing.messages import (
     decode_task,
     encode,
 )
+from shmmap.publishing.sending import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 
@@ -51,8 +50,6 @@ __all__ = ["TASKS_AHEAD", "main"]
 _NICENESS: Final = 5
 TASKS_AHEAD: Final = 8
 """Cells that a worker has at a time: as many are sent while the next is made."""
-_YOUNG_S: Final = 86_400.0
-"""An object that no version names is used again if it is younger: pruning spares it for much longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,22 +177,10 @@ class _Sender:
         with self._lock:
             if name.sha256 in self._there:
                 return 0
-        is_there = self._is_there(name)
-        if not is_there:
-            step("publish.object")
-            self._store.put(name.path, frame)
+        is_new = send_object(self._store, name.path, frame, look=not self._is_first)
         with self._lock:
             self._there.add(name.sha256)
-        return 0 if is_there else name.size
-
-    def _is_there(self, name: ObjectName) -> bool:
-        """Whether a run that was cut short has sent it lately."""
-        if self._is_first:
-            return False
-        found = self._store.head(name.path)
-        return (
-            found is not None and found.size == name.size and abs(time.time() - found.modified_s) < _YOUNG_S
-        )
+        return name.size if is_new else 0
 
 
 def _work(channel: socket.socket, argument: str) -> None:
