@@ -47,9 +47,8 @@ class Cells(Protocol):
     def mean_size(self) -> tuple[float, float]:
         """Mean extent of the cells along x and y, metres."""
 
-    @property
-    def boxes(self) -> NDArray[np.float64]:
-        """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame."""
+    def boxes_of(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(K, 4) float64, ``min_x, min_y, max_x, max_y`` of these cells, metres, map frame."""
 
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
@@ -161,7 +160,7 @@ class LayerVersions:
         halos = [(layer, _kind(layer).halo_m) for layer in layers]
         widest_m = max((halo_m for _, halo_m in halos), default=0.0)
         around = self._around(index, widest_m + _SLACK_M) if widest_m else np.zeros(0, np.intp)
-        boxes, (min_x, min_y, max_x, max_y) = self._catalogue().boxes[around], self._catalogue().box(index)
+        boxes, (min_x, min_y, max_x, max_y) = self._catalogue().boxes_of(around), self._catalogue().box(index)
         for layer, halo_m in halos:
             near = around[:0]
             if halo_m:

@@ -95,7 +95,7 @@ class MapSwitch:
     def switch(self, new: CatalogueView, change: CatalogueChange) -> None:
         """Serve another state of the map; ``change`` is what it differs in from the one served now."""
         cache = self._cache
-        if change.count <= CELLS_REMEMBERED:
+        if change.known and change.count <= CELLS_REMEMBERED:
             touched = {cell for how in ("changed", "added", "moved") for cell in change.ids(how)}
             if change:
                 self._remember(touched, change.ids("removed"))

@@ -201,7 +201,7 @@ class CellRequests:
         for part in parts(cold, LOADS_A_STEP):
             if len(cold) > LOADS_A_STEP:
                 yield from wanted.pause(cache)  # before the first one, too: they were looked for until now
-            boxes = cache.catalogue.boxes[np.array([index for index, _ in part], dtype=np.intp)]
+            boxes = cache.catalogue.boxes_of(np.array([index for index, _ in part], dtype=np.intp))
             for (index, layer), distance in zip(part, wanted.distances_m(boxes).tolist(), strict=True):
                 key = Key(cache.catalogue.id(index), layer)
                 if key in wanted.refused or cache.warm.get(index, layer) is not None:

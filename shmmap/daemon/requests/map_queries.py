@@ -113,7 +113,7 @@ class MapQueries:
             else:
                 touched = change.cells
                 if area is not None:
-                    touched = touched[touches(area, catalogue.boxes[touched])]
+                    touched = touched[touches(area, catalogue.boxes_of(touched))]
                 page = touched[start : start + limit].tolist()
                 following = start + limit if start + limit < len(touched) else None
                 removed = change.removed if start == 0 else ()
@@ -138,7 +138,7 @@ class MapQueries:
             more = len(found) > limit
             return found[:limit].tolist(), int(found[limit]) if more else None
         end = min(start + LOOKED_AT, count)
-        found = np.flatnonzero(touches(area, catalogue.boxes[start:end])) + start
+        found = np.flatnonzero(touches(area, catalogue.boxes_of(np.arange(start, end)))) + start
         if len(found) > limit:
             return found[:limit].tolist(), int(found[limit])
         return found.tolist(), end if end < count else None

@@ -12,7 +12,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.errors import Offline
 from shmmap.geometry import Area, Box
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import Tables
+from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.segment.version import Stamp
 
 __all__ = ["PagingOrigin", "PagingView"]
@@ -47,6 +47,8 @@ class PagingView:
         )
         self.id_prefix: Final = whole.id_prefix
         self.problems: Final = ()
+        self.pages: Final = None
+        self.tables: Final = None
         self.opened: Final = None
         self.frame: Final = whole.frame
 
@@ -76,20 +78,15 @@ class PagingView:
     def source_bytes(self, index: int) -> int:
         return self._cells.source_bytes(index)
 
-    @property
-    def names(self) -> NDArray[np.bytes_]:
-        return self._cells.names
+    def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
+        return self._cells.boxes_of(indices)
 
-    @property
-    def boxes(self) -> NDArray[np.float64]:
-        return self._cells.boxes
+    def ready_bytes(self, index: int, layer: str) -> int | None:
+        return self._cells.ready_bytes(index, layer)
 
-    @property
-    def stamps(self) -> NDArray[np.int64]:
-        return self._cells.stamps
-
-    def ids(self, indices: Indices) -> list[str]:
-        return self._cells.ids(indices)
+    def changes_from(self, before: object) -> CatalogueChange:
+        assert isinstance(before, PagingView)
+        return self._cells.changes_from(before._cells)
 
     def find(self, cell: str) -> int | None:
         return self._cells.find(cell)
@@ -131,7 +128,7 @@ class PagingOrigin:
         self.offline = False
         self.path = whole.id_prefix
 
-    def load(self, *, fresh: bool = False, before: Tables | None = None) -> CatalogueView:
+    def load(self, *, fresh: bool = False, before: object | None = None) -> CatalogueView:
         del fresh, before
         if self.offline:
             raise Offline(f"{self.path}: it does not answer")
