@@ -119,4 +119,5 @@ def cell_error(failure: FailedCell, cell_id: str) -> CellError:
         cell_id=cell_id,
         layer=failure.layer,
         holders=failure.holders,
+        box=failure.box,
     )

@@ -33,6 +33,14 @@ _SLACK_M: Final = 1e-3
 """Cells are looked for a little farther than a halo reaches, and then compared as `neighbours` does it."""
 
 
+class ReadyLayer(Protocol):
+    """A layer that the origin has ready made."""
+
+    @property
+    def version(self) -> int:
+        """Its version."""
+
+
 class Cells(Protocol):
     """What is asked of a map's catalogue: its cells by index."""
 
@@ -52,6 +60,9 @@ class Cells(Protocol):
 
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
+
+    def ready(self, index: int, layer: str) -> ReadyLayer | None:
+        """What is known of a layer that the origin has ready made; None: it is computed here."""
 
     def box(self, index: int) -> tuple[float, float, float, float]:
         """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
@@ -89,9 +100,12 @@ class LayerVersions:
 
     def version(self, index: int, layer: str) -> int:
         """Current version of one layer of a cell, see `shmmap.segment.version`."""
-        cell = self._catalogue().version
+        catalogue = self._catalogue()
+        cell = catalogue.version
         if layer == LAYER:
             return cell(index)
+        if (ready := catalogue.ready(index, layer)) is not None:
+            return ready.version
         kind = _kind(layer)
         if not kind.halo_m:
             return layer_version(cell(index), layer, kind.builder_version)
@@ -116,7 +130,14 @@ class LayerVersions:
         Of more than `MAX_NEIGHBOURS` the first ones, one more than that: such a layer cannot be made.
         """
         halo_m = _kind(layer).halo_m
-        return self._around(index, halo_m)[: MAX_NEIGHBOURS + 1].tolist() if halo_m else []
+        if not halo_m or self._catalogue().ready(index, layer) is not None:
+            return []
+        around: list[int] = self._around(index, halo_m)[: MAX_NEIGHBOURS + 1].tolist()
+        return around
+
+    def is_computed(self, index: int, layer: str) -> bool:
+        """Whether a layer of a cell is computed here, which may take long."""
+        return layer != LAYER and self._catalogue().ready(index, layer) is None
 
     def _around(self, index: int, halo_m: float) -> NDArray[np.intp]:
         min_x, min_y, max_x, max_y = self._catalogue().box(index)

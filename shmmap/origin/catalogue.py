@@ -18,6 +18,7 @@ from shmmap.origin.map_frame import UNKNOWN_FRAME, MapFrame
 from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
+from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp, cell_version
 from shmmap.sparse_table import sparse_zeros
 
@@ -210,14 +211,13 @@ class Catalogue:
         boxes: NDArray[np.float64] = self.boxes[indices]
         return boxes
 
-    def path(self, index: int) -> str:
-        """File to load for a cell."""
-        return self.id(index)
+    def source(self, index: int) -> Source:
+        """Where a cell's points come from: the file whose path is its id."""
+        return Source(self.id(index))
 
-    def ready_bytes(self, index: int, layer: str) -> int | None:
+    def ready(self, index: int, layer: str) -> None:
         """None: all layers are made here, of files."""
         del index, layer
-        return None
 
     def stamp(self, index: int) -> Stamp:
         """Stamp of a cell's file as last known."""

@@ -131,13 +131,17 @@ class Holder(msgspec.Struct, array_like=True, frozen=True):
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix."""
+    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix.
+
+    ``box`` says where it lies, ``min_x, min_y, max_x, max_y`` in metres; None where that is not known.
+    """
 
     id: str
     layer: str
     code: str
     message: str
     holders: tuple[Holder, ...] = ()
+    box: tuple[float, float, float, float] | None = None
 
 
 class Cells(msgspec.Struct, array_like=True, tag="cells"):

@@ -19,7 +19,7 @@ from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
+from shmmap.daemon.loading.worker_messages import Begun, Check, Checked, Done, Ended, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
@@ -95,11 +95,12 @@ class Scheduler:
         cache = self._cache
         key = Key(cache.catalogue.id(index), layer)
         failure = self.loads.failures.get(key)
-        if failure is None or key in self.loads.by_key:
-            return self.loads.want(key, cache.estimate(index, layer), priority, asker)
-        if now_s >= failure.retry_at_s:
+        if failure is not None and key not in self.loads.by_key and now_s >= failure.retry_at_s:
             cache.tell(cache.events.retried, key, failure)
-            return self.loads.want(key, cache.estimate(index, layer), priority, asker)
+            failure = None
+        if failure is None or key in self.loads.by_key:
+            computed = cache.layers.is_computed(index, layer)
+            return self.loads.want(key, cache.estimate(index, layer), priority, asker, computed=computed)
         if failure.code in SPACE_CODES or failure.stamp is None:
             return None
         load = self.loads.want(key, 0, priority, asker)
@@ -188,24 +189,30 @@ class Scheduler:
         if index is None:
             return None
         if load.unless is not None:
-            return Check(number, catalogue.path(index), "", load.unless)
+            return Check(number, catalogue.source(index), "", load.unless)
         if load.adopted is not None:
             if cache.ledger.resident_named(load.adopted.name) is load.adopted:
-                return Check(number, catalogue.path(index), load.adopted.name, catalogue.stamp(index))
+                return Check(number, catalogue.source(index), load.adopted.name, catalogue.stamp(index))
             load.adopted = None  # it was retired before its turn came
             if not load.wanted:
                 return None
             load.estimate = cache.estimate(index, load.key.layer)
         layer = load.key.layer
+        ready = catalogue.ready(index, layer)
         around = cache.layers.neighbours(index, layer)
         load.sources = tuple(map(catalogue.stamp, (index, *around)))
         load.version = cache.layers.version(index, layer)
         points = cache.warm.get(index, LAYER) if layer != LAYER else None
         return Job(
-            number, load.key.cell_id, catalogue.path(index), layer, catalogue.box(index), catalogue.frame_id,
-            load.estimate, points.name if points is not None else "",
-            tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in around),
+            number, load.key.cell_id, catalogue.source(index), layer, catalogue.box(index),
+            catalogue.frame_id, load.estimate, points.name if points is not None else "",
+            tuple(map(self._neighbour, around)),
+            ready.version if ready is not None else 0,
         )  # fmt: skip
+
+    def _neighbour(self, index: int) -> Neighbour:
+        catalogue = self._cache.catalogue
+        return Neighbour.of(catalogue.id(index), catalogue.source(index), catalogue.box(index))
 
     def next_event_s(self) -> float:
         """When there is something to do although nothing arrives; infinity for never."""
@@ -235,6 +242,8 @@ class Scheduler:
             self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
         elif isinstance(message, Ready):  # this process had no descriptor left to receive it
             self.lost.ended(worker, "too many open files", now_s)
+        elif isinstance(message, Begun):
+            self.pool.works_on(worker, message.number, now_s)
         elif isinstance(message, Need):
             self.room.ask(worker, message)
             self.room.feed(self._jobs, now_s)
@@ -250,6 +259,7 @@ class Scheduler:
             if load is None:
                 return
             load.spent_s = spent_s
+            load.took_s = now_s - load.started_s if worker.fetches else spent_s
             if isinstance(message, Checked):
                 self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
@@ -365,6 +375,6 @@ class Scheduler:
     def _end(self, load: Load, failure: Failure | None = None) -> None:
         """A load ended; whoever waits for it is told."""
         out = failure is not None and (load.unread or failure.code == "load_timeout")
-        self.prefetcher.ended.append((load, load.running, load.spent_s, out))
+        self.prefetcher.ended.append((load, load.running, load.took_s or load.spent_s, out))
         self.loads.finish(load, failure)
         self.on_settled(load.key)

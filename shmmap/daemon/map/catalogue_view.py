@@ -16,8 +16,8 @@ answers for the cells of the pages that are here, and its `Pages` say which ther
   into the tables in `Pages.collect`, in the serving loop, in less than a millisecond each.
 - Another version is another view: `ViewOrigin.load` returns it, in a thread, when the pages that the view
   before has are here in it, too; `changes_from` then says what differs as far as both know it.
-- What loads read is said by `path`; what of it lies ready made in the origin, and how large it is in memory,
-  by `ready_bytes`: such a layer is fetched, not computed.
+- What loads read is said by `source`.  A layer that the origin has ready made is not computed here: its size
+  in memory and its version are those that `ready` gives, and it looks into no other cells.
 """
 
 from __future__ import annotations
@@ -32,9 +32,17 @@ from shmmap.geometry import Area
 from shmmap.origin.catalogue_change import CatalogueChange, Tables
 from shmmap.origin.map_frame import MapFrame
 from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
 
-__all__ = ["CatalogueView", "PageNews", "Pages", "ViewOrigin"]
+__all__ = ["CatalogueView", "PageNews", "Pages", "Ready", "ViewOrigin"]
+
+
+class Ready(NamedTuple):
+    """A layer that the origin has ready made: its bytes in memory, and its version."""
+
+    nbytes: int
+    version: int
 
 
 class PageNews(NamedTuple):
@@ -164,8 +172,8 @@ class CatalogueView(Protocol):
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
 
-    def path(self, index: int) -> str:
-        """What a loader reads for a cell."""
+    def source(self, index: int) -> Source:
+        """Where a cell's points come from, for loaders."""
 
     def stamp(self, index: int) -> Stamp:
         """Stamp of a cell's source as last known."""
@@ -173,8 +181,11 @@ class CatalogueView(Protocol):
     def source_bytes(self, index: int) -> int:
         """Size of a cell's source as last known."""
 
-    def ready_bytes(self, index: int, layer: str) -> int | None:
-        """Bytes in memory of a layer that the origin has ready made; None: it is made here."""
+    def ready(self, index: int, layer: str) -> Ready | None:
+        """What is known of a layer that the origin has ready made; None: it is computed here.
+
+        Of ``points`` it may be None, too: where their size is only guessed, and their version is `version`.
+        """
 
     def set_stamp(self, index: int, stamp: Stamp) -> None:
         """Correct a cell's stamp: a loader has found another one; versions follow."""

@@ -161,12 +161,14 @@ class CellReplies:
             answer.residents.append(resident)
         if refusal is not None:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,) if mine.bytes else ()))
+            box = cache.catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,) if mine.bytes else (), box))
         elif not current and failure is not None and not promised:
             holders: tuple[Holder, ...] = ()
             if failure.code in SPACE_CODES:
                 holders, answer.short = UNNAMED, True
-            answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders))
+            box = cache.catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders, box))
         elif not current:
             if not promised:  # evicted, or no longer out of room: "pending" promises a load
                 self.scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)

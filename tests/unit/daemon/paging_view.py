@@ -8,11 +8,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_view import CatalogueView, Ready
 from shmmap.errors import Offline
 from shmmap.geometry import Area, Box
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
 
 __all__ = ["PagingOrigin", "PagingView"]
@@ -81,8 +82,9 @@ class PagingView:
     def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
         return self._cells.boxes_of(indices)
 
-    def ready_bytes(self, index: int, layer: str) -> int | None:
-        return self._cells.ready_bytes(index, layer)
+    def ready(self, index: int, layer: str) -> Ready | None:
+        del index, layer
+        return None
 
     def changes_from(self, before: object) -> CatalogueChange:
         assert isinstance(before, PagingView)
@@ -100,8 +102,8 @@ class PagingView:
     def version(self, index: int) -> int:
         return self._cells.version(index)
 
-    def path(self, index: int) -> str:
-        return self._cells.path(index)
+    def source(self, index: int) -> Source:
+        return self._cells.source(index)
 
     def stamp(self, index: int) -> Stamp:
         return self._cells.stamp(index)

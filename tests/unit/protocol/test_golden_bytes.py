@@ -171,7 +171,17 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ("b.pcd",),
             bytes([2, 0, 0, 0, 0, 0, 0, 0]),
             (m.PendingCell("c", "points"),),
-            (m.FailedCell("d", "points", "over_budget", "no", (m.Holder(0, 0, 0, "unknown", 8, 1),)),),
+            (
+                m.FailedCell(
+                    "d",
+                    "points",
+                    "over_budget",
+                    "no",
+                    (m.Holder(0, 0, 0, "unknown", 8, 1),),
+                    (0.0, 0.0, 20.0, 20.0),
+                ),
+                m.FailedCell("e", "points", "unknown_cell", "no"),
+            ),
             ("points",),
             False,
         ),
@@ -184,15 +194,27 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ["b.pcd"],
             b"\x02\x00\x00\x00\x00\x00\x00\x00",
             [["c", "points"]],
-            [["d", "points", "over_budget", "no", [[0, 0, 0, "unknown", 8, 1, ""]]]],
+            [
+                [
+                    "d",
+                    "points",
+                    "over_budget",
+                    "no",
+                    [[0, 0, 0, "unknown", 8, 1, ""]],
+                    [0.0, 0.0, 20.0, 20.0],
+                ],
+                ["e", "points", "unknown_cell", "no", [], None],
+            ],
             ["points"],
             False,
         ],
         (
             "9ba563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
             "000000cb0000000000000000cb4034000000000000cb4034000000000000c291a5622e706364c408"
-            "02000000000000009192a163a6706f696e74739195a164a6706f696e7473ab6f7665725f62756467"
-            "6574a26e6f9197000000a7756e6b6e6f776e0801a091a6706f696e7473c2"
+            "02000000000000009192a163a6706f696e74739296a164a6706f696e7473ab6f7665725f62756467"
+            "6574a26e6f9197000000a7756e6b6e6f776e0801a094cb0000000000000000cb0000000000000000"
+            "cb4034000000000000cb403400000000000096a165a6706f696e7473ac756e6b6e6f776e5f63656c"
+            "6ca26e6f90c091a6706f696e7473c2"
         ),
     ),
     (

@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include <shmmap/areas.hpp>
 #include <shmmap/cell.hpp>
 
 namespace shmmap {
@@ -19,6 +20,7 @@ namespace shmmap {
 /// `no_space`, `offline`; take any other code for `load_failed`.
 struct Failure {
   std::string id, layer, code, message;
+  std::optional<Box> box = std::nullopt;  ///< where the cell lies, if that is known
 };
 
 /// What came of a request.
