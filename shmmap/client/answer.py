@@ -106,4 +106,5 @@ class Answer:
             reply.map_version,
             reply.layers,
             reply.covered,
+            reply.reason,
         )

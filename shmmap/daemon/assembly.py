@@ -43,6 +43,7 @@ from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
+from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import Chore, ServingLoop
@@ -121,7 +122,11 @@ class Service:
             sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
             cache.events.minutes,
         )  # fmt: skip
-        change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log)
+        paging = Paging(
+            cache, scheduler, memory.map_switch, cells, queries, memory.adoption, sessions, watched
+        )  # fmt: skip
+        paging.follow()
+        change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
         dispatch = Dispatch(
@@ -137,7 +142,7 @@ class Service:
             self._inbox.due,
         )
         chores: deque[tuple[str, Chore]] = deque()
-        chores += [("usage", cache.survey), ("map", memory.map_switch)]
+        chores += [("usage", cache.survey), ("map", memory.map_switch), ("map", paging)]
         chores += [("memory", scheduler.prefetcher)]
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
         self._handshake = handshake

@@ -99,7 +99,10 @@ class LayerVersions:
         self._count = 0
 
     def version(self, index: int, layer: str) -> int:
-        """Current version of one layer of a cell, see `shmmap.segment.version`."""
+        """Current version of one layer of a cell, see `shmmap.segment.version`.
+
+        0 where it is not known yet: not all of the cells are that it looks into.
+        """
         catalogue = self._catalogue()
         cell = catalogue.version
         if layer == LAYER:
@@ -112,8 +115,11 @@ class LayerVersions:
         known = self._known.get(layer)
         version = known.get(index) if known is not None else None
         if version is None:
-            around = self.neighbours(index, layer)
-            version = layer_version(cell(index), layer, kind.builder_version, list(map(cell, around)))
+            around, complete = self._around(index, kind.halo_m)
+            if not complete:
+                return 0
+            near = [cell(one) for one in around[: MAX_NEIGHBOURS + 1].tolist()]
+            version = layer_version(cell(index), layer, kind.builder_version, near)
             self._remember(index, layer, version)
         return version
 
@@ -125,25 +131,37 @@ class LayerVersions:
                 yield from ((index, layer) for index in indices if known is None or index not in known)
 
     def neighbours(self, index: int, layer: str) -> list[int]:
-        """Catalogue indices of the cells that a layer of this one looks into, ascending.
+        """Catalogue indices of the cells that a layer of this one looks into, in id order.
 
         Of more than `MAX_NEIGHBOURS` the first ones, one more than that: such a layer cannot be made.
         """
         halo_m = _kind(layer).halo_m
         if not halo_m or self._catalogue().ready(index, layer) is not None:
             return []
-        around: list[int] = self._around(index, halo_m)[: MAX_NEIGHBOURS + 1].tolist()
+        around: list[int] = self._around(index, halo_m)[0][: MAX_NEIGHBOURS + 1].tolist()
         return around
+
+    def halo_m(self, layers: Iterable[str]) -> float:
+        """How far the farthest-looking of some layers looks beyond a cell, metres."""
+        return max((_kind(layer).halo_m for layer in layers if layer != LAYER), default=0.0)
 
     def is_computed(self, index: int, layer: str) -> bool:
         """Whether a layer of a cell is computed here, which may take long."""
         return layer != LAYER and self._catalogue().ready(index, layer) is None
 
-    def _around(self, index: int, halo_m: float) -> NDArray[np.intp]:
+    def looks_into(self, index: int, layer: str) -> Box | None:
+        """Where a layer of a cell looks; None if it takes that cell alone."""
+        halo_m = _kind(layer).halo_m if self.is_computed(index, layer) else 0.0
+        return self._reach(index, halo_m) if halo_m else None
+
+    def _reach(self, index: int, halo_m: float) -> Box:
         min_x, min_y, max_x, max_y = self._catalogue().box(index)
-        area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
-        found, _ = self._catalogue().query(area)
-        return np.delete(found, found == index)
+        return Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
+
+    def _around(self, index: int, halo_m: float) -> tuple[NDArray[np.intp], bool]:
+        """Known cells around one, in id order, and whether these are all."""
+        found, known = self._catalogue().query(self._reach(index, halo_m))
+        return np.delete(found, found == index), known
 
     def check_reach(self, layer: str) -> None:
         """Refuse a layer that would look into too many cells of this map.
@@ -180,7 +198,7 @@ class LayerVersions:
         """For each of these layers, the cells whose version has this one's in it, itself first."""
         halos = [(layer, _kind(layer).halo_m) for layer in layers]
         widest_m = max((halo_m for _, halo_m in halos), default=0.0)
-        around = self._around(index, widest_m + _SLACK_M) if widest_m else np.zeros(0, np.intp)
+        around = self._around(index, widest_m + _SLACK_M)[0] if widest_m else np.zeros(0, np.intp)
         boxes, (min_x, min_y, max_x, max_y) = self._catalogue().boxes_of(around), self._catalogue().box(index)
         for layer, halo_m in halos:
             near = around[:0]

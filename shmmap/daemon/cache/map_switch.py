@@ -108,6 +108,11 @@ class MapSwitch:
         self._unseen = cache.ledger.segments.walk()
         cache.unentered = cache.ledger.resident_count
 
+    def look_again(self) -> None:
+        """More of the map is known: what was of no known version may be current."""
+        self._unseen = self._cache.ledger.segments.walk()
+        self._cache.unentered = self._cache.ledger.resident_count
+
     @property
     def busy(self) -> bool:
         """Whether `turn` has something to do."""
@@ -146,7 +151,7 @@ class MapSwitch:
             cache.tell(cache.rows.show, resident, "resident")
         elif resident.checked:
             cache.tell(cache.rows.show, resident, "stale")
-        elif not cache.is_current(resident):
+        elif not cache.is_current(resident) and cache.layers.version(index, resident.key.layer):
             cache.reclaimer.retire(resident, now_s, "map")
 
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:

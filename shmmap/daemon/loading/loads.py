@@ -274,6 +274,10 @@ class Loads:
         load.reserved += extra if fits else 0
         return fits
 
+    def set_aside(self, load: Load) -> None:
+        """A queued load cannot be begun yet; `requeue` it when it can."""
+        self._queue.discard(load)
+
     def requeue(self, load: Load) -> None:
         """Put a running load back (its worker died before its turn, or what it read is outdated)."""
         self._take_back(load)

@@ -76,6 +76,7 @@ class Scheduler:
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
+        self._for_pages: dict[Load, None] = {}  # that wait until it is known which cells they look into
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
@@ -110,8 +111,36 @@ class Scheduler:
     def map_changed(self) -> None:
         """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
         self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+        self.pages_settled()
         self.misplaced.map_changed()
         self.pool.read_through(self._opened)
+
+    def pages_settled(self) -> None:
+        """Pages of the map have come, or cannot be had: begin what waits for them, or find out."""
+        waiting, self._for_pages = self._for_pages, {}
+        for load in waiting:
+            if self.loads.by_key.get(load.key) is load:
+                self.loads.requeue(load)
+        self.prefetcher.look_again()
+
+    def _waits_for_pages(self, load: Load, now_s: float) -> bool:
+        """Whether a load cannot be begun because it is not known yet which cells it looks into."""
+        cache, pages = self._cache, self._cache.catalogue.pages
+        if pages is None or load.unless is not None or load.adopted is not None:
+            return False
+        index = cache.index_of(load.key.cell_id)
+        area = cache.layers.looks_into(index, load.key.layer) if index is not None else None
+        absent = [] if area is None else [page for page in pages.of_area(area) if not pages.is_here(page)]
+        if not absent:
+            return False
+        pages.want(absent, load.priority)
+        if any(map(pages.is_out_of_reach, absent)):
+            why = "which cells lie around it cannot be found out at present"
+            self._fail(load, "offline", why, None, now_s)
+        else:
+            self.loads.set_aside(load)
+            self._for_pages[load] = None
+        return True
 
     @property
     def _opened(self) -> Opened:
@@ -153,6 +182,8 @@ class Scheduler:
         load = self.loads.next_queued(points=points, layers=layers) if points or layers else None
         if load is None:
             return False
+        if load.computed and self._waits_for_pages(load, now_s):
+            return True
         estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
         if estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)

@@ -74,6 +74,13 @@ class Pages(Protocol):
     def cells(self, page: int) -> range:
         """Indices of a page's cells, here or not."""
 
+    def cells_surely_in(self, area: Area) -> int:
+        """How many cells the pages have that lie wholly in an area: so many it has at least."""
+
+    @property
+    def known_cells(self) -> int:
+        """How many cells the pages have that are here."""
+
     def is_here(self, page: int) -> bool:
         """Whether the page's cells are known."""
 
@@ -152,9 +159,10 @@ class CatalogueView(Protocol):
         """Directories that its cells are to be read through; None: their sources have to do."""
 
     def query(self, area: Area, most: int | None = None) -> tuple[NDArray[np.intp], bool]:
-        """Cells whose box touches ``area``, ascending (which is id order), and whether these are all.
+        """Known cells whose box touches ``area``, in id order, and whether these are all.
 
-        If there are more than ``most``, some of them, more than ``most``, in no order.
+        Where all cells are known, id order is that of the indices.  If there are more than ``most``, some of
+        them, more than ``most``, in no order.
         """
 
     def find(self, cell: str) -> int | None:

@@ -97,7 +97,7 @@ class CellReplies:
         if answer.short:
             yield from self._name_holders(wanted, answer)
         self.reply(
-            wanted.session, wanted.request, answer, wanted.layers, wanted.covered,
+            wanted.session, wanted.request, answer, wanted.layers, wanted.covered, reason=wanted.reason,
             removed=wanted.removed, removed_packed=wanted.removed_packed,
         )  # fmt: skip
         if wanted.began_s:
@@ -112,6 +112,7 @@ class CellReplies:
         layers: tuple[str, ...],
         covered: bool = True,
         *,
+        reason: str = "",
         removed: tuple[str, ...],
         removed_packed: bytes,
     ) -> None:
@@ -119,7 +120,7 @@ class CellReplies:
         cache = self.cache
         reply = encode_cells(
             request, cache.epoch, cache.catalogue.map_version, answer.handles, removed, removed_packed,
-            layers, covered, *answer.packed,
+            layers, covered, *answer.packed, reason=reason,
         )  # fmt: skip
         session.connection.reply(reply)
 

@@ -73,6 +73,11 @@ class Prefetcher:
         self._full_until_s = self._followed_s = -math.inf
         self._running: dict[Load, int] = {}
 
+    def look_again(self) -> None:
+        """More of the map is known, or less: look over all ways again."""
+        self.prefetch.look_again()
+        self._next_s = -math.inf
+
     # --- clients ----------------------------------------------------------------------------------
 
     def _follow(self, session: Session) -> None:

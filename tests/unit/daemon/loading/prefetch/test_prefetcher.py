@@ -190,7 +190,7 @@ def test_as_many_are_under_way_as_there_are_free_places(prefetching: Callable[..
         for resident in list(one.ledger.residents()):
             if resident.box[0] > -290.0:
                 one.reclaimer.retire(resident, one.now_s(), "request")
-        one.reclaimer.sweep(one.now_s())
+                one.reclaimer.never_revive(resident.key)
         one.run_until(lambda: len(one.scheduler._jobs) == 2 * 8 - 8 // KEPT)
         for _ in range(10):
             drive.ask(-350.0, wait=0.0)
