@@ -117,7 +117,7 @@ class Service:
             config, cache, sessions, self._pins, memory.map_switch, scheduler.loads, memory.event_log,
             events_path(socket_path),
         )  # fmt: skip
-        operators = OperatorRequests(cache, self._pins, reloader)
+        self._operators = operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
             sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
             cache.events.minutes,
@@ -260,6 +260,7 @@ class Service:
         if not any(self._connections):  # nobody can leave who would make room
             self._connections.try_again()
         self._pins.keep(now_s)
+        self._operators.answer_overdue(now_s)
         self._live.beat(now_s)
         self._look_after_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):

@@ -60,6 +60,11 @@ class Reloader:
         self._asked: list[Answer] = []
         self._next: list[Answer] = []
 
+    @property
+    def map_path(self) -> str:
+        """The map as a person would name it."""
+        return self._origin.path
+
     def ask(self, answer: Answer) -> None:
         """Have the catalogue loaded; ``answer`` is called from `collect`."""
         self._next.append(answer)

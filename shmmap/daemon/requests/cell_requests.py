@@ -41,6 +41,8 @@ __all__ = ["CellRequests"]
 MAX_WAIT_S: Final = 3600.0
 MOST_AT_ONCE: Final = 4096
 """Cells of an area that are compared with what a client holds in one turn, if all are in memory."""
+MOST_LOOKED_AT: Final = 20_000
+"""Cells of requests that are looked through before a page of the map is given up."""
 PACKED_A_CELL: Final = 256
 HELD_A_CELL: Final = 2
 """Bytes of packed versions, and cells held by name, of a request that waits: they take a cell's memory."""
@@ -298,10 +300,10 @@ class CellRequests:
         self._patient.map_changed()
 
     def uses(self, page: int) -> bool:
-        """Whether a request that is not answered yet has cells of a page, or an area in it."""
+        """Whether a request that is not answered yet has cells of a page, or an area in it; or may have."""
         pages = self._cache.catalogue.pages
-        if pages is None:
-            return False
+        if pages is None or sum(len(wanted.cells) for wanted in self._open) > MOST_LOOKED_AT:
+            return True
         cells = pages.cells(page)
         for wanted in self._open:
             if any(index in cells for index, _layer in wanted.cells):
@@ -360,16 +362,17 @@ class CellRequests:
 
         That is what was found anew; or a cell that had settled and is cold again, or may fit now.
         """
-        if self._now_s() >= wanted.deadline_s:
-            return False
+        in_time = self._now_s() < wanted.deadline_s
         if wanted.is_new:
-            if not self._patient.recount(wanted):
-                return False
-            yield from self._have_loaded(wanted, note=True)
-            yield from self._need(wanted)
+            may_wait = self._patient.recount(wanted) and in_time
+            yield from self._have_loaded(wanted, note=may_wait)
+            if may_wait:
+                yield from self._need(wanted)
+                self._wait_for_pages(wanted)
             wanted.is_new = False
-            self._wait_for_pages(wanted)
-            return wanted.waits or wanted.outdated
+            return may_wait and (wanted.waits or wanted.outdated)
+        if not in_time:
+            return False
         for number, part in enumerate(parts(wanted.cells)):
             if number:
                 yield from wanted.pause(self._cache)

@@ -59,6 +59,11 @@ class MemoryPages:
         self._out += pages
         os.eventfd_write(self.fd, 1)
 
+    @property
+    def settled(self) -> bool:
+        """Whether the daemon has taken in what came."""
+        return not self._come and not self._out
+
     def __len__(self) -> int:
         return len(self.boxes)
 

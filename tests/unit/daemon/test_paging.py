@@ -3,9 +3,13 @@
 
 from __future__ import annotations
 
+import math
+import random
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +19,7 @@ import pytest
 from shmmap import AutowareSquare, Box, HeldCell, MapWindow, Offline, connect
 from shmmap.daemon.loading.loads import PREFETCH
 from shmmap.daemon.requests import limits, map_queries
+from shmmap.daemon.requests.operators import operator_requests
 from shmmap.daemon.requests.paging import Paging
 from shmmap.layers.versions import LayerVersions
 from shmmap.origin.map_directory import open_map
@@ -93,6 +98,16 @@ class Paged:
             self.pages.drop(page)
         self.pages.come(*(page for page in pages if not self.pages.is_here(page)))
         self.daemon.turn_until(lambda: set(self.pages.needed) == set(pages))
+
+    def give_up(self, most: int) -> None:
+        """Let the daemon drop pages until so many are here, or more that are needed."""
+        self.pages.most, looked = most, 2 * len(self.pages.needed)
+        is_needed = self.paging.is_needed
+        while self.pages.spare() is not None and (looked := looked - 1):
+            self.paging.turn(math.inf)
+            self.paging._rests_until_s = -math.inf
+        assert len(self.pages.needed) <= most or any(map(is_needed, self.pages.needed))
+        self.pages.most = len(self.pages)
 
     def read_again(self) -> None:
         self.origin.whole = open_map(str(self.directory.root), cache_dir=self.cache_dir).load()
@@ -266,6 +281,83 @@ def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
     paged.know(WEST, EAST)
     reply = paged.ask(lambda n: m.Selected(n, ("20_20.pcd", "nowhere.pcd"), wait=LONG_S))
     assert (reply.covered, [one.id for one in reply.failed]) == (True, ["nowhere.pcd"])
+
+
+def _all_ids(one: Paged) -> list[str]:
+    whole = one.origin.whole
+    return [whole.id(index) for index in range(len(whole))]
+
+
+def _version(one: Paged, name: str) -> int:
+    index = one.origin.whole.find(name)
+    assert index is not None
+    return one.origin.whole.version(index)
+
+
+def _touches(area: m.CircleMessage, box: tuple[float, float, float, float]) -> bool:
+    dx = max(box[0] - area.x, area.x - box[2], 0.0)
+    dy = max(box[1] - area.y, area.y - box[3], 0.0)
+    return dx * dx + dy * dy <= area.radius * area.radius
+
+
+def _absent(one: Paged, area: m.CircleMessage) -> list[int]:
+    around = m.area_from_message(area)
+    return [page for page in one.pages.of_area(around) if not one.pages.is_here(page)]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, seed: int
+) -> None:
+    """While pages come, fail and are given up, and the map changes; what is held is packed or named."""
+    chance = random.Random(seed)
+    corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
+    strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
+    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), strips, set())
+    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    held: dict[str, int] = {}
+    covered = 0
+    for step in range(100):
+        action = chance.random()
+        if action < 0.4:
+            one.pages.come(chance.randrange(8))
+        elif action < 0.45:
+            one.pages.fail(*(page for page in [chance.randrange(8)] if not one.pages.is_here(page)))
+        elif action < 0.5:
+            held = {name: version for name, version in held.items() if chance.random() < 0.5}
+            one.ask(m.Evict)
+            one.give_up(chance.randrange(4))
+        elif action < 0.54:
+            small_map.change(chance.choice(ALL), step)
+            one.read_again()
+        one.daemon.turn_until(lambda: one.pages.settled)
+        area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
+        while True:
+            by_name = chance.random() < 0.5
+            named = tuple(HeldCell(name, version) for name, version in held.items()) if by_name else ()
+            packed = b"" if by_name else pack_versions(held.values())
+            known = [one.view.id(i) for page in one.pages.needed for i in one.pages.cells(page)]
+            reply = one.ask(partial(m.Differential, area=area, held=named, packed=packed))
+            of_version = {version: name for name, version in held.items()}
+            removed = {*reply.removed, *(of_version[v] for v in unpack_versions(reply.removed_packed))}
+            box_of = {Path(cell).name: one.origin.whole.box(i) for i, cell in enumerate(_all_ids(one))}
+            inside = {name for name in ALL if _touches(area, box_of[name])}
+            now_known = {Path(cell).name for cell in known}
+            assert reply.covered is (not _absent(one, area))
+            assert removed == {
+                name for name in held if name not in inside and (name in now_known or reply.covered)
+            }
+            fresh = {cell.id: cell.version for cell in reply.cells if not cell.stale}
+            want = {name for name in inside & now_known if held.get(name) != _version(one, name)}
+            assert set(fresh) | {cell.id for cell in reply.pending} == want
+            assert all(version == _version(one, name) for name, version in fresh.items())
+            held = {name: version for name, version in held.items() if name not in removed} | fresh
+            if not reply.pending:
+                break
+        covered += reply.covered
+        if reply.covered:
+            assert held == {name: _version(one, name) for name in inside}
+    assert 10 < covered < 95, "else nothing was tried"
 
 
 # --- within one version ----------------------------------------------------------------------------
@@ -547,6 +639,26 @@ def test_a_window_keeps_what_may_be_in_the_unknown_part(
         assert window.wait_until_current(LONG_S)
         assert (names(window.cells), window.complete) == (ALL, True)
         assert not update.removed
+
+
+def test_a_reload_that_takes_long_is_offline_and_goes_on(
+    paged: Paged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operator_requests, "RELOAD_S", 0.05)
+    go_on, load = threading.Event(), paged.origin.load
+
+    def slow(**options: Any) -> Any:
+        assert go_on.wait(LONG_S)
+        return load(**options)
+
+    monkeypatch.setattr(paged.origin, "load", slow)
+    before, reloads = paged.view, paged.count("reloads")
+    reply = paged.ask(m.Reload)
+    assert isinstance(reply, m.ErrorReply)
+    assert (reply.code, paged.view is before) == ("offline", True)
+    go_on.set()
+    paged.daemon.turn_until(lambda: paged.count("reloads") > reloads)
+    assert paged.view is not before
 
 
 def test_an_origin_out_of_reach_does_not_change_the_map(paged: Paged) -> None:

@@ -33,6 +33,7 @@ struct Answer {
   std::vector<std::string> layers;  ///< those asked for, in canonical form
   std::uint64_t epoch = 0, map_version = 0;
   bool covered = true;  ///< false: part of what was asked for is not known yet, ask again
+  std::string reason;   ///< then `offline` where that cannot be reached at present, else empty
 };
 
 /// What a client has: the cell's id and its version (none: the current one), of these layers; no layers means all

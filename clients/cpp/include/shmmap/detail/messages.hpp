@@ -158,6 +158,7 @@ inline Cells read_cells(Reader& reader, Row& row) {
   if (row.next())
     for (auto left = reader.array(); left > 0; --left) answer.layers.emplace_back(reader.text());
   if (row.next()) answer.covered = reader.boolean();
+  if (row.next()) answer.reason = reader.text();
   row.end();
   return found;
 }
