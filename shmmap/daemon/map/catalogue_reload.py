@@ -18,7 +18,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
 from shmmap.daemon.map.old_tables import give_back_apart
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue_change import CatalogueChange, compare
+from shmmap.origin.catalogue_change import CatalogueChange
 
 __all__ = ["Reloader", "Reread"]
 
@@ -29,6 +29,7 @@ class Reread:
 
     catalogue: CatalogueView
     change: CatalogueChange
+    before: CatalogueView
 
 
 Answer = Callable[[Reread | ShmmapError], None]
@@ -59,6 +60,11 @@ class Reloader:
         self._asked: list[Answer] = []
         self._next: list[Answer] = []
 
+    @property
+    def map_path(self) -> str:
+        """The map as a person would name it."""
+        return self._origin.path
+
     def ask(self, answer: Answer) -> None:
         """Have the catalogue loaded; ``answer`` is called from `collect`."""
         self._next.append(answer)
@@ -81,7 +87,7 @@ class Reloader:
         try:
             catalogue = self._origin.load(fresh=True, before=before)
             _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # found here, not in the loop
-            self._result = Reread(catalogue, compare(before, catalogue))
+            self._result = Reread(catalogue, catalogue.changes_from(before), before)
         except ShmmapError as error:
             self._result = error
         except OSError as error:
@@ -108,7 +114,7 @@ class Reloader:
             for answer in asked:
                 answer(result)
         if isinstance(result, Reread) and self._served() is result.catalogue:
-            give_back_apart(result.change.old, result.catalogue)
+            give_back_apart(result.before.tables, result.catalogue.tables)
         if self._next and not self._asked:
             self._begin()
 

@@ -13,6 +13,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
+from shmmap.daemon.requests.paging import Paging
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue_change import CatalogueChange
@@ -35,6 +36,7 @@ class MapChange:
     scheduler: Scheduler
     map_switch: MapSwitch
     event_log: EventLog
+    paging: Paging
 
     def collect(self) -> None:
         """A reload is over: serve what it found, and tell those who asked for it."""
@@ -45,6 +47,7 @@ class MapChange:
         statistics, catalogue = self.cache.statistics, reread.catalogue
         self.map_switch.switch(catalogue, reread.change)
         self.scheduler.map_changed()
+        self.paging.follow()
         statistics.add("reloads")
         statistics.set("last_reload_unix_ns", time.time_ns())
         statistics.set("last_reload_failed", 0)
