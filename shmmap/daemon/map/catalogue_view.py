@@ -14,8 +14,10 @@ answers for the cells of the pages that are here, and its `Pages` say which ther
 - ``query`` says whether all pages of the area are here; ``find`` of an id in no page that is here is None.
 - Nothing waits: not for the network, not for a disk.  Pages are decoded elsewhere (a thread, say), and taken
   into the tables in `Pages.collect`, in the serving loop, in less than a millisecond each.
-- Another version is another view: `ViewOrigin.load` returns it, in a thread, when the pages that the view
-  before has are here in it, too; `changes_from` then says what differs as far as both know it.
+- Another version is another view: `ViewOrigin.load` returns it, in a thread, with what it can share of the
+  view before, which goes on changing in the serving loop meanwhile.  It is held back until `Pages.lacking`
+  says that nothing is missing where the view before knows cells; until then that one is served.  What differs
+  is then asked of `changes_from`, as far as both know it, in the serving loop.
 - What loads read is said by `source`.  A layer that the origin has ready made is not computed here: its size
   in memory and its version are those that `ready` gives, and it looks into no other cells.
 """
@@ -100,6 +102,9 @@ class Pages(Protocol):
 
     def collect(self) -> PageNews:
         """Take in what has come since the last time."""
+
+    def lacking(self, before: Pages) -> Sequence[int]:
+        """Pages that are not here, and that lie where the version ``before`` has some that are."""
 
     def spare(self) -> int | None:
         """Return the page that was needed least recently, if they take more memory than they may."""
@@ -216,6 +221,5 @@ class ViewOrigin(Protocol):
     def load(self, *, fresh: bool = False, before: object | None = None) -> CatalogueView:
         """Find out which cells are known now; errors are those of `MapOrigin.load`.
 
-        What has not changed since ``before``, an earlier view, may be shared with it; of a map in pages,
-        those that are here in ``before`` are here in the new one, too.
+        What has not changed since ``before``, an earlier view, may be shared with it.
         """

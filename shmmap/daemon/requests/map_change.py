@@ -42,9 +42,14 @@ class MapChange:
         """A reload is over: serve what it found, and tell those who asked for it."""
         self.reloader.collect(self._apply, self._keep)
 
-    def _apply(self, reread: Reread) -> None:
-        """Serve another state of the map from now on."""
+    def _apply(self, reread: Reread) -> Reread | None:
+        """Serve another state of the map from now on; None if it does not know enough yet."""
         statistics, catalogue = self.cache.statistics, reread.catalogue
+        if not self.paging.is_ready(catalogue, self._try_again):
+            return None
+        if catalogue.pages is not None:  # more of both is known by now
+            before = self.cache.catalogue
+            reread = Reread(catalogue, catalogue.changes_from(before), before)
         self.map_switch.switch(catalogue, reread.change)
         self.scheduler.map_changed()
         self.paging.follow()
@@ -55,6 +60,11 @@ class MapChange:
         self._tell(reread.change)
         for problem in itertools.islice(catalogue.problems, PROBLEMS_TOLD):
             log.warning("problem in the map", what=problem)
+        return reread
+
+    def _try_again(self) -> None:
+        """More is known of the state of the map that was held back."""
+        self.reloader.apply_held(self._apply)
 
     def _tell(self, change: CatalogueChange) -> None:
         """Say what is new in the map."""

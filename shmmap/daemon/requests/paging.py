@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,7 +14,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.map.catalogue_view import Pages
+from shmmap.daemon.map.catalogue_view import CatalogueView, Pages
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.transport.sessions import Sessions
@@ -44,6 +45,7 @@ class Paging:
     sessions: Sessions
     watched: WatchedDescriptors
     _fd: int = -1
+    _coming_fd: int = -1
     _rests_until_s: float = -math.inf
 
     @property
@@ -52,6 +54,7 @@ class Paging:
 
     def follow(self) -> None:
         """Hear of the pages of the map that is served from now on."""
+        self._stop_following_the_next()
         if self._fd >= 0:
             self.watched.unwatch(self._fd)
             self.cells.map_changed()
@@ -59,6 +62,31 @@ class Paging:
         self._fd = pages.fd if pages is not None else -1
         if self._fd >= 0:
             self.watched.watch(self._fd, self.collect, "map")
+
+    def is_ready(self, new: CatalogueView, try_again: Callable[[], None]) -> bool:
+        """Whether another state of the map knows all that is known of the one that is served.
+
+        Else its pages are fetched, and ``try_again`` is called when some have come.
+        """
+        self._stop_following_the_next()
+        pages, served = new.pages, self._pages
+        lacking = pages.lacking(served) if pages is not None and served is not None else ()
+        if pages is None or not lacking:
+            return True
+
+        def come() -> None:
+            if pages.collect().come:
+                try_again()
+
+        self._coming_fd = pages.fd
+        self.watched.watch(self._coming_fd, come, "map")
+        pages.want(lacking, 0.0)
+        return False
+
+    def _stop_following_the_next(self) -> None:
+        if self._coming_fd >= 0:
+            self.watched.unwatch(self._coming_fd)
+        self._coming_fd = -1
 
     def collect(self) -> None:
         """Pages have settled: begin what waited for them."""

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Ready
+from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages, Ready
 from shmmap.errors import Offline
 from shmmap.geometry import Area
 from shmmap.origin.catalogue import Catalogue
@@ -112,6 +112,9 @@ class MemoryPages:
                 self.needed.append(page)
         self._lost |= set(news.out_of_reach)
         return news
+
+    def lacking(self, before: Pages) -> Sequence[int]:
+        return [page for page in range(len(self)) if before.is_here(page) and not self.is_here(page)]
 
     def spare(self) -> int | None:
         return self.needed[0] if len(self.needed) > self.most else None
@@ -259,12 +262,18 @@ class PagedOrigin:
         The map as it is now; the next `load` has it.
     known
         Pages that are here in the first view; later ones have what the view before has.
+    sharing
+        Pages that a later view may have of the one before it.
+    last
+        The view that was loaded last.
     offline
         Whether it cannot be reached.
     """
 
     def __init__(self, whole: Catalogue, pages: NDArray[np.float64], known: Iterable[int]) -> None:
         self.whole, self._pages, self.known = whole, pages, set(known)
+        self.sharing = set(range(len(pages)))
+        self.last: PagedView | None = None
         self.offline = False
         self.path = whole.id_prefix
 
@@ -272,5 +281,6 @@ class PagedOrigin:
         del fresh
         if self.offline:
             raise Offline(f"{self.path}: it does not answer")
-        known = before.pages.needed if isinstance(before, PagedView) else self.known
-        return PagedView(self.whole, self._pages, known)
+        known = self.sharing & set(before.pages.needed) if isinstance(before, PagedView) else self.known
+        self.last = PagedView(self.whole, self._pages, known)
+        return self.last

@@ -440,6 +440,53 @@ def test_what_changed_since_is_known_if_it_was_known_in_both(paged: Paged, compa
     assert (names(page.rows) == ["20_20.pcd"]) is compared
 
 
+def test_another_version_is_served_when_it_knows_what_is_known_of_this_one(paged: Paged) -> None:
+    """Until then this one is, whole; a link that is lost meanwhile changes nothing."""
+    paged.know(WEST, EAST)
+    before = {cell.id: cell.version for cell in paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).cells}
+    served = paged.view
+    paged.directory.change("20_20.pcd", 5)
+    paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+    paged.origin.sharing = {WEST}
+    paged.requests += 1
+    paged.daemon.send(m.Reload(paged.requests))
+    paged.daemon.turn_until(lambda: paged.origin.last is not None and paged.origin.last.pages.wanted)
+    coming = paged.origin.last
+    assert coming is not None
+    assert (paged.view is served, coming.pages.wanted) == (True, {EAST: 0.0})
+    coming.pages.fail(EAST)
+    paged.daemon.turn_until(lambda: coming.pages.is_out_of_reach(EAST))
+    assert (paged.view is served, paged.daemon.answered()) == (True, False)
+    coming.pages.come(EAST)
+    reloaded = paged.answer()
+    assert (type(reloaded), reloaded.changed, paged.view is coming) == (m.Reloaded, 1, True)
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    assert [cell.id for cell in reply.cells if cell.version != before[cell.id]] == ["20_20.pcd"]
+    since = paged.ask(lambda n: m.Metadata(n, since=served.map_version))
+    assert (names(since.rows), since.since_known) == (["20_20.pcd"], True)
+
+
+def test_a_version_that_is_held_back_gives_way_to_a_later_one(paged: Paged) -> None:
+    paged.know(WEST, EAST)
+    paged.origin.sharing = {WEST}
+    for _ in range(2):
+        paged.requests += 1
+        paged.daemon.send(m.Reload(paged.requests))
+    first: list[PagedView] = []
+
+    def second() -> bool:
+        last = paged.origin.last
+        if last is not None and last.pages.wanted and last not in first:
+            first.append(last)
+        return len(first) == 2
+
+    paged.daemon.turn_until(second)
+    first[0].pages.come(EAST)
+    first[1].pages.come(EAST)
+    assert [type(paged.answer()), type(paged.answer())] == [m.Reloaded] * 2
+    assert paged.view is first[1]
+
+
 # --- the list of cells -----------------------------------------------------------------------------
 
 

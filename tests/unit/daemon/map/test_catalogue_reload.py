@@ -37,7 +37,7 @@ def reloader() -> Iterator[Reloader]:
 def collect(reloader: Reloader) -> None:
     """Do what the loop does when the descriptor is readable."""
     assert select.select([reloader.fd], [], [], 30.0)[0]
-    reloader.collect(lambda _: None, lambda _: None)
+    reloader.collect(lambda found: found, lambda _: None)
 
 
 def test_who_asks_meanwhile_gets_the_next_one(reloader: Reloader) -> None:

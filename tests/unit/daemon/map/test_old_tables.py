@@ -75,9 +75,10 @@ def collected(reloader: Reloader, served: list[CatalogueView], *, takes_over: bo
     reloader.ask(lambda _: None)
     assert select.select([reloader.fd], [], [], 60.0)[0]
 
-    def apply(found: Reread) -> None:
+    def apply(found: Reread) -> Reread:
         if takes_over:
             served[0] = found.catalogue
+        return found
 
     reloader.collect(apply, lambda _: None)
     for thread in threading.enumerate():
