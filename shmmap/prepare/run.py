@@ -82,34 +82,10 @@ class _Count:
             self._cache.trim()
         self._progress.advance(1)
 
-<<<<<<< HEAD
     def died(self, task: work.CellWork, how: str) -> None:
-        message = f"{task.path}: the worker died of it ({how})"
+        message = f"{task.source.name}: the worker died of it ({how})"
         self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
         self._progress.advance(1)
-=======
-    def _died(self, worker: _Worker) -> None:
-        task, ready = worker.task, worker.ready
-        how = self._end(worker)
-        if not ready:
-            self._failed_starts += 1
-            if self._failed_starts >= _FAILED_STARTS:
-                raise InternalError(f"no worker can be started: {how}")
-            if task is not None:
-                self._again.append(task)
-            return
-        if task is not None:
-            message = f"{task.source.name}: the worker died of it ({how})"
-            self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
-            self._progress.advance(1)
-
-    def _end(self, worker: _Worker) -> str:
-        self._workers.remove(worker)
-        self._selector.unregister(worker.channel)
-        worker.channel.close()
-        worker.process.kill()
-        return how_ended(worker.process.wait())
->>>>>>> seams
 
 
 def prepare_map(
@@ -148,30 +124,12 @@ def prepare_map(
 
     def tasks() -> Iterator[work.CellWork]:
         for index in range(len(catalogue)):
-<<<<<<< HEAD
             around, refused = neighbours_of(catalogue, versions, index, names)
             crowded.extend(refused)
             yield work.CellWork(
                 index,
                 catalogue.id(index),
-                catalogue.path(index),
-=======
-            cell_id = catalogue.id(index)
-            around: dict[str, tuple[Neighbour, ...]] = {}
-            for name in names:
-                near = versions.neighbours(index, name)
-                if len(near) > MAX_NEIGHBOURS:
-                    message = f"{name} looks into more than {MAX_NEIGHBOURS} cells around one"
-                    crowded.append(Failure(cell_id, name, message))
-                else:
-                    around[name] = tuple(
-                        Neighbour.of(catalogue.id(i), catalogue.source(i), catalogue.box(i)) for i in near
-                    )
-            yield work.CellWork(
-                index,
-                cell_id,
                 catalogue.source(index),
->>>>>>> seams
                 catalogue.box(index),
                 catalogue.frame_id,
                 tuple(around),
@@ -207,5 +165,7 @@ def neighbours_of(
             message = f"{layer} looks into more than {MAX_NEIGHBOURS} cells around one"
             crowded.append(Failure(catalogue.id(index), layer, message))
         else:
-            around[layer] = tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in near)
+            around[layer] = tuple(
+                Neighbour.of(catalogue.id(i), catalogue.source(i), catalogue.box(i)) for i in near
+            )
     return around, crowded

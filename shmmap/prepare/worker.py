@@ -28,6 +28,7 @@ from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.segment.source import Source
 
 __all__ = ["CellPoints", "main"]
 
@@ -56,7 +57,7 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
             if cache.recognise(key, _content(job, digests)):
                 done[str(spec)] = work.LayerDone(str(spec), "recognised", cache.size_of(key))
                 missing.remove(entry)
-    source = CellPoints(task.path, task.box, [spec for spec, _, _ in missing])
+    source = CellPoints(task.source, task.box, [spec for spec, _, _ in missing])
     for spec, job, _ in missing:
         done[str(spec)] = _build(spec, job, cache, source)
     return work.CellDone(task.number, tuple(done[name] for name in task.layers))
@@ -65,8 +66,8 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
 class CellPoints:
     """The cell's points, read when first asked for, with the columns that all layers need together."""
 
-    def __init__(self, path: str, box: Box, specs: list[LayerSpec]) -> None:
-        self._path = path
+    def __init__(self, source: Source, box: Box, specs: list[LayerSpec]) -> None:
+        self._source = source
         self._box = box
         self._read: CellSource | None = None
         needs = [spec.source_columns for spec in specs if spec.kind.name != LAYER]
@@ -77,11 +78,7 @@ class CellPoints:
     def points(self, spec: LayerSpec) -> CellSource:
         """The columns that one layer takes: exactly those, whatever the others need."""
         if self._read is None:
-<<<<<<< HEAD
-            self._read = read_source(self._path, self._box, self._needs)
-=======
-            self._read = FILES.read(self._task.source, self._task.box, self._needs)
->>>>>>> seams
+            self._read = FILES.read(self._source, self._box, self._needs)
         names = spec.source_columns
         table = self._read.points
         columns = {n: c for n, c in table.columns.items() if names is None or n in names}

@@ -247,7 +247,7 @@ def _send_cells(
             yield CellToSend(
                 index,
                 catalogue.id(index),
-                catalogue.path(index),
+                catalogue.source(index),
                 catalogue.box(index),
                 catalogue.frame_id,
                 tuple(around),
@@ -267,7 +267,7 @@ def _send_cells(
         progress.advance(1)
 
     def died(task: CellToSend, how: str) -> None:
-        message = f"{task.path}: the worker died of it ({how})"
+        message = f"{task.source.name}: the worker died of it ({how})"
         result.failures.append(Failure(task.cell_id, ", ".join(task.layers), message))
         progress.advance(1)
 

@@ -83,17 +83,17 @@ class _Maker:
 
     def make(self, task: CellToSend) -> _Cell:
         specs = [layer_spec(name) for name in task.layers]
-        source = CellPoints(task.path, task.box, specs)
+        source = CellPoints(task.source, task.box, specs)
         layers, headers = [], []
         for spec, around in zip(specs, task.around, strict=True):
-            job = CellJob(task.cell_id, task.path, task.box, task.frame_id, around)
+            job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around)
             header, layer = self._layer(spec, job, source)
             headers.append(header)
             layers.append(layer)
         states: set[SourceStamp] = {header.source for header in headers}
         if len(states) > 1:
             raise _LayerRefused(
-                str(specs[0]), MapDataError.code, f"{task.path}: the file changed while it was read"
+                str(specs[0]), MapDataError.code, f"{task.source.name}: the file changed while it was read"
             )
         return _Cell(headers[task.layers.index(LAYER)], tuple(layers))
 
@@ -108,7 +108,7 @@ class _Maker:
                     raise MapDataError(
                         f"{name} has {format_bytes(header.total_bytes)}, more than the"
                         f" {format_bytes(MAX_OBJECT_BYTES)} that a published layer of a cell may have",
-                        path=job.path,
+                        path=job.source.name,
                         cause="too_large",
                         hint="divide the map into smaller cells",
                     )
@@ -118,13 +118,13 @@ class _Maker:
         except ShmmapError as error:
             raise _LayerRefused(name, error.code, error.message, error.hint) from None
         except OSError as error:
-            message = f"{error.filename or job.path}: {error.strerror or error}"
+            message = f"{error.filename or job.source.name}: {error.strerror or error}"
             raise _LayerRefused(name, MapDataError.code, message) from None
         except MemoryError:
-            message = f"{job.path}: building {name} ran out of memory"
+            message = f"{job.source.name}: building {name} ran out of memory"
             raise _LayerRefused(name, MapDataError.code, message) from None
         except Exception as error:  # noqa: BLE001  a builder of another package, say
-            message = f"{job.path}: building {name} failed: {error!r}"
+            message = f"{job.source.name}: building {name} failed: {error!r}"
             raise _LayerRefused(name, InternalError.code, message) from None
 
     def _object(self, segment: memoryview) -> _Layer:

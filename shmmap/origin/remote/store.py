@@ -78,6 +78,9 @@ class Store(Protocol):
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
         """Return a whole object, and the tag of this state of it."""
 
+    def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
+        """Return a whole object and its tag; None if it still is in the state that ``tag`` names."""
+
     def head(self, path: str) -> Listed | None:
         """Return an object's size and age; None if there is none."""
 
