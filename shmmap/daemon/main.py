@@ -107,6 +107,10 @@ def run(config: DaemonConfig) -> int:
             "no map is named", key="map_path",
             hint="give `shmmap serve MAP`, or set map_path; --live NAME for a live map alone",
         )  # fmt: skip
+    if "://" in config.map_path:
+        from shmmap.origin.remote.store import read_url
+
+        read_url(config.map_path)  # may refuse: one that may hold a secret is not logged
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     early = fork_early()
     prepare_process()

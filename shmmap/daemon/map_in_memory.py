@@ -124,8 +124,10 @@ class MapInMemory:
                 instance=config.instance, mode=mode, gid=gid,
             )  # fmt: skip
             self.watched = WatchedDescriptors()
-            settings = (directory.path, str(loader_bytes(group_limit)), config.cache_dir)
-            settings += (str(config.cache_bytes), *(origin.words if origin is not None else ()))
+            settings = (
+                directory.path, str(loader_bytes(group_limit)), config.cache_dir, str(config.cache_bytes),
+                *(origin.words if origin is not None else ()),
+            )  # fmt: skip
             parent = PreparedParent(settings, self.watched, early)
             parent.start()  # it imports what loaders need while this process gets ready
             pool = WorkerPool(

@@ -232,8 +232,8 @@ class PublishedView:
                     found[how] += [page.first + row for row in getattr(difference, how)]
         if same_ids and found["added"] and found["removed"]:
             self._note_moved(found, before)
-        indices = {how: np.sort(np.array(some, np.intp)) for how, some in found.items()}
-        return CatalogueChange(before, self, **indices)
+        added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in found.values())
+        return CatalogueChange(before, self, added, removed, changed, moved)
 
     def _note_moved(self, found: dict[str, list[int]], before: PublishedView) -> None:
         """Cells that left one shard and came to another one have only moved."""

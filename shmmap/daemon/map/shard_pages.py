@@ -8,7 +8,7 @@ import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ class Page:
     @classmethod
     def of(cls, shard: Shard, first: int) -> Page:
         """Return the page of a shard."""
-        arrays = [shard.boxes, shard.z, shard.points]
+        arrays: list[NDArray[Any]] = [shard.boxes, shard.z, shard.points]
         for layer in shard.layers.values():
             arrays += [layer.sizes, layer.raws, layer.hashes, layer.contents]
         nbytes = sum(int(array.nbytes) for array in arrays) + (8 + NAME_BYTES) * len(shard)
@@ -202,7 +202,8 @@ class ShardPages:
         """Take in what has come since the last time, a bounded part of it."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
-        come, lost = [], []
+        come: list[int] = []
+        lost: list[int] = []
         while self._arrived and len(come) < TAKEN_AT_ONCE:
             number, shard = self._arrived.popleft()
             self._wanted.pop(number, None)
