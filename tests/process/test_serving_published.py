@@ -33,8 +33,9 @@ pytest.importorskip("obstore", reason="obstore is not installed")
 
 NDT = "ndt(leaf=2.0,min_points=3)"
 ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
-LAYERS = ("points", NDT, "voxel(leaf=1.0)", "normals(radius=2.0)")
-"""As it is, published, computed here from one cell, computed here from the cells around, too."""
+PUBLISHED = ("points", NDT)
+COMPUTED = ("voxel(leaf=1.0)", "normals(radius=2.0)")
+"""Of one cell alone, and of the cells around it, too."""
 
 Connect = Callable[..., RawClient]
 
@@ -102,10 +103,11 @@ def test_every_column_is_that_of_the_files(
     url: tuple[str, dict[str, str]], daemon: DaemonFactory, town: DividedMap
 ) -> None:
     local, remote = daemon(town.root), daemon(url[0], environment=url[1])
+    layers = (*PUBLISHED, *COMPUTED) if url[0].startswith("/") else PUBLISHED
     found = []
     for one in (local, remote):
         with shmmap.connect(one.endpoint) as client:
-            cells = client.area(ALL, layers=LAYERS, wait=120.0)
+            cells = client.area(ALL, layers=layers, wait=120.0)
             assert cells.complete, cells.failed
             found.append((columns_of(cells), names(cells)))
             for cell in cells:
@@ -113,7 +115,7 @@ def test_every_column_is_that_of_the_files(
                 assert cell.box == town.box(cell.id.rsplit("/", 1)[1])
                 assert cell.frame_id == "map"
     (of_files, order), (of_objects, other_order) = found
-    assert len(of_files) == 9 * len(LAYERS)
+    assert len(of_files) == 9 * len(layers)
     assert order == other_order
     assert of_files == of_objects
     with shmmap.connect(remote.endpoint) as client:
@@ -202,7 +204,7 @@ def offline_codes(cells: Any) -> set[str]:
     return {failure.code for failure in cells.failed}
 
 
-@pytest.mark.parametrize("how", ["refuse", "stall", "503", "truncate"])
+@pytest.mark.parametrize("how", ["refuse", "stall", "503"])
 def test_an_origin_out_of_reach_costs_only_what_is_not_here(
     daemon: DaemonFactory, web: FaultyWeb, how: str
 ) -> None:
@@ -231,6 +233,18 @@ def test_an_origin_out_of_reach_costs_only_what_is_not_here(
         while waiting(not client.area(ALL, wait=5.0).complete):
             time.sleep(0.05)
         while waiting((said := health(one))[0] != 0):
+            time.sleep(0.05)
+
+
+def test_bodies_that_end_early_are_no_cells(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    web.fault = lambda path: "truncate" if path.startswith("blobs/") else ""
+    with shmmap.connect(one.endpoint) as client:
+        cells = client.area(ALL, wait=60.0)
+        assert (len(cells), offline_codes(cells)) == (0, {"offline"})
+        web.heal()
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=5.0).complete):
             time.sleep(0.05)
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 __all__ = ["FaultyWeb", "faulty_web"]
 
 Fault = Callable[[str], str]
-"""What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (unless it is for the rest of one),
+"""What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
 ``truncate``, ``corrupt``, a status such as ``503``; or nothing."""
 
 

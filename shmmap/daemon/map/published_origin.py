@@ -24,6 +24,7 @@ from shmmap.origin.remote.map_versions import (
 )
 from shmmap.origin.remote.published_index import Root, Shard, unpack_shard
 from shmmap.origin.remote.serving_store import ServedFrom, open_for_serving
+from shmmap.origin.remote.store import PROBE
 
 __all__ = ["PublishedOrigin"]
 
@@ -54,6 +55,7 @@ class PublishedOrigin:
         self, served: ServedFrom, *, catalogue_bytes: int, poll_s: float, accept_version: int = 0
     ) -> None:
         self._store = open_for_serving(served)
+        self._probe = open_for_serving(served, PROBE)
         self.served = served._replace(url=self._store.url)
         self.path = self._store.url
         self._catalogue_bytes = catalogue_bytes
@@ -141,7 +143,8 @@ class PublishedOrigin:
         """Whether there is another version than the one that was taken; asked in a thread."""
         if self._taken is None:
             return False
-        self._seen = read_current_again(self._store, self._seen)
+        store = self._probe if self.link.is_out else self._store
+        self._seen = read_current_again(store, self._seen)
         return self._seen.current not in (self._taken, self._refused, None)
 
     def close(self) -> bool:

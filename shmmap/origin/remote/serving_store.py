@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import HASTY, Store
+from shmmap.origin.remote.store import HASTY, Patience, Store
 
 __all__ = ["ServedFrom", "open_for_serving"]
 
@@ -28,14 +28,14 @@ class ServedFrom(NamedTuple):
         return cls(url, *map(bool, flags))
 
 
-def open_for_serving(served: ServedFrom) -> Store:
+def open_for_serving(served: ServedFrom, patience: Patience = HASTY) -> Store:
     """Return the store: somebody waits for what it gives.
 
     What is immutable is read by `Store.get_exactly` alone.  Errors are those of `open_store`.
     """
     return open_store(
         served.url,
-        patience=HASTY,
+        patience=patience,
         insecure_http=served.insecure_http,
         instance_credentials=served.instance_credentials,
     )

@@ -19,6 +19,7 @@ __all__ = [
     "BUCKET_SCHEMES",
     "HASTY",
     "PATIENT",
+    "PROBE",
     "WEB_SCHEMES",
     "Listed",
     "Patience",
@@ -110,8 +111,10 @@ class Patience:
     retry_s: float
 
 
-HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.0)
-"""For what somebody waits for."""
+HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
+"""For what somebody waits for: a server that says nothing is asked once more, as is one that falls silent."""
+PROBE: Final = Patience(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
+"""To find out whether a server is back."""
 PATIENT: Final = Patience(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
 """For long runs."""
 
