@@ -46,6 +46,7 @@ class Paging:
     watched: WatchedDescriptors
     _fd: int = -1
     _coming_fd: int = -1
+    _was_out_of_reach: bool = False
     _rests_until_s: float = -math.inf
 
     @property
@@ -94,6 +95,9 @@ class Paging:
         if pages is None:
             return
         news = pages.collect()
+        if news.come and self._was_out_of_reach:  # what has failed for that may be had again
+            self.scheduler.loads.forget_failures()
+        self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
             self.adoption.pages_came(time.monotonic())
             if self.cache.layers.halo_m(self.cache.ledger.layers()):

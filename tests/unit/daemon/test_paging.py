@@ -568,6 +568,10 @@ def test_a_layer_that_looks_into_what_is_out_of_reach_is_offline(paged: Paged) -
     paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
     reply = paged.ask(lambda n: m.Selected(n, ("-20_-40.pcd",), (HALO,), wait=LONG_S))
     assert [(one.code, one.box) for one in reply.failed] == [("offline", (-20.0, -40.0, 0.0, -20.0))]
+    paged.pages.come(EAST)
+    paged.daemon.turn_until(lambda: paged.pages.is_here(EAST))
+    reply = paged.ask(lambda n: m.Selected(n, ("-20_-40.pcd",), (HALO,), wait=LONG_S))
+    assert (names(reply.cells), reply.failed) == (["-20_-40.pcd"], ()), "at once, not when its time has come"
 
 
 # --- a restart -------------------------------------------------------------------------------------
