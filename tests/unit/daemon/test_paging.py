@@ -18,6 +18,7 @@ import pytest
 
 from shmmap import AutowareSquare, Box, HeldCell, MapWindow, Offline, connect
 from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.map.catalogue_view import Ready
 from shmmap.daemon.requests import limits, map_queries
 from shmmap.daemon.requests.operators import operator_requests
 from shmmap.daemon.requests.paging import Paging
@@ -26,6 +27,7 @@ from shmmap.origin.map_directory import open_map
 from shmmap.protocol import events
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions, unpack_versions
+from tests.support.cpp_client import CppClient
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.paging_view import MemoryPages, PagedOrigin, PagedView
 from tests.unit.daemon.whole_daemon import WholeDaemon
@@ -382,6 +384,14 @@ def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
     assert (since.rows, since.since_known, since.map_version) == ((), True, version)
 
 
+def test_sizes_that_the_catalogue_knows_are_taken(paged: Paged, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By loads, and by what is fetched ahead."""
+    cache = paged.daemon.memory.cache
+    guessed = cache.estimate(0, "points")
+    monkeypatch.setattr(PagedView, "ready", lambda view, index, _: Ready(20_000, view.version(index)))
+    assert (guessed, cache.estimate(0, "points"), cache.estimate(0, "ndt(leaf=2.0)")) == (12288, 20480, 20480)
+
+
 def test_how_many_cells_are_known_is_counted(paged: Paged) -> None:
     def known() -> tuple[int, int]:
         counters = paged.ask(m.Stats).counters
@@ -657,6 +667,20 @@ def test_the_client_library_says_so(paged: Paged) -> None:
         while client.stats().counters["map_cells_known"] < 16:
             pass
         assert len(client.metadata()) == 16
+
+
+def test_so_does_the_one_in_cpp(paged: Paged, cpp_program: Path) -> None:
+    with paged.daemon.turning(), CppClient(cpp_program, paged.daemon.endpoint) as client:
+        everywhere = Box(-35.0, -35.0, 35.0, 35.0)
+        found = client.area(everywhere, wait=0.5)
+        assert (found.covered, found.complete, found.reason) == (False, False, "")
+        paged.pages.fail(EAST)
+        found = client.area(everywhere, wait=60.0)
+        assert (len(found), found.covered, found.reason) == (8, False, "offline")
+        paged.pages.come(EAST)
+        while not found.covered:
+            found = client.area(everywhere, wait=60.0)
+        assert (len(found), found.complete, found.reason) == (16, True, "")
 
 
 @pytest.mark.parametrize("background", [True, False])
