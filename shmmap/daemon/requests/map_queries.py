@@ -128,18 +128,18 @@ class MapQueries:
             session.connection.reply(encode(page or self._empty(message)))
 
     def pages_settled(self, news: PageNews) -> None:
-        """Pages have come, or cannot be had: answer who waited for one."""
+        """Answer requests that waited for pages which have come, or cannot be had."""
         if self._waiting and (news.come or news.out_of_reach):
             waiting, self._waiting = self._waiting, []
             for one in waiting:
                 self._answer_waiting(one, over=False)
 
     def next_deadline_s(self) -> float:
-        """When somebody has waited long enough; infinity if nobody waits."""
+        """When a request has waited long enough; infinity if none waits."""
         return min((one.deadline_s for one in self._waiting), default=math.inf)
 
     def answer_overdue(self, now_s: float) -> None:
-        """Answer those who have waited long enough: they ask again."""
+        """Answer requests that have waited long enough: clients repeat them."""
         waiting, self._waiting = self._waiting, []
         for one in waiting:
             if now_s < one.deadline_s:
@@ -220,7 +220,7 @@ class MapQueries:
     ) -> tuple[Sequence[int], int | None] | None:
         """Cells of one page of the map, from a row on, and where the next ones begin; None: it has to come.
 
-        Where one begins is told as its page's number, shifted by 32 bits, and its row there.
+        A place in the list is its page's number, shifted by 32 bits, and its row there.
 
         Raises
         ------

@@ -102,7 +102,7 @@ class Paged:
         self.daemon.turn_until(lambda: set(self.pages.needed) == set(pages))
 
     def give_up(self, most: int) -> None:
-        """Let the daemon drop pages until so many are here, or more that are needed."""
+        """Let the daemon drop pages until no more than ``most`` are here, or all are needed."""
         self.pages.most, looked = most, 2 * len(self.pages.needed)
         is_needed = self.paging.is_needed
         while self.pages.spare() is not None and (looked := looked - 1):
@@ -266,7 +266,7 @@ def test_nothing_that_may_lie_in_the_unknown_part_is_removed(paged: Paged, by_na
     reply = paged.answer()
     assert reply.covered
     assert removed(reply) == sorted([*WESTERN, "nowhere.pcd"])
-    assert names(reply.cells) == [], "who kept the cells lacks nothing"
+    assert names(reply.cells) == [], "a client that kept the cells lacks nothing"
 
 
 def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
@@ -369,7 +369,7 @@ def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
     reply = paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S))
     cache, statistics = paged.daemon.memory.cache, paged.daemon.memory.statistics
     warm, before = cache.warm, {name: statistics.values[name] for name in ("reloads", "evictions")}
-    told = paged.ask(lambda n: events.Recent(n, after=0)).next
+    first = paged.ask(lambda n: events.Recent(n, after=0)).next
     version, segments = paged.view.map_version, {cell.segment for cell in reply.cells}
     welcome = paged.ask(lambda n: m.Hello(n, *m.PROTOCOL_VERSION, "again"))
     assert (welcome.cells, welcome.bounds) == (16, (-40.0, -40.0, 40.0, 40.0)), "those of the whole map"
@@ -378,7 +378,7 @@ def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
     assert segments < {cell.segment for cell in reply.cells}
     assert (cache.warm is warm, paged.view.map_version) == (True, version)
     assert {name: statistics.values[name] for name in before} == before
-    recent = paged.ask(lambda n: events.Recent(n, after=told - 1)).events
+    recent = paged.ask(lambda n: events.Recent(n, after=first - 1)).events
     assert {type(events.decode_event(one)) for one in recent} <= {events.Loaded, events.Late}
     since = paged.ask(lambda n: m.Metadata(n, since=version))
     assert (since.rows, since.since_known, since.map_version) == ((), True, version)
