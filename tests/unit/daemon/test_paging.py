@@ -101,6 +101,15 @@ class Paged:
         self.pages.come(*(page for page in pages if not self.pages.is_here(page)))
         self.daemon.turn_until(lambda: set(self.pages.needed) == set(pages))
 
+    def let_come(self, chance: random.Random, failing: float = 0.0) -> None:
+        """Let one of the pages come that are wanted, of this state of the map or the next; or fail."""
+        for view in {id(one): one for one in (self.view, self.origin.last) if one is not None}.values():
+            pages = view.pages
+            if pages.wanted and pages.settled:
+                page = chance.choice(sorted(pages.wanted))
+                fails = chance.random() < failing and not pages.is_out_of_reach(page)
+                (pages.fail if fails else pages.come)(page)
+
     def give_up(self, most: int) -> None:
         """Let the daemon drop pages until no more than ``most`` are here, or all are needed."""
         self.pages.most, looked = most, 2 * len(self.pages.needed)
@@ -360,6 +369,67 @@ def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
         if reply.covered:
             assert held == {name: _version(one, name) for name in inside}
     assert 10 < covered < 95, "else nothing was tried"
+
+
+@pytest.mark.parametrize("layer", ["points", HALO])
+def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, layer: str
+) -> None:
+    """Pages come in any order while it waits, some cannot be had, and the map may change meanwhile."""
+    chance = random.Random(7)
+    corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
+    strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
+    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), strips, set())
+    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    held: dict[str, int] = {}
+    reasons: list[str] = []
+    for step in range(40):
+        if chance.random() < 0.3:
+            one.ask(m.Evict)
+            held = {}
+            one.give_up(0)
+        area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
+        one.requests += 1
+        named = tuple(HeldCell(name, version) for name, version in held.items())
+        one.daemon.send(m.Differential(one.requests, area, (layer,), held=named, wait=LONG_S))
+        changes = layer == "points" and chance.random() < 0.15
+        while not one.daemon.answered():
+            one.daemon.turn()
+            one.let_come(chance, failing=0.15)
+            if changes and len(one.daemon.service._loop.cells):
+                changes = False
+                small_map.change(chance.choice(ALL), step)
+                one.origin.whole = open_map(str(small_map.root), cache_dir=str(tmp_path)).load()
+                one.daemon.service._reload()
+        reply = one.daemon.received()
+        if reply.map_version != one.origin.whole.map_version:
+            held = {}  # nothing to compare with: the state that it is of is gone
+            while one.view.map_version != one.origin.whole.map_version:
+                one.daemon.turn()
+                one.let_come(chance)
+            continue
+        reasons.append(reply.reason)
+        assert reply.pending == ()
+        assert {failed.code for failed in reply.failed} <= {"offline"}
+        lost = {failed.id for failed in reply.failed}
+        versions = LayerVersions(lambda: one.origin.whole)
+        index_of = {name: one.origin.whole.find(name) for name in ALL}
+        current = {name: versions.version(i, layer) for name, i in index_of.items() if i is not None}
+        inside = {
+            name for name, i in index_of.items() if i is not None and _touches(area, one.origin.whole.box(i))
+        }
+        fresh = {cell.id: cell.version for cell in reply.cells}
+        assert fresh == {name: current[name] for name in fresh}
+        if reply.covered:
+            assert set(fresh) | lost == {name for name in inside if held.get(name) != current[name]}
+            assert set(reply.removed) == {name for name in held if name not in inside}
+        else:
+            assert reply.reason == "offline"
+            assert set(fresh) | lost <= inside
+            assert not inside & set(reply.removed)
+        held = {name: v for name, v in held.items() if name not in reply.removed} | fresh
+    assert reasons.count("") > 10
+    assert "offline" in reasons
 
 
 # --- within one version ----------------------------------------------------------------------------
