@@ -567,6 +567,26 @@ def test_a_version_that_is_held_back_gives_way_to_a_later_one(paged: Paged) -> N
     assert paged.view is first[1]
 
 
+def test_what_changed_in_a_page_that_has_gone_comes_with_it(paged: Paged) -> None:
+    paged.know(WEST, EAST)
+    before = paged.view.map_version
+    paged.directory.change("20_20.pcd", 5)
+    paged.read_again()
+    for _ in range(2):
+        page = paged.ask(lambda n: m.Metadata(n, since=before))
+        assert (names(page.rows), page.since_known, page.next) == (["20_20.pcd"], True, None)
+        paged.know(WEST)
+        page = paged.ask(lambda n: m.Metadata(n, since=before))
+        assert (page.rows, page.since_known, page.next) == ((), True, 0), "nothing yet: ask again"
+        paged.know(WEST, EAST)
+
+
+def test_a_first_page_without_rows_says_that_the_whole_list_follows(paged: Paged) -> None:
+    paged.know(EAST)
+    page = paged.ask(lambda n: m.Metadata(n, since=12345))
+    assert (page.rows, page.since_known, page.next) == ((), False, 0)
+
+
 # --- the list of cells -----------------------------------------------------------------------------
 
 
