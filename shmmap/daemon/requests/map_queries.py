@@ -194,7 +194,7 @@ class MapQueries:
     def _changed_rows(
         self, touched: NDArray[np.intp], area: Area | None, start: int, limit: int
     ) -> tuple[Sequence[int], int | None] | None:
-        """Cells that changed, from the ``start``-th on, and where the next begin; None: pages have to come."""
+        """Cells that changed, from the ``start``-th on, and the next place; None: pages have to come."""
         catalogue = self._catalogue
         if (pages := catalogue.pages) is not None:
             page_of = pages.of_cell
