@@ -8,6 +8,7 @@ instants are for ``tests/benchmarks/interrupts.py``.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dis
 import gc
@@ -255,10 +256,8 @@ def test_threads_that_begin_when_nobody_wants_them_any_more(
     before = holdings(one), len(running)
     with monkeypatch.context() as patch:
         patch.setattr(follower if what == "window" else connection_watch, "start_thread", later)
-        try:
+        with contextlib.suppress(Interrupt):
             OPENS[what](one.endpoint)
-        except Interrupt:
-            pass
     shmmap.connect(one.endpoint).close()
     (begin,) = begun
     begin()
