@@ -66,7 +66,7 @@ def user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Terminal]:
         first = reader.terminal()
         demo, serve = README.commands("server")
         assert demo.startswith("shmmap demo ")
-        first.run(demo)
+        first.run(f"{demo} --density 20")  # in a fifth of the time; as it stands: test_first_steps.py
         with first.serving(serve):
             yield reader.terminal()
     finally:
