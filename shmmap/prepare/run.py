@@ -178,7 +178,7 @@ class _Run:
                 self._again.append(task)
             return
         if task is not None:
-            message = f"{task.path}: the worker died of it ({how})"
+            message = f"{task.source.name}: the worker died of it ({how})"
             self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
             self._progress.advance(1)
 
@@ -234,11 +234,13 @@ def prepare_map(
                     message = f"{name} looks into more than {MAX_NEIGHBOURS} cells around one"
                     crowded.append(Failure(cell_id, name, message))
                 else:
-                    around[name] = tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in near)
+                    around[name] = tuple(
+                        Neighbour.of(catalogue.id(i), catalogue.source(i), catalogue.box(i)) for i in near
+                    )
             yield work.CellWork(
                 index,
                 cell_id,
-                catalogue.path(index),
+                catalogue.source(index),
                 catalogue.box(index),
                 catalogue.frame_id,
                 tuple(around),

@@ -66,7 +66,7 @@ PARTS = {
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
     },
-    "prepare": BASE | {"formats", "layers", "origin"},
+    "prepare": BASE | {"formats", "layers", "origin", "segment"},
     "service": BASE,
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
