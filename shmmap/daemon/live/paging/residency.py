@@ -32,7 +32,7 @@ from shmmap.daemon.live.paging.windows import Windows
 __all__ = ["REVIEW_S", "Residency"]
 
 RETRY_S: Final = 1.0
-"""How long after a file could not be read or written it is tried again."""
+"""How long after a file could not be read or written, or a scan needed the room, it is tried again."""
 REVIEW_S: Final = 0.1
 """How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
 IN_VAIN_S: Final = 1.0
@@ -130,7 +130,7 @@ class Residency:
         self._in_vain_s = dict.fromkeys(self._found, -math.inf)  # nor before that, unless a client moves
         self._reviewed = dict.fromkeys(self._found, _Short.NO)
         self._news = dict.fromkeys(self._found, 0)
-        self._save_s = self._near_s = -math.inf  # not before: a file could not be written, or read
+        self._save_s = self._near_s = -math.inf  # not before: a file could not be written, or loaded
         self.durability = Durability()
 
     def fits(self, more_bytes: int) -> bool:
@@ -474,6 +474,8 @@ class Residency:
             chunk.waiting = deque()
         else:
             self._note_missing(chunk.key)
+            if chunk.key in self.windows.near:  # a scan needed its room: it would soon be given up again
+                self._near_s = now_s + RETRY_S
         return chunk
 
     def next_event_s(self, now_s: float) -> float:
