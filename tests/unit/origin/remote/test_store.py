@@ -20,9 +20,12 @@ from pathlib import Path
 import pytest
 
 from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapDataError, MapMissing, Offline
+from tests.support.bucket_server import BucketServer
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.store import HASTY, Patience, Store, read_url
-from tests.support.bucket_server import BucketServer
 
 SOON = Patience(connect_s=0.5, read_s=0.3, retries=0, retry_s=0.5)
 
