@@ -253,7 +253,8 @@ def test_what_is_damaged_in_the_store_is_sent_again(shmmap: Shmmap, town: Divide
     for damaged in (store / "blobs/sha256").iterdir():
         damaged.write_bytes(b"")
     assert "has 0 bytes" in shmmap("publish", town.root, store, code=65)
-    assert shmmap.json("publish", town.root, store, "--resend")["sent_objects"] == 9
+    assert "--id-prefix" in shmmap("publish", town.root, store, "--resend", code=2)
+    assert shmmap.json("publish", town.root, store, "--resend", "--id-prefix", "/store/")["sent_objects"] == 9
     check(store, town)
     again = shmmap.json("publish", town.root, store)
     assert (again["changed"], again["version"]) == (False, 2)
