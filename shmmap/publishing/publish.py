@@ -36,6 +36,7 @@ from shmmap.origin.remote.map_versions import (
 )
 from shmmap.origin.remote.published_index import (
     EXACT,
+    MAX_ROOT_BYTES,
     LayerObjects,
     Root,
     Shard,
@@ -189,6 +190,13 @@ class _Run:
         result.objects = len(self._catalogue) * len(self._names)
         result.bytes = objects.nbytes
         unpacked = pack_root(self._root(side, self._send_shards(objects, side)))
+        if len(unpacked) > MAX_ROOT_BYTES:
+            raise MapDataError(
+                f"its index has {len(unpacked):,} bytes, more than {MAX_ROOT_BYTES:,}",
+                path=self._store.url,
+                cause="too_large",
+                hint="publish it as several maps",
+            )
         result.map_version = map_version_of(unpacked)
         is_same = before is not None and unpacked == pack_root(before)
         if seen.current is not None and is_same and not self._resend:
