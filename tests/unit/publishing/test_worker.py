@@ -12,6 +12,7 @@ from shmmap.layers import making
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
+from shmmap.layers.source_reader import Files
 from shmmap.layers.spec import layer_spec
 from tests.support.divided_map import DividedMap, make_map
 
@@ -56,7 +57,7 @@ def test_layers_prepared_before_come_out_of_the_cache(
         raise AssertionError("it is there already")
 
     monkeypatch.setattr(making, "derive", built)
-    monkeypatch.setattr(making, "build_points", built)
+    monkeypatch.setattr(Files, "fill", built)
     again = CellMaker(KnownObjects(""), cache).make(task)
     assert [layer.name for layer in again.layers] == [layer.name for layer in made.layers]
     assert [layer.frame for layer in again.layers] == [layer.frame for layer in made.layers]
