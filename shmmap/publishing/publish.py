@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishing a map: what is new of it is sent, and then all of it becomes the current version at once.
+
+Killed at any moment, the version that was current is whole; run again, what was sent is not sent again.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from hashlib import sha256
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing, error_from_wire
+from shmmap.failpoints import step
+from shmmap.layers.points import LAYER
+from shmmap.layers.spec import canonical_layers, layer_spec
+from shmmap.layers.versions import LayerVersions
+from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.remote.map_versions import (
+    CurrentState,
+    Entry,
+    add_version,
+    new_entry,
+    read_current,
+    read_root,
+    read_shards,
+)
+from shmmap.origin.remote.published_index import (
+    EXACT,
+    MAX_ROOT_BYTES,
+    LayerObjects,
+    Root,
+    Shard,
+    is_id_prefix,
+    map_version_of,
+    pack_root,
+    pack_shard,
+)
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.zstd_frame import pack_frame
+from shmmap.prepare.run import Failure, PrepareProgress, neighbours_of
+from shmmap.prepare.task_pool import TaskPool
+from shmmap.publishing.known_objects import write_known_objects
+from shmmap.publishing.messages import CellSent, CellToSend, NotSent, PublishSettings, decode_sent
+from shmmap.publishing.sending import send_object
+from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
+from shmmap.publishing.worker import TASKS_AHEAD
+
+__all__ = ["Published", "publish_map"]
+
+_LONGEST_S: Final = 86_400.0  # what a run reuses must not be as old as what pruning removes
+_SENT_AT_ONCE: Final = 16
+
+
+@dataclass(slots=True)
+class Published:
+    """What a run came to.
+
+    Attributes
+    ----------
+    version
+        The new version's number; None where nothing has changed or a layer could not be made.
+    current
+        The number of the version that is current now; 0 where there is none.
+    root
+        SHA-256 of the root's object.
+    objects, sent_objects, sent_bytes
+        Objects of the version's layers; what was sent: all objects, and their bytes.
+    bytes
+        Bytes of the objects of all layers.
+    """
+
+    cells: int
+    layers: tuple[str, ...]
+    id_prefix: str = ""
+    version: int | None = None
+    current: int = 0
+    map_version: int = 0
+    root: str = ""
+    objects: int = 0
+    sent_objects: int = 0
+    sent_bytes: int = 0
+    bytes: int = 0
+    failures: list[Failure] = field(default_factory=list)
+
+
+class _ShardRow(NamedTuple):
+    """What the root says of a shard."""
+
+    key: tuple[int, int]
+    cells: int
+    size: int
+    sha256: bytes
+
+
+def publish_map(
+    catalogue: Catalogue,
+    store: Store,
+    layers: Sequence[str],
+    *,
+    settings: PublishSettings,
+    id_prefix: str = "",
+    resend: bool = False,
+    workers: int,
+    progress: PrepareProgress,
+) -> Published:
+    """Publish a map, and make it current.
+
+    Parameters
+    ----------
+    store, settings
+        Where, and how workers open it; what is known there is filled in here.
+    layers
+        Specs of layers besides ``points``, in any form.
+    id_prefix
+        What ids begin with; empty: as before, at first ``/<last part of the URL>/``.
+    resend
+        Send every object again, as if none were there, and make that a version.
+    workers
+        How many processes make layers.
+
+    Returns
+    -------
+    What came of it.  With failures nothing was made current.
+
+    Raises
+    ------
+    BadRequest
+        A layer is unknown, the prefix is not that of the versions before, or the store takes nothing.
+    Offline, CannotWrite, MapDataError
+        The store does not answer or refuses; its current version is damaged; it took longer than a day.
+    InstanceBusy
+        Another publisher was quicker: its version is current.
+    """
+    if store.read_only:
+        raise BadRequest(f"{store.url}: {store.read_only}")
+    check_names(catalogue)
+    names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
+    return _Run(catalogue, store, names, progress, resend=resend).run(settings, id_prefix, max(1, workers))
+
+
+class _Run:
+    """One run: what it publishes, and what was current when it began."""
+
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        store: Store,
+        names: tuple[str, ...],
+        progress: PrepareProgress,
+        *,
+        resend: bool,
+    ) -> None:
+        self._catalogue = catalogue
+        self._store = store
+        self._names = names
+        self._progress = progress
+        self._resend = resend
+        self._began_s = time.monotonic()
+        self._seen: CurrentState = read_current(store)
+        self._before: Root | None = self._read_root()
+        self._shards: dict[tuple[int, int], tuple[bytes, int]] = {}  # before: key, content, row of the root
+        has_none = self._before is None and next(iter(store.list("blobs/")), None) is None
+        self._look = not (resend or has_none)
+        self._result = Published(len(catalogue), names)
+        if self._seen.current is not None:
+            self._result.current = self._seen.current.version
+
+    def run(self, settings: PublishSettings, id_prefix: str, workers: int) -> Published:
+        result, before, seen = self._result, self._before, self._seen
+        result.id_prefix = self._prefix(id_prefix)
+        side = shard_side(self._catalogue, len(self._names), before.shard_m if before is not None else None)
+        with tempfile.NamedTemporaryFile(prefix="shmmap-publish-") as known:
+            settings = msgspec.structs.replace(settings, is_first=not self._look)
+            if write_known_objects(known.name, self._known_layers()):
+                settings = msgspec.structs.replace(settings, known=known.name)
+            objects = self._send_cells(settings, workers)
+        if result.failures:
+            return result
+        result.objects = len(self._catalogue) * len(self._names)
+        result.bytes = objects.nbytes
+        unpacked = pack_root(self._root(side, self._send_shards(objects, side)))
+        if len(unpacked) > MAX_ROOT_BYTES:
+            raise MapDataError(
+                f"its index has {len(unpacked):,} bytes, more than {MAX_ROOT_BYTES:,}",
+                path=self._store.url,
+                cause="too_large",
+                hint="publish it as several maps",
+            )
+        result.map_version = map_version_of(unpacked)
+        is_same = before is not None and unpacked == pack_root(before)
+        if seen.current is not None and is_same and not self._resend:
+            result.root = seen.current.root
+            self._progress.done(len(self._catalogue))
+            return result
+        entry = self._send_root(unpacked)
+        add_version(self._store, entry, seen)
+        result.version = result.current = entry.version
+        self._progress.done(len(self._catalogue))
+        return result
+
+    # --- the version before ---------------------------------------------------------------------
+
+    def _read_root(self) -> Root | None:
+        if self._seen.current is None:
+            return None
+        try:
+            return read_root(self._store, self._seen.current)
+        except (MapMissing, MapDataError):
+            if self._resend:
+                return None
+            raise
+
+    def _prefix(self, wanted: str) -> str:
+        url = self._store.url
+        if wanted and not is_id_prefix(wanted):
+            raise BadRequest(f"ids cannot begin with {wanted!r}", hint="a prefix begins and ends with /")
+        if self._before is not None:
+            if wanted not in ("", self._before.id_prefix):
+                raise BadRequest(
+                    f"ids of the map at {url} begin with {self._before.id_prefix}, in all its versions",
+                    hint="publish to another URL for other ids",
+                )
+            return self._before.id_prefix
+        if not wanted and self._seen.current is not None:
+            raise BadRequest(
+                f"the current version at {url} cannot be read: what do its ids begin with?",
+                hint="name it: --id-prefix",
+            )
+        last = re.sub(r"[^\w.-]", "_", url.rpartition("/")[2]) or "map"
+        return wanted or f"/{last}/"
+
+    def _known_layers(self) -> Iterator[LayerObjects]:
+        """The objects of the version before, by shard and layer; none where all is sent again."""
+        root = self._before
+        if root is None or self._resend:
+            return
+        self._progress.stage("read the current version", root.cells)
+        for number, shard in enumerate(read_shards(self._store, root)):
+            row, column = root.keys[number].tolist()
+            self._shards[row, column] = sha256(pack_shard(shard)).digest(), number
+            self._progress.advance(len(shard))
+            yield from shard.layers.values()
+
+    # --- sending --------------------------------------------------------------------------------
+
+    def _send_cells(self, settings: PublishSettings, workers: int) -> CellObjects:
+        """Have the objects of all cells in the store; failures go into the result."""
+        catalogue, result = self._catalogue, self._result
+        objects = CellObjects(len(catalogue), self._names)
+        versions = LayerVersions(lambda: catalogue)
+
+        def tasks() -> Iterator[CellToSend]:
+            for index in range(len(catalogue)):
+                around, crowded = neighbours_of(catalogue, versions, index, self._names)
+                if crowded:
+                    result.failures.extend(crowded)
+                    self._progress.advance(1)
+                    continue
+                yield CellToSend(
+                    index,
+                    catalogue.id(index),
+                    catalogue.source(index),
+                    catalogue.box(index),
+                    catalogue.frame_id,
+                    tuple(around),
+                    tuple(around.values()),
+                )
+
+        def finished(task: CellToSend, done: CellSent | NotSent) -> None:
+            if isinstance(done, CellSent):
+                objects.set(task.number, done)
+                for layer in done.layers:
+                    self._count(layer.sent)
+            elif not done.layer:  # the store refuses: so it would each other cell
+                raise error_from_wire(done.code, done.message, done.hint)
+            else:
+                result.failures.append(Failure(task.cell_id, done.layer, done.message))
+            self._progress.advance(1)
+
+        def died(task: CellToSend, how: str) -> None:
+            message = f"{task.source.name}: the worker died of it ({how})"
+            result.failures.append(Failure(task.cell_id, ", ".join(task.layers), message))
+            self._progress.advance(1)
+
+        self._progress.stage("publish", len(catalogue))
+        pool: TaskPool[CellToSend, CellSent | NotSent] = TaskPool(
+            "shmmap.publishing.worker",
+            [msgspec.json.encode(settings).decode()],
+            workers=workers,
+            decode=decode_sent,
+            finished=finished,
+            died=died,
+            ahead=TASKS_AHEAD,
+        )
+        pool.run(tasks())
+        return objects
+
+    def _count(self, sent_bytes: int) -> None:
+        self._result.sent_objects += sent_bytes > 0
+        self._result.sent_bytes += sent_bytes
+
+    def _send_shards(self, objects: CellObjects, side: float) -> list[_ShardRow]:
+        """Send the shards that are new, and return what the root says of all."""
+        rows: list[_ShardRow] = []
+        self._progress.stage("index", len(self._catalogue))
+        divided = divide_into_shards(self._catalogue, objects, side)
+        with ThreadPoolExecutor(_SENT_AT_ONCE, "shard") as pool:
+            while some := list(itertools.islice(divided, _SENT_AT_ONCE)):
+                for row, sent_bytes in pool.map(self._send_shard, some):
+                    rows.append(row)
+                    self._count(sent_bytes)
+                    self._progress.advance(row.cells)
+        return rows
+
+    def _send_shard(self, keyed: tuple[tuple[int, int], Shard]) -> tuple[_ShardRow, int]:
+        key, shard = keyed
+        unpacked = pack_shard(shard)
+        content, number = self._shards.get(key, (b"", -1))
+        if self._before is not None and content == sha256(unpacked).digest():
+            size = int(self._before.sizes[number])
+            return _ShardRow(key, len(shard), size, self._before.shard_sha256(number)), 0
+        frame = pack_frame(unpacked)
+        digest = sha256(frame).digest()
+        step("publish.shard")
+        is_new = send_object(self._store, blob_path(digest), frame, look=self._look)
+        return _ShardRow(key, len(shard), len(frame), digest), len(frame) * is_new
+
+    def _root(self, side: float, rows: list[_ShardRow]) -> Root:
+        catalogue = self._catalogue
+        largest_x, largest_y = (catalogue.boxes[:, 2:] - catalogue.boxes[:, :2]).max(axis=0).tolist()
+        bounds = catalogue.bounds
+        assert bounds is not None  # noqa: S101  a catalogue without cells is not loaded
+        return Root(
+            id_prefix=self._result.id_prefix,
+            frame_id=catalogue.frame_id,
+            crs=catalogue.frame.crs,
+            origin=catalogue.frame.origin,
+            unit_m=catalogue.frame.unit_m,
+            encoding=EXACT,
+            cells=len(catalogue),
+            bounds=bounds,
+            shard_m=side,
+            largest_m=(largest_x, largest_y),
+            mean_m=catalogue.mean_size,
+            layers={name: layer_spec(name).builder_version for name in self._names},
+            keys=np.array([row.key for row in rows], np.int32),
+            counts=np.array([row.cells for row in rows], np.uint32),
+            sizes=np.array([row.size for row in rows], np.uint32),
+            hashes=np.frombuffer(b"".join(row.sha256 for row in rows), np.uint8).reshape(-1, 32),
+        )
+
+    def _send_root(self, unpacked: bytes) -> Entry:
+        frame = pack_frame(unpacked)
+        digest = sha256(frame).digest()
+        self._result.root = digest.hex()
+        step("publish.root")
+        self._count(len(frame) * send_object(self._store, blob_path(digest), frame, look=self._look))
+        if time.monotonic() - self._began_s > _LONGEST_S:
+            raise CannotWrite(
+                f"publishing to {self._store.url} took longer than a day: the version is not made current",
+                hint="run the same command again: what was sent within a day is not sent again",
+            )
+        step("version.entry")
+        return new_entry(self._store, self._result.root, len(frame), self._seen.current)
