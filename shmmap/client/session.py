@@ -103,8 +103,9 @@ class Session:
         self._waiting.append(queue)
 
     def stop_telling(self, queue: SimpleQueue[Any]) -> None:
-        """End `tell_when_lost`."""
-        self._waiting.remove(queue)
+        """End `tell_when_lost`; may be repeated."""
+        if queue in self._waiting:
+            self._waiting.remove(queue)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

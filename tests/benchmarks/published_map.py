@@ -94,8 +94,9 @@ def objects(paths: list[Path], repeats: int) -> bool:
         f"object        {share:6.1%} of raw  encode {mb / seconds['encode']:5.0f} MB/s"
         f"  verify, decode and write {mb / seconds['decode']:5.0f} MB/s"
     )
+    peer = sizes["pcd.zst"] / sizes["pcd"]
     print(
-        f"zstd of PCD   {sizes['pcd.zst'] / sizes['pcd']:6.1%}         encode {mb / seconds['zstd']:5.0f} MB/s"
+        f"zstd of PCD   {peer:6.1%} of PCD  encode {mb / seconds['zstd']:5.0f} MB/s"
         f"  verify, decode and write {mb / seconds['unzstd']:5.0f} MB/s, a PCD file"
     )
     print(f"limit {LIMIT:.0%}: {'held' if share <= LIMIT else 'NOT HELD'}")

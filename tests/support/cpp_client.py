@@ -48,12 +48,12 @@ FLAGS: Final = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wpedantic", "-
 _CELL_WORDS: Final = 9
 
 
-def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17") -> Path:
+def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17", optimize: str = "-Og") -> Path:
     """Compile the client with the sanitizers of addresses and of undefined behaviour."""
     program = folder / f"cpp_client.{compiler}.{standard}"
     subprocess.run(
         [
-            compiler, f"-std={standard}", "-Og", "-g1", "-fsanitize=address,undefined",
+            compiler, f"-std={standard}", optimize, "-g1", "-fsanitize=address,undefined",
             "-fno-sanitize-recover=all", *FLAGS, str(SOURCE), "-o", str(program),
         ],
         check=True,
@@ -234,7 +234,7 @@ class CppCells(_Answer):
     def __init__(self, program: CppProgram, lines: list[list[str]]) -> None:
         super().__init__(program, lines)
         self.cells = self.of("cell")
-        epoch, map_version, covered = self.words("answer")
+        epoch, map_version, covered, self.reason = self.words("answer")
         self.epoch, self.map_version, self.covered = int(epoch), int(map_version), covered == "1"
         self.removed_versions = {int(line[1]) for line in lines if line[0] == "removed_version"}
 

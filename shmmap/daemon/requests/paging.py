@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose list of cells comes in pages: who hears of those that have come, and which may go again."""
+"""A map whose list of cells comes in pages: what those that have come are for, and which may go again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MOST_RETIRED: Final = 20_000
 
 @dataclass(eq=False, slots=True)
 class Paging:
-    """Tells of pages that have come, or cannot be had, and drops those that nothing needs.
+    """Passes on which pages have come, or cannot be had, and drops those that nothing needs.
 
     A page is needed while there is a segment of one of its cells, a load, a pin, a request that is not
     answered yet, or a session whose area may have cells of it.  It is a chore of the serving loop.
@@ -46,6 +46,7 @@ class Paging:
     watched: WatchedDescriptors
     _fd: int = -1
     _coming_fd: int = -1
+    _was_out_of_reach: bool = False
     _rests_until_s: float = -math.inf
 
     @property
@@ -53,7 +54,7 @@ class Paging:
         return self.cache.catalogue.pages
 
     def follow(self) -> None:
-        """Hear of the pages of the map that is served from now on."""
+        """Follow the pages of the map that is served from now on."""
         self._stop_following_the_next()
         if self._fd >= 0:
             self.watched.unwatch(self._fd)
@@ -94,6 +95,9 @@ class Paging:
         if pages is None:
             return
         news = pages.collect()
+        if news.come and self._was_out_of_reach:  # what has failed for that may be had again
+            self.scheduler.loads.forget_failures()
+        self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
             self.adoption.pages_came(time.monotonic())
             if self.cache.layers.halo_m(self.cache.ledger.layers()):
