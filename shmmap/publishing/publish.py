@@ -270,7 +270,7 @@ class _Run:
                 yield CellToSend(
                     index,
                     catalogue.id(index),
-                    catalogue.path(index),
+                    catalogue.source(index),
                     catalogue.box(index),
                     catalogue.frame_id,
                     tuple(around),
@@ -289,7 +289,7 @@ class _Run:
             self._progress.advance(1)
 
         def died(task: CellToSend, how: str) -> None:
-            message = f"{task.path}: the worker died of it ({how})"
+            message = f"{task.source.name}: the worker died of it ({how})"
             result.failures.append(Failure(task.cell_id, ", ".join(task.layers), message))
             self._progress.advance(1)
 

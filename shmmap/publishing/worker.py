@@ -84,17 +84,17 @@ class CellMaker:
     def make(self, task: CellToSend) -> _Cell:
         """Make the objects of a cell's layers; `LayerRefused` where one cannot be made."""
         specs = [layer_spec(name) for name in task.layers]
-        source = CellPoints(task.path, task.box, specs)
+        source = CellPoints(task.source, task.box, specs)
         layers, headers = [], []
         for spec, around in zip(specs, task.around, strict=True):
-            job = CellJob(task.cell_id, task.path, task.box, task.frame_id, around)
+            job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around)
             header, layer = self._layer(spec, job, source)
             headers.append(header)
             layers.append(layer)
         states: set[SourceStamp] = {header.source for header in headers}
         if len(states) > 1:
             raise LayerRefused(
-                str(specs[0]), MapDataError.code, f"{task.path}: the file changed while it was read"
+                str(specs[0]), MapDataError.code, f"{task.source.name}: the file changed while it was read"
             )
         return _Cell(headers[task.layers.index(LAYER)], tuple(layers))
 
@@ -109,7 +109,7 @@ class CellMaker:
                     raise MapDataError(
                         f"{name} has {format_bytes(header.total_bytes)}, more than the"
                         f" {format_bytes(MAX_OBJECT_BYTES)} that a published layer of a cell may have",
-                        path=job.path,
+                        path=job.source.name,
                         cause="too_large",
                         hint="divide the map into smaller cells",
                     )
@@ -119,13 +119,13 @@ class CellMaker:
         except ShmmapError as error:
             raise LayerRefused(name, error.code, error.message, error.hint) from None
         except OSError as error:
-            message = f"{error.filename or job.path}: {error.strerror or error}"
+            message = f"{error.filename or job.source.name}: {error.strerror or error}"
             raise LayerRefused(name, MapDataError.code, message) from None
         except MemoryError:
-            message = f"{job.path}: building {name} ran out of memory"
+            message = f"{job.source.name}: building {name} ran out of memory"
             raise LayerRefused(name, MapDataError.code, message) from None
         except Exception as error:  # noqa: BLE001  a builder of another package, say
-            message = f"{job.path}: building {name} failed: {error!r}"
+            message = f"{job.source.name}: building {name} failed: {error!r}"
             raise LayerRefused(name, InternalError.code, message) from None
 
     def _object(self, segment: memoryview) -> _Layer:

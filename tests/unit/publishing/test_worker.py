@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.layers import making
-from shmmap.layers.derive import CellJob
+from shmmap.layers import making, source_reader
+from shmmap.layers.derive import CellJob, Neighbour
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
 from shmmap.layers.spec import layer_spec
+from shmmap.segment.source import Source
 from tests.support.divided_map import DividedMap, make_map
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -33,7 +34,9 @@ def town(tmp_path: Path) -> DividedMap:
 def task_of(town: DividedMap, layers: tuple[str, ...] = LAYERS) -> CellToSend:
     (name,) = town.corners
     specs = tuple(str(layer_spec(layer)) for layer in layers)
-    return CellToSend(0, town.id(name), town.id(name), town.box(name), "map", specs, tuple(() for _ in specs))
+    return CellToSend(
+        0, town.id(name), Source(town.id(name)), town.box(name), "map", specs, tuple(() for _ in specs)
+    )
 
 
 def test_layers_prepared_before_come_out_of_the_cache(
@@ -45,7 +48,7 @@ def test_layers_prepared_before_come_out_of_the_cache(
     cache.make()
     for layer in task.layers:
         fd = os.memfd_create("layer")
-        job = CellJob(task.cell_id, task.path, task.box, task.frame_id, ())
+        job = CellJob(task.cell_id, task.source, task.box, task.frame_id, ())
         make_layer(layer_spec(layer), job, fd, cache=cache, keep=True)
         os.close(fd)
 
@@ -53,7 +56,7 @@ def test_layers_prepared_before_come_out_of_the_cache(
         raise AssertionError("it is there already")
 
     monkeypatch.setattr(making, "derive", built)
-    monkeypatch.setattr(making, "build_points", built)
+    monkeypatch.setattr(source_reader, "build_points", built)
     again = CellMaker(KnownObjects(""), cache).make(task)
     assert [layer.name for layer in again.layers] == [layer.name for layer in made.layers]
     assert [layer.frame for layer in again.layers] == [layer.frame for layer in made.layers]
@@ -86,7 +89,7 @@ def test_a_file_that_changes_meanwhile_is_refused(town: DividedMap, monkeypatch:
 
 def test_a_file_that_is_gone_is_refused_by_its_name(town: DividedMap) -> None:
     task = task_of(town)
-    os.unlink(task.path)
+    os.unlink(task.source.name)
     with pytest.raises(LayerRefused) as refused:
         CellMaker(KnownObjects(""), None).make(task)
-    assert task.path in refused.value.message
+    assert task.source.name in refused.value.message
