@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.layers import making, source_reader
-from shmmap.layers.derive import CellJob, Neighbour
+from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
 from shmmap.layers.spec import layer_spec
