@@ -127,7 +127,7 @@ def newcomer(
     else:
         python = interpreter(request.param)
         if python is None and request.param == WHOLE:  # the README's line is tried on any Python
-            python = Path(sys._base_executable)
+            python = Path(sys.base_prefix) / "bin" / "python3"
         if python is None:
             pytest.skip(f"no {request.param} on PATH or in ~/.pyenv")
         script(programs / "python3", f'exec "{python}" "$@"')

@@ -214,17 +214,16 @@ def test_no_test_file_imports_another() -> None:
                 assert not (node.module or "").rsplit(".", 1)[-1].startswith("test_"), path
 
 
-def test_all_is_sorted_and_true() -> None:
-    """In one test: each process of pytest that runs a part of it would load half of the modules."""
-    for module in [*modules(), *modules(CLIENTS)]:
-        loaded = importlib.import_module(module)
-        names = getattr(loaded, "__all__", None)
-        if names is None:
-            assert source(module).name in {"__init__.py", "__main__.py"}, f"{module} has no __all__"
-            continue
-        assert len(set(names)) == len(names), module
-        for name in names:
-            assert hasattr(loaded, name), f"{module}.__all__ names {name}, which does not exist"
+@pytest.mark.parametrize("module", [*modules(), *modules(CLIENTS)])
+def test_all_is_sorted_and_true(module: str) -> None:
+    loaded = importlib.import_module(module)
+    names = getattr(loaded, "__all__", None)
+    if names is None:
+        assert source(module).name in {"__init__.py", "__main__.py"}, f"{module} has no __all__"
+        return
+    assert len(set(names)) == len(names)
+    for name in names:
+        assert hasattr(loaded, name), f"{module}.__all__ names {name}, which does not exist"
 
 
 def test_every_module_starts_with_its_licence() -> None:

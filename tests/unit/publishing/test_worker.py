@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.layers import making, source_reader
+from shmmap.layers import making
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
+from shmmap.layers.source_reader import Files
 from shmmap.layers.spec import layer_spec
-from shmmap.segment.source import Source
 from tests.support.divided_map import DividedMap, make_map
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -22,6 +22,7 @@ from shmmap.publishing import worker
 from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import CellToSend
 from shmmap.publishing.worker import CellMaker, LayerRefused
+from shmmap.segment.source import Source
 
 LAYERS = ("points", "sample(every=2)", "sample(count=50)")
 
@@ -56,7 +57,7 @@ def test_layers_prepared_before_come_out_of_the_cache(
         raise AssertionError("it is there already")
 
     monkeypatch.setattr(making, "derive", built)
-    monkeypatch.setattr(source_reader, "build_points", built)
+    monkeypatch.setattr(Files, "fill", built)
     again = CellMaker(KnownObjects(""), cache).make(task)
     assert [layer.name for layer in again.layers] == [layer.name for layer in made.layers]
     assert [layer.frame for layer in again.layers] == [layer.frame for layer in made.layers]
