@@ -182,15 +182,18 @@ class ShardPages:
 
     def want(self, pages: Iterable[int], priority: float) -> None:
         """Have pages fetched, those with the lowest priority first."""
+        absent = []
         for number in pages:
             page = self._here.pop(number, None)
             if page is not None:
                 self._here[number] = page
-            elif number not in self._lost and priority < self._wanted.get(number, np.inf):
+                continue
+            absent.append(number)
+            if number not in self._lost and priority < self._wanted.get(number, np.inf):
                 self._wanted[number] = priority
                 self._fetcher.want(self, self.root, number, priority)
-        if self._here:
-            x, y = self._boxes[next(reversed(self._here)), :2].tolist()
+        if absent:
+            x, y = self._boxes[absent, :2].mean(axis=0).tolist()
             self._around = x, y
 
     def deliver(self, number: int, shard: Shard | None) -> None:
