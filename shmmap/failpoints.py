@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 from typing import Final
 
-__all__ = ["CLIENT_STEPS", "DAEMON_STEPS", "LIVE_STEPS", "WORKER_STEPS", "step"]
+__all__ = ["CLIENT_STEPS", "DAEMON_STEPS", "LIVE_STEPS", "ORIGIN_STEPS", "WORKER_STEPS", "step"]
 
 WORKER_STEPS: Final = (
     "worker.alloc",
@@ -54,6 +54,22 @@ LIVE_STEPS: Final = (
     "live.renamed",
     "live.flushed",
 )
+ORIGIN_STEPS: Final = (
+    "publish.send",
+    "publish.shard",
+    "publish.root",
+    "version.entry",
+    "version.switch",
+    "version.switched",
+    "restore.entry",
+    "restore.looked",
+    "prune.entry",
+    "prune.listed",
+    "prune.object",
+    "fetch.cell",
+    "fetch.whole",
+    "fetch.renamed",
+)
 CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.map")
 
 
@@ -64,7 +80,7 @@ def _untouched(label: str) -> None:
 def _parsed(wanted: str) -> tuple[str, int, str]:
     label, _, rest = wanted.partition(":")
     number, _, file = rest.partition(":")
-    if label not in {*WORKER_STEPS, *DAEMON_STEPS, *LIVE_STEPS, *CLIENT_STEPS}:
+    if label not in {*WORKER_STEPS, *DAEMON_STEPS, *LIVE_STEPS, *ORIGIN_STEPS, *CLIENT_STEPS}:
         raise ValueError(f"SHMMAP_TEST_CRASH, SHMMAP_TEST_DEFECT: there is no step {label!r}")
     return label, int(number or 1), file
 

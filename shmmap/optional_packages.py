@@ -14,7 +14,7 @@ __all__ = ["needed_packages"]
 _PACKAGES: Final = {"lzf": "python-neo-lzf", "yaml": "PyYAML", "zmq": "pyzmq", "open3d": "open3d-cpu"}
 """Packages that are not called as the module they bring."""
 
-_OPTIONAL: Final = frozenset({"cyclonedds", "laspy", "pyopencl", "tifffile", "zstandard"})
+_OPTIONAL: Final = frozenset({"cyclonedds", "laspy", "obstore", "pyopencl", "tifffile", "zstandard"})
 """Packages that no ordinary install brings: `project.optional-dependencies`."""
 
 _OURS: Final = ("shmmap", "shmmap_clients")

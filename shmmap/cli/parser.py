@@ -18,6 +18,9 @@ VERBS: Final = {
     "divide": "divide",
     "merge": "merge",
     "prepare": "prepare",
+    "publish": "publish",
+    "versions": "versions",
+    "fetch": "fetch",
     "live": "live.group",
     "serve": "serve",
     "status": "status",
@@ -58,7 +61,7 @@ Exit codes, of every verb:
   70   internal error: a defect in shmmap
   71   the daemon cannot start now: something is full, missing or in its way
   73   an output cannot be written
-  75   another process runs this instance, or makes this output
+  75   another process runs this instance, or makes this output; a map's store does not answer
   76   daemon and client speak different protocol versions
   78   a mistake in the settings
   130  interrupted (128 + signal)

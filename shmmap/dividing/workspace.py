@@ -32,6 +32,13 @@ _AT_FDCWD: Final = -100  # fcntl.h
 class Workspace:
     """A hidden directory beside ``out``, held by this process alone.
 
+    Parameters
+    ----------
+    doing
+        What is done there: a part of its name.
+    keep_failed
+        A run that failed, not only one that was interrupted, can be resumed.
+
     Attributes
     ----------
     path
@@ -40,10 +47,11 @@ class Workspace:
         The directory in it that becomes ``out``.
     """
 
-    def __init__(self, out: str) -> None:
+    def __init__(self, out: str, doing: str = "dividing", *, keep_failed: bool = False) -> None:
         parent, name = os.path.split(out)
         self.out = out
-        self.path = os.path.join(parent, f".{name}.dividing")
+        self.path = os.path.join(parent, f".{name}.{doing}")
+        self._keep_failed = keep_failed
         self.content = os.path.join(self.path, "map")
         with writing_errors(self.path):
             os.makedirs(parent, exist_ok=True)
@@ -72,8 +80,9 @@ class Workspace:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # an interrupted run can be resumed; one that failed would fail again
-        if error is None or isinstance(error, Exception) or self.state() is None:
+        # an interrupted run can be resumed; one that failed at its input would fail again
+        failed = isinstance(error, Exception) and not self._keep_failed
+        if error is None or failed or self.state() is None:
             self.remove()
         os.close(self._lock)
 

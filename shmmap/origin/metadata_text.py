@@ -14,12 +14,14 @@ METADATA_NAME: Final = "pointcloud_map_metadata.yaml"
 _PLAIN_KEY: Final = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.+-]*")
 
 
-def metadata_text(size: str, entries: Iterable[tuple[str, tuple[str, str]]]) -> str:
+def metadata_text(size: str, entries: Iterable[tuple[str, tuple[str, str]]], size_y: str = "") -> str:
     """Return the file for cells of ``size`` metres, entries being (file name, (x, y) of the corner).
+
+    Cells that are not square have ``size_y`` along y.
 
     Numbers come as text, so that whole ones stay integers; names are quoted where YAML needs it.
     """
-    lines = [f"{axis}_resolution: {size}\n" for axis in "xy"]
+    lines = [f"x_resolution: {size}\n", f"y_resolution: {size_y or size}\n"]
     for name, corner in sorted(entries):
         key = name if _PLAIN_KEY.fullmatch(name) else json.dumps(name, ensure_ascii=False)
         lines.append(f"{key}: [{', '.join(corner)}]\n")

@@ -17,6 +17,7 @@ import xxhash
 
 from shmmap.errors import ShmmapError
 from shmmap.layers.cache_key import CacheKey
+from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob, combined_digest
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import cache_key, make_layer
@@ -27,7 +28,7 @@ from shmmap.prepare import work
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
 
-__all__ = ["main"]
+__all__ = ["CellPoints", "main"]
 
 _NICENESS: Final = 5
 _BLOCK_BYTES: Final = 1 << 20
@@ -54,17 +55,18 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
             if cache.recognise(key, _content(job, digests)):
                 done[str(spec)] = work.LayerDone(str(spec), "recognised", cache.size_of(key))
                 missing.remove(entry)
-    source = _Source(task, [spec for spec, _, _ in missing])
+    source = CellPoints(task.path, task.box, [spec for spec, _, _ in missing])
     for spec, job, _ in missing:
         done[str(spec)] = _build(spec, job, cache, source)
     return work.CellDone(task.number, tuple(done[name] for name in task.layers))
 
 
-class _Source:
+class CellPoints:
     """The cell's points, read when first asked for, with the columns that all layers need together."""
 
-    def __init__(self, task: work.CellWork, specs: list[LayerSpec]) -> None:
-        self._task = task
+    def __init__(self, path: str, box: Box, specs: list[LayerSpec]) -> None:
+        self._path = path
+        self._box = box
         self._read: CellSource | None = None
         needs = [spec.source_columns for spec in specs if spec.kind.name != LAYER]
         self._needs: tuple[str, ...] | None = (
@@ -74,7 +76,7 @@ class _Source:
     def points(self, spec: LayerSpec) -> CellSource:
         """The columns that one layer takes: exactly those, whatever the others need."""
         if self._read is None:
-            self._read = read_source(self._task.path, self._task.box, self._needs)
+            self._read = read_source(self._path, self._box, self._needs)
         names = spec.source_columns
         table = self._read.points
         columns = {n: c for n, c in table.columns.items() if names is None or n in names}
@@ -82,7 +84,7 @@ class _Source:
         return replace(self._read, points=replace(table, columns=columns, units=units))
 
 
-def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: _Source) -> work.LayerDone:
+def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints) -> work.LayerDone:
     name = str(spec)
     try:
         fd = os.memfd_create("layer", os.MFD_CLOEXEC)

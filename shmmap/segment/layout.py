@@ -44,7 +44,7 @@ COLUMNS_OFFSET: Final = 512
 TAIL_BYTES: Final = 72  # header CRC, padding, publish block
 MAX_DIMENSIONS: Final = 4
 COLUMN: Final = struct.Struct("<40s8s16sII4QQQQ")
-_TOKEN: Final = struct.Struct("<3q")
+_TOKEN: Final = struct.Struct("<Qqq")  # a size is not negative; the first 8 bytes of a hash may be any
 
 
 class SourceStamp(NamedTuple):

@@ -15,6 +15,7 @@ from shmmap.testing.fixtures import judged_daemons
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_daemon import SETTINGS, LiveDaemon
+from tests.support.map_stores import _buckets, buckets, web  # noqa: F401  fixtures
 from tests.support.raw_client import RawClient
 
 RESOLUTION = 0.2  # that of ``live_drive``, which compiles kernels: before pytest has said where they are kept

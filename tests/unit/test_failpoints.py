@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 import shmmap
-from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, LIVE_STEPS, WORKER_STEPS
+from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, LIVE_STEPS, ORIGIN_STEPS, WORKER_STEPS
 
-EVERY = (*WORKER_STEPS, *DAEMON_STEPS, *LIVE_STEPS, *CLIENT_STEPS)
+EVERY = (*WORKER_STEPS, *DAEMON_STEPS, *LIVE_STEPS, *ORIGIN_STEPS, *CLIENT_STEPS)
 PROGRAM = """
 import sys
 from shmmap.failpoints import step

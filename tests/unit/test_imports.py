@@ -67,6 +67,7 @@ PARTS = {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
     },
     "prepare": BASE | {"formats", "layers", "origin"},
+    "publishing": BASE | {"dividing", "formats", "layers", "origin", "prepare", "segment"},
     "service": BASE,
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
@@ -81,8 +82,8 @@ PARTS = {
     },
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
-        "segment", "service", "statistics", "daemon.config", "daemon.config_file", "daemon.config_live",
-        "daemon.live.disk",
+        "publishing", "segment", "service", "statistics", "daemon.config", "daemon.config_file",
+        "daemon.config_live", "daemon.live.disk",
         "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip
@@ -95,7 +96,19 @@ ROOMS = [
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 
 CLIENT_PACKAGES = {"numpy", "zmq", "posix_ipc", "msgspec"}
-HEAVY = {"open3d", "numba", "laspy", "scipy", "rich", "yaml", "xxhash", "lzf", "pandas", "matplotlib"}
+HEAVY = {
+    "obstore",
+    "open3d",
+    "numba",
+    "laspy",
+    "scipy",
+    "rich",
+    "yaml",
+    "xxhash",
+    "lzf",
+    "pandas",
+    "matplotlib",
+}
 
 
 def modules(package: Path = PACKAGE) -> list[str]:

@@ -21,6 +21,7 @@ CONTRACT += ["config", "unit", "doctor", "cpp"]
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
 CONTRACT += ["divide", "merge", "prepare", "live"]
 CONTRACT += ["top", "tail", "map", "metrics"]
+CONTRACT += ["publish", "versions", "fetch"]
 
 
 def parse(*words: str) -> argparse.Namespace:

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap fetch URL DIR``: a published map back into files."""
+
+from __future__ import annotations
+
+import argparse
+
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
+from shmmap.cli.screens.output import counted, format_bytes, format_duration, print_json, print_pairs
+from shmmap.cli.store_options import URL_HELP, add_store_options, store_at
+
+__all__ = ["add_parser", "run"]
+
+_EPILOG = """\
+Every object is compared with its hash.  DIR appears complete or not at all; a stopped run, started again,
+fetches only what is missing.
+JSON (fields may be added, none is removed):
+  {"url", "path", "version", "map_version": hex, "cells", "points", "fetched_cells", "fetched_bytes",
+   "seconds"}
+Exit code: 0, 2 wrong usage or DIR exists, 65 an object is damaged, 66 no such map or version, or an object
+is gone, 69 a package is missing, 73 DIR cannot be written, 75 the store does not answer or refuses, or
+another run is making DIR, 78 unusable credentials."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "fetch",
+        run,
+        help="write a published map as a divided map",
+        description="Write a published map as a divided map, which `serve` and Autoware read.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("url", metavar="URL", help=URL_HELP)
+    parser.add_argument("out", metavar="DIR", help="the map directory to make")
+    parser.add_argument("--at", metavar="N", type=at_least(1), help="version N instead of the current one")
+    parser.add_argument("--force", action="store_true", help="replace a divided map that exists")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_store_options(parser)
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fetch, with progress on stderr."""
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+
+    store = store_at(args.url, args)
+    from shmmap.publishing.fetch import fetch_map
+
+    began_s = time.monotonic()
+    progress = StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0)
+    made = fetch_map(store, args.out, version=args.at, force=args.force, progress=progress)
+    seconds = time.monotonic() - began_s
+    if args.json:
+        print_json(
+            {
+                "url": store.url,
+                "path": made.path,
+                "version": made.version,
+                "map_version": f"{made.map_version:016x}",
+                "cells": made.cells,
+                "points": made.points,
+                "fetched_cells": made.fetched_cells,
+                "fetched_bytes": made.fetched_bytes,
+                "seconds": seconds,
+            }
+        )
+        return 0
+    print_pairs(
+        [
+            ("map", f"{made.path}, {counted(made.cells, 'cell')}, {made.points:,} points"),
+            ("version", f"{made.version} of {store.url}"),
+            ("fetched", f"{counted(made.fetched_cells, 'cell')}, {format_bytes(made.fetched_bytes)}"),
+            ("time", format_duration(seconds)),
+        ]
+    )
+    return 0

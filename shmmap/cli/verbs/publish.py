@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap publish MAP URL``: a map into a bucket or a directory, for vehicles to fetch."""
+
+from __future__ import annotations
+
+import argparse
+
+from shmmap.cli.options import (
+    Subparsers,
+    add_json_option,
+    add_layer_option,
+    add_unit_options,
+    add_verb,
+    at_least,
+)
+from shmmap.cli.screens.output import (
+    counted,
+    format_bytes,
+    format_duration,
+    print_json,
+    print_line,
+    print_pairs,
+)
+from shmmap.cli.store_options import add_store_options, store_at
+
+__all__ = ["add_parser", "run"]
+
+_SHOWN_FAILURES = 20
+
+_EPILOG = """\
+URL is s3://BUCKET/PATH, gs://BUCKET/PATH, az://CONTAINER/PATH, file:///DIR or a directory, which any web
+server can serve.  Credentials come from the environment, from $CREDENTIALS_DIRECTORY, or from a profile.
+Only what the current version does not have is sent.  The new version becomes current at once, at the end; a
+stopped run, started again, sends only what is missing.
+JSON (fields may be added, none is removed):
+  {"map", "url", "changed", "version": the current one, "map_version": hex, "root": hash of its object,
+   "cells", "layers": [spec], "id_prefix", "objects": layers of cells, "bytes": of their objects,
+   "sent_objects", "sent_bytes", "seconds", "failed": [{"id", "layer", "message"}]}
+Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
+or damaged version, 66 no map or bucket, 69 a package is missing, 73 cannot write, 75 the store does not
+answer or refuses, or another publisher was quicker, 78 unusable credentials."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "publish",
+        run,
+        help="publish a map in a bucket or a directory",
+        description="Publish a map in a bucket or a directory, from where vehicles fetch what they need.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
+    parser.add_argument("url", metavar="URL", help="where to publish it")
+    add_layer_option(parser, "layers to publish besides points, such as 'ndt(leaf=2.0)'")
+    parser.add_argument(
+        "--id-prefix",
+        metavar="PREFIX",
+        default="",
+        help="what cell ids begin with, in all versions (default: /<last part of URL>/)",
+    )
+    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
+    parser.add_argument(
+        "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
+    )
+    add_unit_options(parser)
+    parser.add_argument(
+        "--resend",
+        action="store_true",
+        help="send every object again, also those that should be there: repairs a damaged store",
+    )
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=at_least(0),
+        default=0,
+        help="number of processes (default: one for each core)",
+    )
+    parser.add_argument(
+        "--cache-dir", metavar="DIR", default="", help="where layers made by `shmmap prepare` are kept"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_store_options(parser)
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Publish, with progress on stderr."""
+    import os
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.dividing.served_cloud import find_origin
+    from shmmap.layers.spec import canonical_layers
+    from shmmap.origin.sidecar import default_cache_directory
+
+    store = store_at(args.url, args)
+    from shmmap.publishing.messages import PublishSettings
+    from shmmap.publishing.publish import publish_map
+
+    layers = canonical_layers(args.layer) if args.layer else ()
+    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    began_s = time.monotonic()
+    origin = find_origin(
+        args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir,
+        unit=args.unit or "", vertical_unit=args.vertical_unit or "",
+    )  # fmt: skip
+    done = publish_map(
+        origin.load(fresh=True),
+        store,
+        layers,
+        settings=PublishSettings(
+            store.url,
+            args.insecure_http,
+            args.instance_credentials,
+            cache_dir if os.path.isdir(os.path.join(cache_dir, "layers")) else "",
+        ),
+        id_prefix=args.id_prefix,
+        workers=args.workers or len(os.sched_getaffinity(0)),
+        resend=args.resend,
+        progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+    )
+    seconds = time.monotonic() - began_s
+    if args.json:
+        print_json(
+            {
+                "map": origin.path,
+                "url": store.url,
+                "changed": done.version is not None,
+                "version": done.current,
+                "map_version": f"{done.map_version:016x}",
+                "root": done.root,
+                "cells": done.cells,
+                "layers": list(done.layers),
+                "id_prefix": done.id_prefix,
+                "objects": done.objects,
+                "bytes": done.bytes,
+                "sent_objects": done.sent_objects,
+                "sent_bytes": done.sent_bytes,
+                "seconds": seconds,
+                "failed": [
+                    {"id": one.cell_id, "layer": one.layer, "message": one.message} for one in done.failures
+                ],
+            }
+        )
+        return 1 if done.failures else 0
+    for failure in done.failures[:_SHOWN_FAILURES]:
+        print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
+    if done.failures:
+        if len(done.failures) > _SHOWN_FAILURES:
+            print_line(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
+        print_line("nothing is published: the current version stays as it was")
+        return 1
+    changed = "" if done.version is not None else ": nothing has changed"
+    print_pairs(
+        [
+            ("map", f"{origin.path}, {counted(done.cells, 'cell')}"),
+            ("url", store.url),
+            ("version", f"{done.current}{changed}"),
+            ("layers", " ".join(done.layers)),
+            ("ids", f"{done.id_prefix}..."),
+            ("size", format_bytes(done.bytes)),
+            ("sent", f"{counted(done.sent_objects, 'object')}, {format_bytes(done.sent_bytes)}"),
+            ("time", format_duration(seconds)),
+        ]
+    )
+    return 0

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap versions URL``: the versions of a published map; going back to one, removing old ones."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
+from shmmap.cli.screens.output import (
+    Column,
+    counted,
+    format_bytes,
+    print_json,
+    print_line,
+    print_pairs,
+    print_table,
+)
+from shmmap.cli.store_options import URL_HELP, add_store_options, store_at
+
+if TYPE_CHECKING:
+    from shmmap.origin.remote.store import Store
+
+__all__ = ["add_parser", "run"]
+
+_EPILOG = """\
+--rollback gives an old version's content a new number: vehicles never go back to a lower one.
+JSON (fields may be added, none is removed):
+  {"url", "current": number, "versions": [{"version", "state": "current", "earlier" or "never served",
+   "created": RFC 3339, "root": hash, "bytes": of the root, "before", "restored": the version whose content
+   it has again, or 0}]}, the latest first; a web server cannot list those that were never served
+  --rollback: {"url", "changed", "version": the current one, "restored", "objects": that were looked for}
+  --prune: {"url", "versions": [number], "objects", "bytes", "kept_versions": [number], "kept_objects",
+   "kept_bytes"}
+Exit code: 0, 2 wrong usage, 65 damaged, 66 no such map or version, 69 a package is missing, 75 the store
+does not answer or refuses, or another publisher was quicker, 78 unusable credentials."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "versions",
+        run,
+        help="list a published map's versions, go back to one, remove old ones",
+        description="List the versions of a published map, go back to one, or remove old ones.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("url", metavar="URL", help=URL_HELP)
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument(
+        "--rollback", metavar="N", type=at_least(1), help="make the content of version N current again"
+    )
+    what.add_argument(
+        "--prune",
+        action="store_true",
+        help="remove versions that have not been current for --keep days, and what only they have",
+    )
+    parser.add_argument(
+        "--keep", metavar="DAYS", type=_days, default=None, help="with --prune: 7 or more (default: 30)"
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_store_options(parser)
+    add_json_option(parser)
+
+
+def _days(text: str) -> float:
+    try:
+        days = float(text)
+    except ValueError:
+        days = -1.0
+    if not 7 <= days < 1e6:
+        raise argparse.ArgumentTypeError(f"expected days, 7 or more, not {text!r}")
+    return days
+
+
+def run(args: argparse.Namespace) -> int:
+    """List, restore or prune."""
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.errors import BadRequest
+
+    if args.keep is not None and not args.prune:
+        raise BadRequest("--keep goes with --prune")
+    store = store_at(args.url, args)
+    unit = "objects" if args.prune else "cells"
+    progress = StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
+    if args.rollback is not None:
+        from shmmap.publishing.restore import restore_version
+
+        restored = restore_version(store, args.rollback, progress)
+        if args.json:
+            print_json(
+                {
+                    "url": store.url,
+                    "changed": restored.version is not None,
+                    "version": restored.current,
+                    "restored": restored.restored,
+                    "objects": restored.objects,
+                }
+            )
+        elif restored.version is None:
+            print_line(f"version {restored.current} has that content: nothing has changed")
+        else:
+            print_line(f"version {restored.version} is current: the content of version {restored.restored}")
+        return 0
+    if args.prune:
+        from shmmap.publishing.prune import KEEP_DAYS, prune_versions
+
+        pruned = prune_versions(
+            store, keep_days=KEEP_DAYS if args.keep is None else args.keep, progress=progress
+        )
+        if args.json:
+            from dataclasses import asdict
+
+            print_json({"url": store.url, **asdict(pruned)})
+            return 0
+        removed = f"{counted(pruned.objects, 'object')}, {format_bytes(pruned.bytes)}"
+        kept = f"{counted(pruned.kept_objects, 'object')}, {format_bytes(pruned.kept_bytes)}"
+        print_pairs(
+            [
+                ("removed", f"{_numbers(pruned.versions)}; {removed}"),
+                ("kept", f"{_numbers(pruned.kept_versions)}; {kept}"),
+            ]
+        )
+        return 0
+    _list(store, as_json=args.json)
+    return 0
+
+
+def _numbers(versions: list[int]) -> str:
+    return f"versions {', '.join(map(str, versions))}" if versions else "no version"
+
+
+def _list(store: Store, *, as_json: bool) -> None:
+    from shmmap.errors import MapMissing
+    from shmmap.origin.remote.map_versions import (
+        earlier_versions,
+        list_entries,
+        read_entry,
+        require_current,
+    )
+
+    current = require_current(store)
+    entries = {entry.version: entry for entry in earlier_versions(store, current)}
+    states = {version: "current" if version == current.version else "earlier" for version in entries}
+    if not store.read_only:
+        import contextlib
+
+        for version in list_entries(store):
+            if version not in entries:
+                with contextlib.suppress(MapMissing):  # pruned in this moment
+                    entries[version] = read_entry(store, version)
+                    states[version] = "never served"
+    ordered = sorted(entries.values(), key=lambda entry: -entry.version)
+    if as_json:
+        print_json(
+            {
+                "url": store.url,
+                "current": current.version,
+                "versions": [
+                    {
+                        "version": entry.version,
+                        "state": states[entry.version],
+                        "created": entry.created,
+                        "root": entry.root,
+                        "bytes": entry.bytes,
+                        "before": entry.before,
+                        "restored": entry.restored,
+                    }
+                    for entry in ordered
+                ],
+            }
+        )
+        return
+    print_table(
+        [
+            Column("version", "right"),
+            Column("state"),
+            Column("created"),
+            Column("root"),
+            Column("content of"),
+        ],
+        [
+            (
+                str(entry.version),
+                states[entry.version],
+                entry.created[:19].replace("T", " ") + " UTC",
+                entry.root[:12],
+                f"version {entry.restored}" if entry.restored else "",
+            )
+            for entry in ordered
+        ],
+    )

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A published map in a bucket (S3, Google, Azure) or behind a web server, by obstore.
+
+What obstore says of an error may hold a URL with what signs it: of that only the kind and the HTTP status
+go into our messages.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from typing import Any, Final, TypeVar, cast
+
+from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
+from shmmap.optional_packages import needed_packages
+from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
+from shmmap.origin.remote.store import WEB_SCHEMES, Listed, Patience, StoreUrl, Tag, is_loopback
+from shmmap.origin.remote.zstd_frame import DAMAGED
+
+with needed_packages("a map in a bucket or at a web server"):
+    import obstore
+    from obstore import exceptions
+    from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
+
+__all__ = ["BucketStore"]
+
+_Answer = TypeVar("_Answer")
+
+_IMMUTABLE: Final = {
+    "Cache-Control": "public, max-age=31536000, immutable",
+    "Content-Type": "application/zstd",
+}
+_CHANGES: Final = {"Cache-Control": "no-cache", "Content-Type": "application/json"}
+_STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([45]\d\d)")
+_CLOCK: Final = "are the credentials valid, and is the clock right?"
+_LISTED_AT_ONCE: Final = 1000
+
+
+class BucketStore:
+    """A `shmmap.origin.remote.store.Store` below a URL; `opened_store.open_store` makes it."""
+
+    def __init__(
+        self, where: StoreUrl, *, patience: Patience, insecure_http: bool, instance_credentials: bool
+    ) -> None:
+        self.url = where.text
+        self._scheme = where.scheme
+        self.read_only = (
+            "a web server takes nothing: publish to its directory, or to the bucket behind it"
+            if where.scheme in WEB_SCHEMES
+            else ""
+        )
+        self._store = _opened(where, patience, insecure=insecure_http, instance=instance_credentials)
+
+    # --- reading --------------------------------------------------------------------------------
+
+    def get(self, path: str, max_bytes: int) -> memoryview:
+        """Return a whole object."""
+        return self._read(path, max_bytes)[0]
+
+    def get_exactly(self, path: str, nbytes: int) -> memoryview:
+        """Return an object of so many bytes."""
+        return self._read(path, nbytes, exact=True)[0]
+
+    def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
+        """Return a whole object, and its ETag."""
+        return self._read(path, max_bytes)
+
+    def _read(self, path: str, max_bytes: int, *, exact: bool = False) -> tuple[memoryview, Tag]:
+        def read() -> tuple[Any, Tag]:
+            result = obstore.get(self._store, path)
+            meta = result.meta
+            size = meta["size"]
+            if size > max_bytes or (exact and size != max_bytes):
+                limit = f"not {max_bytes:,}" if exact else f"at most {max_bytes:,} are read"
+                raise MapDataError(f"it has {size:,} bytes, {limit}", path=self._name(path), cause=DAMAGED)
+            named = {key: meta[key] for key in ("e_tag", "version") if meta[key] is not None}
+            return result.bytes(), named
+
+        data, tag = self._ask(path, read)
+        return memoryview(data), tag
+
+    def head(self, path: str) -> Listed | None:
+        """Return an object's size and age."""
+        try:
+            meta = self._ask(path, lambda: obstore.head(self._store, path))
+        except MapMissing:
+            return None
+        return Listed(path, meta["size"], meta["last_modified"].timestamp())
+
+    def list(self, prefix: str) -> Iterator[Listed]:
+        """All objects below a prefix."""
+        self._refuse_if_read_only()
+        stream = self._ask(
+            prefix, lambda: obstore.list(self._store, prefix.rstrip("/"), chunk_size=_LISTED_AT_ONCE)
+        )
+        chunks = iter(stream)
+        while (chunk := self._ask(prefix, lambda: next(chunks, None))) is not None:
+            for meta in chunk:
+                yield Listed(meta["path"], meta["size"], meta["last_modified"].timestamp())
+
+    # --- writing --------------------------------------------------------------------------------
+
+    def put(self, path: str, data: bytes) -> None:
+        """Write an object that never changes."""
+        self._put(path, data, None, _IMMUTABLE)
+
+    def put_new(self, path: str, data: bytes) -> bool:
+        """Write an object that is not there yet."""
+        try:
+            self._put(path, data, "create", _CHANGES)
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
+            return self._has(path, data)
+        return True
+
+    def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
+        """Replace the state of an object that ``tag`` names."""
+        wanted = dict(tag)
+        if self._scheme == "s3":
+            wanted["e_tag"] = wanted["e_tag"].strip('"')  # Ceph's gateway knows no other; Amazon's takes both
+        try:
+            self._put(path, data, wanted, _CHANGES)
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError, MapMissing):
+            return self._has(path, data)
+        return True
+
+    def _has(self, path: str, data: bytes) -> bool:
+        """Whether an object is what was to be written: the answer to a first try may have been lost."""
+        try:
+            return bytes(self.get(path, len(data))) == data
+        except (MapMissing, MapDataError):
+            return False
+
+    def _put(self, path: str, data: bytes, mode: Any, attributes: dict[str, str]) -> None:
+        self._refuse_if_read_only()
+        self._ask(
+            path,
+            lambda: obstore.put(
+                self._store, path, data, mode=mode, attributes=attributes, use_multipart=False
+            ),
+            conditional=mode is not None,
+        )
+
+    def delete(self, path: str) -> None:
+        """Remove an object."""
+        self._refuse_if_read_only()
+        try:
+            self._ask(path, lambda: obstore.delete(self._store, path))
+        except MapMissing:
+            return
+
+    def _refuse_if_read_only(self) -> None:
+        if self.read_only:
+            raise BadRequest(f"{self.url}: {self.read_only}")
+
+    # --- errors ---------------------------------------------------------------------------------
+
+    def _name(self, path: str) -> str:
+        return f"{self.url}/{path}"
+
+    def _ask(self, path: str, ask: Callable[[], _Answer], *, conditional: bool = False) -> _Answer:
+        """Ask obstore, and make its errors ours; refused conditions stay what they are where one was set."""
+        try:
+            return ask()
+        except (exceptions.NotFoundError, FileNotFoundError) as error:
+            if "<Code>NoSuchBucket</Code>" in str(error):
+                raise MapMissing(f"{self.url}: there is no such bucket") from None
+            raise MapMissing(f"{self._name(path)} is not there") from None
+        except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
+            if conditional:
+                raise
+            raise Offline(f"{self._name(path)}: refused (status 412)") from None
+        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError):
+            raise Offline(f"{self._name(path)}: refused, no permission", hint=_CLOCK) from None
+        except (exceptions.BaseError, OSError) as error:
+            found = _STATUS.search(str(error))
+            if found is None:
+                raise Offline(f"{self._name(path)}: no answer") from None
+            status = found[1] or found[2]
+            hint = _CLOCK if status.startswith("4") else ""
+            raise Offline(f"{self._name(path)}: refused (status {status})", hint=hint) from None
+
+
+def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bool) -> Any:
+    environment = os.environ
+    endpoint = where.text if where.scheme in WEB_SCHEMES else _endpoint(where.scheme)
+    plain = endpoint.lower().startswith("http://")
+    if plain and not insecure and not is_loopback(_host(endpoint)):
+        raise BadRequest(
+            f"{where.text}: plain http:// can be read and changed on its way",
+            hint="use https://, or --insecure-http",
+        )
+    client: dict[str, Any] = {
+        "connect_timeout": timedelta(seconds=patience.connect_s),
+        "read_timeout": timedelta(seconds=patience.read_s),
+        "timeout": timedelta(days=1),  # of a whole body, whose length nobody knows beforehand
+        "allow_http": plain,
+        "user_agent": "shmmap",
+    }
+    retry: dict[str, Any] = {
+        "max_retries": patience.retries,
+        "retry_timeout": timedelta(seconds=patience.retry_s),
+        "backoff": {
+            "init_backoff": timedelta(milliseconds=50),
+            "max_backoff": timedelta(seconds=5),
+            "base": 2,
+        },
+    }
+    given: dict[str, Any] = {"client_options": client, "retry_config": retry}
+    try:
+        if where.scheme == "s3":
+            settings, provider = s3_settings(environment, instance=instance)
+            if provider is not None:
+                given["credential_provider"] = provider
+            return S3Store.from_url(where.text, config=cast("Any", settings), **given)
+        if where.scheme == "gs":
+            return GCSStore.from_url(
+                where.text, config=cast("Any", google_settings(environment, instance=instance)), **given
+            )
+        if where.scheme == "az":
+            return AzureStore.from_url(
+                where.text, config=cast("Any", azure_settings(environment, instance=instance)), **given
+            )
+        return HTTPStore.from_url(where.text, **given)
+    except ConfigError:
+        raise
+    except (exceptions.BaseError, ValueError, TypeError, OSError):
+        raise ConfigError(
+            f"{where.text} cannot be opened with the settings and credentials given",
+            hint="look at the variables AWS_*, GOOGLE_*, AZURE_*, and at the files they name",
+        ) from None
+
+
+def _endpoint(scheme: str) -> str:
+    names = {"s3": ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"), "az": ("AZURE_ENDPOINT",)}
+    return next((os.environ[name] for name in names.get(scheme, ()) if os.environ.get(name)), "")
+
+
+def _host(url: str) -> str:
+    from urllib.parse import urlsplit
+
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:
+        return ""

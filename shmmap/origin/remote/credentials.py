@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Credentials for buckets: from the environment, the service manager or a profile, never from the network.
+
+obstore reads the environment itself.  What it would do without any is ask the cloud's metadata address, which
+on a vehicle is a wait for nobody, or for somebody else: so that is done only where it was configured.
+"""
+
+from __future__ import annotations
+
+import configparser
+import os
+from collections.abc import Callable, Mapping
+from datetime import datetime, timedelta, timezone
+from typing import Any, Final
+
+from shmmap.errors import ConfigError
+
+__all__ = ["azure_settings", "google_settings", "s3_settings"]
+
+_DIRECTORY: Final = "CREDENTIALS_DIRECTORY"  # systemd.exec(5), LoadCredential=
+AWS_FILE: Final = "shmmap.aws"
+GOOGLE_FILE: Final = "shmmap.google"
+AZURE_FILE: Final = "shmmap.azure"
+_REFUSED_KEYS: Final = {
+    "sso_session": "single sign-on",
+    "sso_start_url": "single sign-on",
+    "sso_account_id": "single sign-on",
+    "role_arn": "an assumed role",
+    "credential_process": "a program",
+    "credential_source": "an assumed role",
+    "web_identity_token_file": "a web identity",
+}
+_EXPORT: Final = (
+    "export them as AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN:"
+    ' eval "$(aws configure export-credentials --format env)"'
+)
+_AGAIN_AFTER: Final = timedelta(minutes=5)
+_TRUE: Final = ("1", "true", "yes", "on")
+
+Settings = dict[str, Any]
+Provider = Callable[[], dict[str, Any]]
+
+
+def s3_settings(
+    environment: Mapping[str, str], *, instance: bool = False
+) -> tuple[Settings, Provider | None]:
+    """Return what an S3 store is configured with, and what gives it keys, where the environment does not.
+
+    Raises
+    ------
+    ConfigError
+        The profile's credentials are of a kind that is not read here, or not whole.
+    """
+    settings: Settings = {}
+    if not (environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION")):
+        settings["region"] = _region(environment) or "us-east-1"
+    if environment.get("AWS_SKIP_SIGNATURE", "").lower() in _TRUE:
+        return {**settings, "skip_signature": True}, None
+    key, secret = environment.get("AWS_ACCESS_KEY_ID"), environment.get("AWS_SECRET_ACCESS_KEY")
+    if key and secret:
+        given = {"access_key_id": key, "secret_access_key": secret}
+        if token := environment.get("AWS_SESSION_TOKEN"):
+            given["session_token"] = token
+        return {**settings, **given}, None
+    if key or secret:
+        raise ConfigError("AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY are set only together")
+    if _static_keys(environment) is not None:
+
+        def provide() -> dict[str, Any]:
+            keys = _static_keys(environment)
+            return {**(keys or {}), "expires_at": datetime.now(timezone.utc) + _AGAIN_AFTER}
+
+        return settings, provide
+    return (settings if instance else {**settings, "skip_signature": True}), None
+
+
+def _static_keys(environment: Mapping[str, str]) -> dict[str, Any] | None:
+    """The keys in the service manager's file or in the shared credentials file; None where there are none."""
+    profile = environment.get("AWS_PROFILE", "")
+    files = [
+        *_given_file(environment, AWS_FILE),
+        environment.get("AWS_SHARED_CREDENTIALS_FILE") or os.path.expanduser("~/.aws/credentials"),
+    ]
+    for path in files:
+        section = _section(path, profile or "default")
+        if section is None:
+            continue
+        key, secret = section.get("aws_access_key_id"), section.get("aws_secret_access_key")
+        if key and secret:
+            return {
+                "access_key_id": key,
+                "secret_access_key": secret,
+                "token": section.get("aws_session_token") or None,
+            }
+        _refuse_kinds(section, path, profile or "default")
+        raise ConfigError(f"profile {profile or 'default'!r} has no whole pair of keys", origin=path)
+    config = _section(_config_file(environment), _config_section(profile))
+    if config is not None:
+        _refuse_kinds(config, _config_file(environment), profile or "default")
+    if profile:
+        raise ConfigError(
+            f"there is no profile {profile!r} with keys", key="AWS_PROFILE", origin=", ".join(files)
+        )
+    return None
+
+
+def _refuse_kinds(section: Mapping[str, str], path: str, profile: str) -> None:
+    for key, kind in _REFUSED_KEYS.items():
+        if key in section:
+            raise ConfigError(
+                f"profile {profile!r} gets its credentials from {kind} ({key}), which is not done here",
+                key=key,
+                origin=path,
+                hint=_EXPORT,
+            )
+
+
+def _region(environment: Mapping[str, str]) -> str:
+    section = _section(_config_file(environment), _config_section(environment.get("AWS_PROFILE", "")))
+    return (section or {}).get("region", "")
+
+
+def _config_file(environment: Mapping[str, str]) -> str:
+    return environment.get("AWS_CONFIG_FILE") or os.path.expanduser("~/.aws/config")
+
+
+def _config_section(profile: str) -> str:
+    return f"profile {profile}" if profile and profile != "default" else "default"
+
+
+def google_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
+    """Return what a store of Google Cloud is configured with."""
+    given = ("GOOGLE_APPLICATION_CREDENTIALS", "GOOGLE_SERVICE_ACCOUNT", "GOOGLE_SERVICE_ACCOUNT_KEY",
+             "GOOGLE_SERVICE_ACCOUNT_PATH", "SERVICE_ACCOUNT")  # fmt: skip
+    if any(environment.get(name) for name in given):
+        return {}
+    for path in _given_file(environment, GOOGLE_FILE):
+        if os.path.exists(path):
+            return {"application_credentials": path}
+    usual = os.path.expanduser("~/.config/gcloud/application_default_credentials.json")
+    if instance or os.path.exists(usual):
+        return {}
+    return {"skip_signature": True}
+
+
+def azure_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
+    """Return what a store of Azure is configured with.
+
+    Raises
+    ------
+    ConfigError
+        The service manager's file is no list of ``NAME=VALUE``.
+    """
+    account = {}
+    found = dict(environment)
+    for path in _given_file(environment, AZURE_FILE):
+        found |= _lines(path)
+    for name in (
+        "ACCOUNT_NAME", "ACCOUNT_KEY", "SAS_KEY", "SAS_TOKEN", "CLIENT_ID", "CLIENT_SECRET", "TENANT_ID",
+        "ENDPOINT",
+    ):  # fmt: skip
+        value = found.get(f"AZURE_STORAGE_{name}") or found.get(f"AZURE_{name}")
+        if value:
+            account["sas_key" if name == "SAS_TOKEN" else name.lower()] = value
+    has_secret = account.keys() & {"account_key", "sas_key", "client_secret"}
+    if has_secret or instance or environment.get("AZURE_USE_AZURE_CLI", "").lower() in _TRUE:
+        return account
+    return {**account, "skip_signature": True}
+
+
+def _given_file(environment: Mapping[str, str], name: str) -> list[str]:
+    directory = environment.get(_DIRECTORY)
+    return [os.path.join(directory, name)] if directory else []
+
+
+def _lines(path: str) -> dict[str, str]:
+    try:
+        with open(path, encoding="utf-8") as file:
+            lines = [line.strip() for line in file if line.strip() and not line.startswith("#")]
+    except FileNotFoundError:
+        return {}
+    except (OSError, UnicodeDecodeError):
+        raise ConfigError("it cannot be read", origin=path) from None
+    if any("=" not in line for line in lines):
+        raise ConfigError("it is no list of lines NAME=VALUE", origin=path)
+    return {name.strip(): value.strip() for name, _, value in (line.partition("=") for line in lines)}
+
+
+def _section(path: str, name: str) -> Mapping[str, str] | None:
+    """A section of an INI file; None where there is no such file or section."""
+    parser = configparser.RawConfigParser(default_section="", strict=False)
+    try:
+        with open(path, encoding="utf-8") as file:
+            parser.read_file(file)
+    except FileNotFoundError:
+        return None
+    except PermissionError:
+        raise ConfigError(f"{path} may not be read", origin=path) from None
+    except (OSError, UnicodeDecodeError, configparser.Error):
+        # what the parser says repeats the line, and with it the secret
+        raise ConfigError(f"{path} is no file of profiles", origin=path) from None
+    return dict(parser[name]) if parser.has_section(name) else None

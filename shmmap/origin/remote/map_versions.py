@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The versions of a published map: which root each one is, and the one switch from one to the next.
+
+``CURRENT`` names the version that is served.  Each version has an entry, made before it becomes current,
+which names the one before it.  So what was current is found by going back from ``CURRENT``; an entry beside
+that chain was never served: its publisher was killed, or another one was quicker.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from hashlib import sha256
+from typing import Final, NamedTuple, TypeVar
+
+import msgspec
+
+from shmmap.errors import InstanceBusy, MapDataError, MapMissing
+from shmmap.failpoints import step
+from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, unpack_root, unpack_shard
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.store import Store, Tag
+from shmmap.origin.remote.zstd_frame import DAMAGED
+
+__all__ = [
+    "CURRENT",
+    "Current",
+    "CurrentState",
+    "Entry",
+    "add_version",
+    "earlier_versions",
+    "entry_path",
+    "list_entries",
+    "new_entry",
+    "pack_json",
+    "read_current",
+    "read_entry",
+    "read_root",
+    "read_root_object",
+    "read_shard_object",
+    "read_shards",
+    "require_current",
+    "root_path",
+    "unpack_current",
+]
+
+CURRENT: Final = "CURRENT"
+ENTRIES: Final = "versions/"
+_ENTRY: Final = re.compile(r"versions/([1-9]\d{0,18})\.json")
+_MAX_JSON_BYTES: Final = 64 << 10
+_READ_AT_ONCE: Final = 32
+_MOST_VERSIONS: Final = 1_000_000
+_Named = TypeVar("_Named", bound=msgspec.Struct)
+
+
+class Current(msgspec.Struct, frozen=True):
+    """What ``CURRENT`` says: a version's number, the SHA-256 of its root's object, and that one's bytes."""
+
+    version: int
+    root: str
+    bytes: int
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """What ``versions/<n>.json`` says.
+
+    Attributes
+    ----------
+    version, root, bytes
+        As in `Current`.
+    created
+        When it was made, UTC, as RFC 3339 writes it.
+    before
+        The version that was current then; 0: none.
+    restored
+        The version whose content it has again; 0: its own.
+    """
+
+    version: int
+    root: str
+    bytes: int
+    created: str
+    before: int = 0
+    restored: int = 0
+
+    @property
+    def current(self) -> Current:
+        """What ``CURRENT`` says while this one is served."""
+        return Current(self.version, self.root, self.bytes)
+
+    @property
+    def created_s(self) -> float:
+        """The same as Unix time."""
+        return datetime.datetime.fromisoformat(self.created.replace("Z", "+00:00")).timestamp()
+
+
+class CurrentState(NamedTuple):
+    """What is current, and the tag of ``CURRENT``; None, None where nothing is published yet."""
+
+    current: Current | None
+    tag: Tag | None
+
+
+def entry_path(version: int) -> str:
+    """Return where the entry of a version lies."""
+    return f"{ENTRIES}{version}.json"
+
+
+def read_current(store: Store) -> CurrentState:
+    """Return which version is current.
+
+    Raises
+    ------
+    MapDataError
+        ``CURRENT`` is damaged.
+    Offline
+        It cannot be read at present.
+    """
+    try:
+        data, tag = store.get_tagged(CURRENT, _MAX_JSON_BYTES)
+    except MapMissing:
+        return CurrentState(None, None)
+    return CurrentState(unpack_current(data, f"{store.url}/{CURRENT}"), tag)
+
+
+def require_current(store: Store) -> Current:
+    """Return which version is current; `MapMissing` where nothing is published."""
+    found = read_current(store).current
+    if found is None:
+        raise MapMissing(f"no map is published at {store.url}", hint="shmmap publish MAP URL publishes one")
+    return found
+
+
+def unpack_current(data: bytes | memoryview, name: str = CURRENT) -> Current:
+    """Read ``CURRENT``; `MapDataError` if it is damaged."""
+    found = _decode(data, Current, name)
+    _check(found.version, found.root, found.bytes, name)
+    return found
+
+
+def read_entry(store: Store, version: int) -> Entry:
+    """Return the entry of a version.
+
+    Raises
+    ------
+    MapMissing
+        There is none.
+    MapDataError
+        It is damaged.
+    """
+    path = entry_path(version)
+    name = f"{store.url}/{path}"
+    entry = _decode(store.get(path, _MAX_JSON_BYTES), Entry, name)
+    _check(entry.version, entry.root, entry.bytes, name)
+    try:
+        entry.created_s  # noqa: B018  it is a time
+        right = entry.version == version and 0 <= entry.before < version and entry.created.endswith("Z")
+    except (ValueError, OverflowError):
+        right = False
+    if not right:
+        raise MapDataError("it is no entry of this version", path=name, cause=DAMAGED)
+    return entry
+
+
+def list_entries(store: Store) -> list[int]:
+    """Return the numbers of all entries, ascending; the store must be one that can be listed."""
+    found = (_ENTRY.fullmatch(listed.path) for listed in store.list(ENTRIES))
+    return sorted(int(match[1]) for match in found if match is not None)
+
+
+def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
+    """The entries of what is and was current, the latest first; ends where the one before has no entry."""
+    version = current.version
+    for _ in range(_MOST_VERSIONS):
+        try:
+            entry = read_entry(store, version)
+        except MapMissing:
+            return
+        yield entry
+        version = entry.before
+        if not version:
+            return
+
+
+def read_root(store: Store, current: Current) -> Root:
+    """Return the root of a version, verified.
+
+    Raises
+    ------
+    MapMissing, MapDataError, Offline
+        It is not there, not what its name says, or out of reach.
+    """
+    return unpack_root(read_root_object(store, current), name=f"{store.url}/{root_path(current)}")
+
+
+def root_path(current: Current) -> str:
+    """Return where the object of a version's root lies."""
+    return blob_path(bytes.fromhex(current.root))
+
+
+def read_root_object(store: Store, current: Current) -> bytes:
+    """Return the object of a version's root, its hash compared; errors are those of `read_root`."""
+    path = root_path(current)
+    data = bytes(store.get_exactly(path, current.bytes))
+    if sha256(data).hexdigest() != current.root:
+        raise MapDataError("its SHA-256 is not its name", path=f"{store.url}/{path}", cause=DAMAGED)
+    return data
+
+
+def read_shard_object(store: Store, root: Root, number: int) -> memoryview:
+    """Return the object of a shard; `unpack_shard` compares its hash."""
+    return store.get_exactly(blob_path(root.shard_sha256(number)), int(root.sizes[number]))
+
+
+def read_shards(store: Store, root: Root) -> Iterator[Shard]:
+    """All shards of a root in order, several read at a time; errors are those of `read_root`."""
+
+    def read(number: int) -> Shard:
+        return unpack_shard(read_shard_object(store, root, number), root, number)
+
+    with ThreadPoolExecutor(_READ_AT_ONCE, "shard") as pool:
+        for begin in range(0, len(root.keys), _READ_AT_ONCE):  # what is decoded does not pile up
+            yield from pool.map(read, range(begin, min(begin + _READ_AT_ONCE, len(root.keys))))
+
+
+# --- a new version ------------------------------------------------------------------------------------
+
+
+def new_entry(store: Store, root: str, nbytes: int, before: Current | None, *, restored: int = 0) -> Entry:
+    """Make the entry of a new version, which is not served yet: `add_version` switches to it.
+
+    Raises
+    ------
+    InstanceBusy
+        Another publisher takes every number.
+    """
+    for _ in range(100):
+        highest = max([*list_entries(store), before.version if before is not None else 0], default=0)
+        entry = Entry(
+            highest + 1, root, nbytes, _now_text(), before.version if before is not None else 0, restored
+        )
+        if store.put_new(entry_path(entry.version), pack_json(entry)):
+            return entry
+    raise InstanceBusy(f"other publishers take every number at {store.url}", hint="try again later")
+
+
+def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:
+    """Switch to a new version, if the one that was seen is still current.
+
+    Raises
+    ------
+    InstanceBusy
+        Another publisher has switched meanwhile: its version stays.
+    """
+    data = pack_json(entry.current)
+    step("version.switch")
+    switched = store.put_new(CURRENT, data) if seen.tag is None else store.put_if(CURRENT, data, seen.tag)
+    if not switched:
+        raise InstanceBusy(
+            f"another publisher has changed {store.url} meanwhile: its version stays, this one is not served",
+            hint="run the same command again: what was sent is not sent again",
+        )
+    step("version.switched")
+
+
+def pack_json(value: Current | Entry) -> bytes:
+    """Return the bytes of ``CURRENT`` or of an entry: one line of JSON, keys in the order of the document."""
+    return (json.dumps(msgspec.to_builtins(value)) + "\n").encode()
+
+
+def _now_text() -> str:
+    now = datetime.datetime.now(datetime.timezone.utc)
+    return now.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def _decode(data: bytes | memoryview, kind: type[_Named], name: str) -> _Named:
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapDataError(f"it is not what it should be: {error}", path=name, cause=DAMAGED) from None
+
+
+def _check(version: int, root: str, nbytes: int, name: str) -> None:
+    if (
+        not 1 <= version < 1 << 63
+        or not re.fullmatch("[0-9a-f]{64}", root)
+        or not 1 <= nbytes <= MAX_ROOT_BYTES
+    ):
+        raise MapDataError("it names no root", path=name, cause=DAMAGED)

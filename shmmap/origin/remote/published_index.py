@@ -1,0 +1,518 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells a published map has and which objects they are: a root, and shards of neighbouring cells.
+
+Both are columns in a MessagePack map in a zstd frame.  The root has one row for each shard and is small;
+a shard is read when an area needs it.  ``ORIGIN.md`` is the byte-exact document.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any, Final, TypeAlias, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from xxhash import xxh3_64_intdigest
+
+from shmmap.errors import MapDataError
+from shmmap.origin.remote.published_object import MAX_OBJECT_BYTES, STAMP_BYTES, CellIdentity, ObjectName
+from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
+from shmmap.segment.version import cell_version
+
+__all__ = [
+    "EXACT",
+    "MAX_ROOT_BYTES",
+    "MAX_SHARD_BYTES",
+    "POINTS",
+    "LayerObjects",
+    "Root",
+    "Shard",
+    "is_id_prefix",
+    "is_relative_path",
+    "map_version_of",
+    "pack_root",
+    "pack_shard",
+    "published_layer_version",
+    "shard_keys",
+    "unpack_root",
+    "unpack_shard",
+]
+
+MAX_ROOT_BYTES: Final = 16 << 20
+MAX_SHARD_BYTES: Final = 4 << 20
+POINTS: Final = "points"
+FORMAT: Final = "shmmap published map"
+READER: Final = 1
+"""The version of this reader: a root that needs a greater one is refused."""
+EXACT: Final = "exact"
+
+_MAX_LAYERS: Final = 64
+_MAX_SPEC_CHARACTERS: Final = 200
+_MAX_TEXT_CHARACTERS: Final = 4096
+_ROUNDING: Final = 2.0**-22  # an area test on values rounded to float32 may move a border by half of it
+_SMALLEST_OBJECT_BYTES: Final = 4096
+
+Box: TypeAlias = tuple[float, float, float, float]
+_Struct = TypeVar("_Struct", bound=msgspec.Struct)
+
+
+class _Head(msgspec.Struct, frozen=True):
+    """What says whether the rest of a root can be read."""
+
+    format: str
+    min_reader: int
+    encoding: str
+
+
+class RootFields(msgspec.Struct, frozen=True):
+    """The MessagePack map of a root, in this order of keys."""
+
+    format: str
+    min_reader: int
+    id_prefix: str
+    frame_id: str
+    crs: str
+    origin: tuple[float, float, float]
+    unit_m: tuple[float, float]
+    encoding: str
+    cells: int
+    bounds: Box
+    shard_m: float
+    largest_m: tuple[float, float]
+    mean_m: tuple[float, float]
+    layers: dict[str, int]
+    shard_keys: bytes
+    shard_cells: bytes
+    shard_bytes: bytes
+    shard_sha256: bytes
+
+
+class LayerFields(msgspec.Struct, frozen=True):
+    """The columns of one layer in a shard."""
+
+    size: bytes
+    raw_size: bytes
+    sha256: bytes
+    content_sha256: bytes
+
+
+class ShardFields(msgspec.Struct, frozen=True):
+    """The MessagePack map of a shard, in this order of keys."""
+
+    names: bytes
+    boxes: bytes
+    z: bytes
+    points: bytes
+    layers: dict[str, LayerFields]
+
+
+# --- the root -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Root:
+    """What a version of a published map is.
+
+    Attributes
+    ----------
+    id_prefix
+        What all ids begin with; begins and ends with ``/``.
+    crs, origin, unit_m
+        Where the frame lies, see `shmmap.origin.map_frame.MapFrame`.
+    encoding
+        ``exact`` (``mm`` is reserved).
+    bounds
+        Box around all cells, metres, map frame.
+    shard_m
+        Side of a shard, metres.
+    largest_m, mean_m
+        Extent of the largest and of the mean cell along x and y, metres.
+    layers
+        Builder version of each published layer by spec, ascending; `POINTS` is one of them.
+    keys
+        (S, 2) int32, row and column of each shard, ascending.
+    counts, sizes
+        (S,) uint32, cells of each shard, bytes of its object.
+    hashes
+        (S, 32) uint8, SHA-256 of each shard's object, its name.
+    map_version
+        Of what is in this root.
+    """
+
+    id_prefix: str
+    frame_id: str
+    crs: str
+    origin: tuple[float, float, float]
+    unit_m: tuple[float, float]
+    encoding: str
+    cells: int
+    bounds: Box
+    shard_m: float
+    largest_m: tuple[float, float]
+    mean_m: tuple[float, float]
+    layers: Mapping[str, int]
+    keys: NDArray[np.int32]
+    counts: NDArray[np.uint32]
+    sizes: NDArray[np.uint32]
+    hashes: NDArray[np.uint8]
+    map_version: int = 0
+
+    @property
+    def first_indices(self) -> NDArray[np.int64]:
+        """(S + 1,) index of each shard's first cell, and how many cells there are."""
+        return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
+
+    def shard_sha256(self, shard: int) -> bytes:
+        """SHA-256 of a shard's object, its name."""
+        return bytes(self.hashes[shard].tobytes())
+
+    def shards_near(self, bounds: Box) -> NDArray[np.intp]:
+        """Shards that may have cells touching a rectangle (min x, min y, max x, max y), metres, ascending.
+
+        A cell lies in the shard of its lower corner, so those below and left of the rectangle, too.
+        """
+        min_x, min_y, max_x, max_y = bounds
+        slack = _ROUNDING * max(map(abs, (*bounds, *self.bounds)))
+        if not math.isfinite(slack):
+            slack = 0.0
+        columns = self._span(min_x - self.largest_m[0] - slack, max_x + slack, self.keys[:, 1])
+        rows = self._span(min_y - self.largest_m[1] - slack, max_y + slack, self.keys[:, 0])
+        return np.flatnonzero(rows & columns)
+
+    def _span(self, low: float, high: float, keys: NDArray[np.int32]) -> NDArray[np.bool_]:
+        within: NDArray[np.bool_] = (keys >= np.floor(low / self.shard_m)) & (
+            keys <= np.floor(high / self.shard_m)
+        )
+        return within
+
+
+def pack_root(root: Root) -> bytes:
+    """Return what is in a root's frame."""
+    return msgspec.msgpack.encode(
+        RootFields(
+            format=FORMAT,
+            min_reader=READER,
+            id_prefix=root.id_prefix,
+            frame_id=root.frame_id,
+            crs=root.crs,
+            origin=root.origin,
+            unit_m=root.unit_m,
+            encoding=root.encoding,
+            cells=root.cells,
+            bounds=root.bounds,
+            shard_m=root.shard_m,
+            largest_m=root.largest_m,
+            mean_m=root.mean_m,
+            layers=dict(sorted(root.layers.items())),
+            shard_keys=_packed(root.keys, "<i4"),
+            shard_cells=_packed(root.counts, "<u4"),
+            shard_bytes=_packed(root.sizes, "<u4"),
+            shard_sha256=_packed(root.hashes, "u1"),
+        )
+    )
+
+
+def map_version_of(unpacked: bytes) -> int:
+    """Return the map version of what is in a root's frame: its 16 hex digits are the first of the SHA-256."""
+    return int.from_bytes(sha256(unpacked).digest()[:8], "big")
+
+
+def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
+    """Read and check a root's object.
+
+    Raises
+    ------
+    MapDataError
+        If it is no sound root (cause ``damaged``), or one that needs a later reader (``newer``).
+    """
+    unpacked = unpack_frame(frame, MAX_ROOT_BYTES, name=name)
+    wrong = _Wrong(name)
+    head = _decode(unpacked, _Head, wrong)
+    if head.format != FORMAT:
+        raise wrong(f"its format is {head.format[:40]!r}, not {FORMAT!r}")
+    if head.min_reader > READER or head.encoding != EXACT:
+        raise MapDataError(
+            f"it needs reader {head.min_reader} and encoding {head.encoding[:40]!r};"
+            f" this is reader {READER}, for {EXACT!r}",
+            path=name,
+            cause="newer",
+            hint="update shmmap",
+        )
+    found = _decode(unpacked, RootFields, wrong)
+    texts = (found.id_prefix, found.frame_id, found.crs)
+    if any(len(text) > _MAX_TEXT_CHARACTERS or "\0" in text for text in texts):
+        raise wrong("a text is too long")
+    if not is_id_prefix(found.id_prefix):
+        raise wrong(f"{found.id_prefix!r} cannot begin ids")
+    numbers = (*found.origin, *found.unit_m, *found.bounds, found.shard_m, *found.largest_m, *found.mean_m)
+    if not all(map(math.isfinite, numbers)) or not _is_rectangle(found.bounds):
+        raise wrong("a number is not finite, or the bounds are no rectangle")
+    if found.shard_m <= 0 or min(*found.unit_m) <= 0 or min(*found.largest_m, *found.mean_m) < 0:
+        raise wrong("a length is not positive")
+    if POINTS not in found.layers or len(found.layers) > _MAX_LAYERS:
+        raise wrong("its layers are too many, or have no points")
+    if any(
+        len(spec) > _MAX_SPEC_CHARACTERS or not 0 <= built < 1 << 32 for spec, built in found.layers.items()
+    ):
+        raise wrong("a layer is no spec with its builder version")
+    count = len(found.shard_cells) // 4
+    root = Root(
+        id_prefix=found.id_prefix,
+        frame_id=found.frame_id,
+        crs=found.crs,
+        origin=found.origin,
+        unit_m=found.unit_m,
+        encoding=found.encoding,
+        cells=found.cells,
+        bounds=found.bounds,
+        shard_m=found.shard_m,
+        largest_m=found.largest_m,
+        mean_m=found.mean_m,
+        layers=found.layers,
+        keys=_column(found.shard_keys, "<i4", count, 2, wrong),
+        counts=_column(found.shard_cells, "<u4", count, 1, wrong),
+        sizes=_column(found.shard_bytes, "<u4", count, 1, wrong),
+        hashes=_column(found.shard_sha256, "u1", count, 32, wrong),
+        map_version=map_version_of(unpacked),
+    )
+    order = (root.keys[:, 0].astype(np.int64) << 32) + root.keys[:, 1]
+    if not count or (np.diff(order) <= 0).any():
+        raise wrong("its shards do not ascend")
+    if int(root.counts.sum(dtype=np.uint64)) != root.cells or not root.counts.all():
+        raise wrong(f"its shards do not have {root.cells:,} cells")
+    if not root.sizes.all() or int(root.sizes.max()) > MAX_SHARD_BYTES:
+        raise wrong(f"a shard is empty, or larger than {MAX_SHARD_BYTES:,} bytes")
+    return root
+
+
+def is_id_prefix(text: str) -> bool:
+    """Whether ids may begin with it: an absolute path that ends with ``/``."""
+    return text.startswith("/") and text.endswith("/") and "\0" not in text
+
+
+# --- shards -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayerObjects:
+    """The objects of one layer, a row for each cell of a shard.
+
+    ``sizes``, ``raws`` (N,) uint32, bytes of the object and of what is in it; ``hashes``, ``contents``
+    (N, 32) uint8, SHA-256 of both.
+    """
+
+    sizes: NDArray[np.uint32]
+    raws: NDArray[np.uint32]
+    hashes: NDArray[np.uint8]
+    contents: NDArray[np.uint8]
+
+    def name(self, row: int) -> ObjectName:
+        """The object of a cell."""
+        return ObjectName(
+            self.hashes[row].tobytes(),
+            int(self.sizes[row]),
+            int(self.raws[row]),
+            self.contents[row].tobytes(),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shard:
+    """Neighbouring cells of a published map: a row for each, names ascending by their bytes.
+
+    Attributes
+    ----------
+    names
+        What follows the map's `id_prefix` in the id of each cell, UTF-8.
+    boxes
+        (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame.
+    z
+        (N, 2) float64, lowest and highest z of the points, metres; NaN where there are none.
+    points
+        (N,) uint32, rows of layer ``points``.
+    layers
+        Objects of each layer by spec.
+    """
+
+    names: tuple[bytes, ...]
+    boxes: NDArray[np.float64]
+    z: NDArray[np.float64]
+    points: NDArray[np.uint32]
+    layers: Mapping[str, LayerObjects]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def id(self, row: int, id_prefix: str) -> str:
+        """Id of a cell."""
+        return id_prefix + self.names[row].decode()
+
+    def box(self, row: int) -> Box:
+        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+        min_x, min_y, max_x, max_y = self.boxes[row].tolist()
+        return min_x, min_y, max_x, max_y
+
+    def stamp(self, row: int) -> bytes:
+        """Stamp of a cell, see `shmmap.segment.version.Stamp`: 24 bytes of its points' content digest."""
+        return self.layers[POINTS].contents[row, :STAMP_BYTES].tobytes()
+
+    def version(self, row: int, id_prefix: str) -> int:
+        """Version of a cell."""
+        return cell_version(self.id(row, id_prefix), self.stamp(row), self.box(row))
+
+    def identity(self, row: int, root: Root) -> CellIdentity:
+        """What the objects of a cell lack, see `shmmap.origin.remote.published_object.write_segment`."""
+        return CellIdentity(self.id(row, root.id_prefix), self.box(row), root.frame_id, self.stamp(row))
+
+
+def published_layer_version(cell: int, layer: str, builder_version: int, content: bytes) -> int:
+    """Return the version of a published layer other than ``points``.
+
+    Parameters
+    ----------
+    cell
+        Version of the cell.
+    layer, builder_version
+        Its spec, and the version of what has built it.
+    content
+        Its content digest, 32 bytes.
+    """
+    spec = layer.encode()
+    return xxh3_64_intdigest(
+        struct.pack("<QI", cell, len(spec)) + spec + struct.pack("<I", builder_version) + content
+    )
+
+
+def pack_shard(shard: Shard) -> bytes:
+    """Return what is in a shard's frame."""
+    return msgspec.msgpack.encode(
+        ShardFields(
+            names=b"\0".join(shard.names),
+            boxes=_packed(shard.boxes, "<f8"),
+            z=_packed(shard.z, "<f8"),
+            points=_packed(shard.points, "<u4"),
+            layers={
+                spec: LayerFields(
+                    size=_packed(layer.sizes, "<u4"),
+                    raw_size=_packed(layer.raws, "<u4"),
+                    sha256=_packed(layer.hashes, "u1"),
+                    content_sha256=_packed(layer.contents, "u1"),
+                )
+                for spec, layer in sorted(shard.layers.items())
+            },
+        )
+    )
+
+
+def unpack_shard(frame: bytes | memoryview, root: Root, number: int, *, name: str = "") -> Shard:
+    """Verify and read the object of a root's shard.
+
+    Raises
+    ------
+    MapDataError
+        If it is not that object, or no sound shard of this root (cause ``damaged``).
+    """
+    name = name or f"shard {root.keys[number].tolist()}"
+    wrong = _Wrong(name)
+    if sha256(frame).digest() != root.shard_sha256(number):
+        raise wrong("its SHA-256 is not its name")
+    unpacked = unpack_frame(frame, MAX_SHARD_BYTES, name=name)
+    found = _decode(unpacked, ShardFields, wrong)
+    count = int(root.counts[number])
+    names = tuple(found.names.split(b"\0"))
+    if len(names) != count or any(not is_relative_path(one) for one in names):
+        raise wrong(f"its names are not those of {count:,} files below the map")
+    if any(first >= second for first, second in itertools.pairwise(names)):
+        raise wrong("its names do not ascend")
+    if set(found.layers) != set(root.layers):
+        raise wrong("its layers are not the root's")
+    shard = Shard(
+        names=names,
+        boxes=_column(found.boxes, "<f8", count, 4, wrong),
+        z=_column(found.z, "<f8", count, 2, wrong),
+        points=_column(found.points, "<u4", count, 1, wrong),
+        layers={
+            spec: LayerObjects(
+                sizes=_column(layer.size, "<u4", count, 1, wrong),
+                raws=_column(layer.raw_size, "<u4", count, 1, wrong),
+                hashes=_column(layer.sha256, "u1", count, 32, wrong),
+                contents=_column(layer.content_sha256, "u1", count, 32, wrong),
+            )
+            for spec, layer in found.layers.items()
+        },
+    )
+    low, high = shard.boxes[:, :2], shard.boxes[:, 2:]
+    if not np.isfinite(shard.boxes).all() or (low > high).any():
+        raise wrong("a box is no rectangle")
+    if (high - low > np.array(root.largest_m)).any():
+        raise wrong("a cell is larger than the root's largest")
+    if (shard_keys(shard.boxes, root.shard_m) != root.keys[number]).any():
+        raise wrong("a cell lies in another shard")
+    has_points = shard.points > 0
+    if not np.isfinite(shard.z[has_points]).all() or (shard.z[has_points, 0] > shard.z[has_points, 1]).any():
+        raise wrong("a cell's lowest point is above its highest")
+    for layer in shard.layers.values():
+        raws = layer.raws.astype(np.int64)
+        if (raws < _SMALLEST_OBJECT_BYTES).any() or (raws > MAX_OBJECT_BYTES).any():
+            raise wrong("the size of an object is out of range")
+        # zstd's bound of what incompressible data becomes
+        if (layer.sizes == 0).any() or (layer.sizes > raws + (raws >> 8) + 4096).any():
+            raise wrong("the size of an object is out of range")
+    return shard
+
+
+def shard_keys(boxes: NDArray[np.float64], shard_m: float) -> NDArray[np.float64]:
+    """(N, 2) row and column, whole numbers, of the shard that each cell lies in: that of its lower corner."""
+    keys: NDArray[np.float64] = np.floor(boxes[:, 1::-1] / shard_m)
+    return keys
+
+
+def is_relative_path(name: bytes) -> bool:
+    """Whether it names a file below a directory, without leaving it, in UTF-8."""
+    try:
+        name.decode()
+    except UnicodeDecodeError:
+        return False
+    return all(part not in (b"", b".", b"..") for part in name.split(b"/"))
+
+
+# --- columns ------------------------------------------------------------------------------------------
+
+
+class _Wrong:
+    """Makes the error of one object."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __call__(self, message: str) -> MapDataError:
+        return MapDataError(message, path=self._name, cause=DAMAGED)
+
+
+def _decode(unpacked: bytes, kind: type[_Struct], wrong: _Wrong) -> _Struct:
+    try:
+        return msgspec.msgpack.decode(unpacked, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise wrong(f"no MessagePack map of its kind: {error}") from None
+
+
+def _packed(column: NDArray[Any], dtype: str) -> bytes:
+    return np.ascontiguousarray(column, np.dtype(dtype)).tobytes()
+
+
+def _column(data: bytes, dtype: str, count: int, width: int, wrong: _Wrong) -> NDArray[Any]:
+    kind = np.dtype(dtype)
+    if len(data) != count * width * kind.itemsize:
+        raise wrong("its columns are not of one length")
+    column: NDArray[Any] = np.frombuffer(data, kind)
+    return column.reshape(-1, width) if width > 1 else column
+
+
+def _is_rectangle(box: Box) -> bool:
+    return box[0] <= box[2] and box[1] <= box[3]

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A layer of a cell as it is published: a segment without its identity, its columns as planes of bytes.
+
+What names the cell (id, box, frame, source) is left out: so the same points give the same object wherever
+and whenever they are published.  Whoever loads it puts it back.  ``ORIGIN.md`` is the byte-exact document.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import MapDataError, SegmentCorrupt
+from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
+from shmmap.segment.header import pack_header, unpack_header
+from shmmap.segment.layout import NO_SOURCE, TAIL_BYTES, Column, SegmentHeader, SourceStamp, header_size
+from shmmap.segment.writer import write_all
+
+__all__ = [
+    "MAX_OBJECT_BYTES",
+    "STAMP_BYTES",
+    "CellIdentity",
+    "ObjectName",
+    "bare_object",
+    "blob_path",
+    "pack_object",
+    "read_bare_header",
+    "rows_of",
+    "unpack_object",
+    "write_segment",
+]
+
+MAX_OBJECT_BYTES: Final = 1 << 30
+"""Most bytes of an unpacked object: both forms of it are in a loader's memory."""
+STAMP_BYTES: Final = 24
+"""A cell's stamp: the first bytes of its points' content digest."""
+
+FLAGS_AT: Final = 208
+PLANES: Final = 1
+MILLIMETRES: Final = 2  # reserved: not written yet, and refused
+MAX_PLANED_COMPONENTS: Final = 8
+_FLAGS: Final = struct.Struct("<I")
+_STAMP: Final = struct.Struct("<Qqq")
+_BLOCK_ROWS: Final = 1 << 12  # turned at a time: what is read and written stays in the cache
+
+
+class ObjectName(NamedTuple):
+    """What a published map says of an object.
+
+    Attributes
+    ----------
+    sha256
+        Of the frame; the object is ``blobs/sha256/`` and its 64 hex digits.
+    size
+        Bytes of the frame.
+    raw
+        Bytes of what is in it.
+    content
+        SHA-256 of what is in it, the *content digest*.
+    """
+
+    sha256: bytes
+    size: int
+    raw: int
+    content: bytes
+
+    @property
+    def path(self) -> str:
+        """Where it lies, from the map's URL."""
+        return blob_path(self.sha256)
+
+
+def blob_path(digest: bytes) -> str:
+    """Return where the object of this SHA-256 lies, from the map's URL."""
+    return f"blobs/sha256/{digest.hex()}"
+
+
+@dataclass(frozen=True, slots=True)
+class CellIdentity:
+    """What an object lacks, and the segment made of it has: ``box`` in metres.
+
+    ``stamp`` is the cell's, whatever the layer: 24 bytes.
+    """
+
+    cell_id: str
+    box: tuple[float, float, float, float]
+    frame_id: str
+    stamp: bytes
+
+
+# --- out of a segment ---------------------------------------------------------------------------------
+
+
+def bare_object(segment: memoryview) -> bytearray:
+    """Return the unpacked object of a prepared segment, publish block empty.
+
+    Raises
+    ------
+    SegmentCorrupt
+        If it is no whole segment.
+    """
+    header = unpack_header(segment, len(segment))
+    header_bytes = header_size(len(header.columns), "", header.layer, "")
+    shift = header_bytes - header.header_bytes
+    bare = _moved(header, shift)
+    bare = msgspec.structs.replace(
+        bare, cell_id="", frame_id="", box=(0.0, 0.0, 0.0, 0.0), source=NO_SOURCE, source_digest=bytes(16)
+    )
+    unpacked = bytearray(bare.total_bytes)
+    unpacked[:header_bytes] = _flagged(pack_header(bare), PLANES)
+    for column in filter(_has_bytes, header.columns):
+        rows = np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(
+            -1, _plane_count(column)
+        )
+        planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset + shift)
+        target = planes.reshape(rows.shape[::-1])
+        for begin in range(0, len(rows), _BLOCK_ROWS):
+            target[:, begin : begin + _BLOCK_ROWS] = rows[begin : begin + _BLOCK_ROWS].T
+    return unpacked
+
+
+def pack_object(unpacked: bytes | bytearray, content: bytes) -> tuple[ObjectName, bytes]:
+    """Return the name of an object and its frame; ``content`` is its content digest."""
+    frame = pack_frame(unpacked)
+    return ObjectName(sha256(frame).digest(), len(frame), len(unpacked), content), frame
+
+
+def _moved(header: SegmentHeader, shift: int) -> SegmentHeader:
+    """Make the header longer by so many bytes: the columns move."""
+    return msgspec.structs.replace(
+        header,
+        header_bytes=header.header_bytes + shift,
+        total_bytes=header.total_bytes + shift,
+        columns=tuple(
+            msgspec.structs.replace(column, offset=column.offset + shift) for column in header.columns
+        ),
+    )
+
+
+def _flagged(page: bytes, flags: int) -> bytearray:
+    flagged = bytearray(page)
+    _FLAGS.pack_into(flagged, FLAGS_AT, flags)
+    end = len(page) - TAIL_BYTES
+    _FLAGS.pack_into(flagged, end, zlib.crc32(memoryview(flagged)[:end]))
+    return flagged
+
+
+def _has_bytes(column: Column) -> bool:
+    return column.nbytes > 0
+
+
+def _plane_count(column: Column) -> int:
+    """Bytes of what counts as one row of a column: so many planes it is split into."""
+    itemsize = column.dtype.itemsize
+    if len(column.shape) == 2 and 0 < column.shape[1] <= MAX_PLANED_COMPONENTS:
+        return itemsize * column.shape[1]
+    return itemsize
+
+
+# --- into a segment -----------------------------------------------------------------------------------
+
+
+def unpack_object(frame: bytes | memoryview, name: ObjectName) -> bytes:
+    """Verify an object against its name and return what is in its frame.
+
+    Raises
+    ------
+    MapDataError
+        If its hash or a size is another one (cause ``damaged``); before that nothing is unpacked.
+    """
+    path = name.path
+    if len(frame) != name.size:
+        raise MapDataError(f"it has {len(frame):,} bytes, not {name.size:,}", path=path, cause=DAMAGED)
+    if sha256(frame).digest() != name.sha256:
+        raise MapDataError("its SHA-256 is not its name", path=path, cause=DAMAGED)
+    return unpack_frame(frame, name.raw, name=path, exact=True)
+
+
+def write_segment(
+    unpacked: bytes | memoryview,
+    fd: int,
+    identity: CellIdentity,
+    layer: str,
+    *,
+    name: str = "",
+    reserve: Callable[[int], None] | None = None,
+) -> SegmentHeader:
+    """Write an unpacked object into an empty file as a segment of today's layout, header last.
+
+    Parameters
+    ----------
+    fd
+        Empty file, open for writing; after an error its contents mean nothing.
+    layer
+        Spec of the layer that it has to be.
+    name
+        Of the object, for messages.
+    reserve
+        Called with the segment's size in bytes before anything is written; it refuses by raising.
+
+    Returns
+    -------
+    The header as written, publish block empty.
+
+    Raises
+    ------
+    MapDataError
+        If it is no such object (cause ``damaged``), or one of a later version (``newer``).
+    OSError
+        ENOSPC if the file system is full.
+    """
+    bare = read_bare_header(unpacked, layer, name=name)
+    try:
+        shift = header_size(len(bare.columns), identity.cell_id, layer, identity.frame_id) - bare.header_bytes
+    except UnicodeEncodeError:
+        raise MapDataError(f"the id {identity.cell_id!r} is no text", path=name, cause=DAMAGED) from None
+    header = msgspec.structs.replace(
+        _moved(bare, shift),
+        cell_id=identity.cell_id,
+        frame_id=identity.frame_id,
+        box=identity.box,
+        source=SourceStamp(*_STAMP.unpack(identity.stamp)),
+        source_digest=identity.stamp[:16],
+    )
+    page = pack_header(header)
+    if reserve is not None:
+        reserve(header.total_bytes)
+    os.ftruncate(fd, header.total_bytes)
+    for column in filter(_has_bytes, bare.columns):
+        _write_rows(fd, unpacked, column, column.offset + shift)
+    write_all(fd, memoryview(page), 0)
+    return header
+
+
+def read_bare_header(unpacked: bytes | memoryview, layer: str, *, name: str = "") -> SegmentHeader:
+    """Return the header of an unpacked object; errors are those of `write_segment`."""
+    view = memoryview(unpacked)
+    try:
+        header = unpack_header(view, len(view))
+    except SegmentCorrupt as error:
+        raise MapDataError(f"no object of a map: {error.message}", path=name, cause=DAMAGED) from None
+    if header.total_bytes != len(view):
+        raise MapDataError(
+            f"it has {len(view):,} bytes, its header says {header.total_bytes:,}", path=name, cause=DAMAGED
+        )
+    (flags,) = _FLAGS.unpack_from(view, FLAGS_AT)
+    if flags != PLANES:
+        raise MapDataError(
+            f"its flags are {flags:#x}, this program reads {PLANES:#x}",
+            path=name,
+            cause="newer",
+            hint="update shmmap",
+        )
+    if header.layer != layer:
+        raise MapDataError(f"it is layer {header.layer!r}, not {layer!r}", path=name, cause=DAMAGED)
+    return header
+
+
+def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray[Any]:
+    """Return a column of an unpacked object as it will be in memory, dtype and shape as its header says."""
+    if not column.nbytes:
+        return np.empty(column.shape, column.dtype)
+    planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(_plane_count(column), -1)
+    return np.ascontiguousarray(planes.T).reshape(-1).view(column.dtype).reshape(column.shape)
+
+
+def _write_rows(fd: int, unpacked: bytes | memoryview, column: Column, offset: int) -> None:
+    count = _plane_count(column)
+    planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(count, -1)
+    for begin in range(0, planes.shape[1], _BLOCK_ROWS):
+        rows = np.ascontiguousarray(planes[:, begin : begin + _BLOCK_ROWS].T)
+        write_all(fd, rows.data.cast("B"), offset + begin * count)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks about cells, worked off by processes: a hostile file costs its cell, not the run.
+
+Workers are processes that the kernel ends with this one.  One that dies costs the task it worked on; another
+takes its place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import selectors
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final, Generic, Protocol, TypeVar
+
+import msgspec
+
+from shmmap.errors import InternalError
+from shmmap.prepare.work import Ready, encode
+from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import how_ended, start_child
+
+__all__ = ["TaskPool"]
+
+_FAILED_STARTS: Final = 3
+
+
+class _Numbered(Protocol):
+    number: int
+
+
+_Task = TypeVar("_Task", bound=_Numbered)
+_Done = TypeVar("_Done", bound=_Numbered)
+
+
+@dataclass(eq=False, slots=True)
+class _Worker(Generic[_Task]):
+    process: subprocess.Popen[bytes]
+    channel: socket.socket
+    tasks: dict[int, _Task] = field(default_factory=dict)
+    ready: bool = False
+
+
+class TaskPool(Generic[_Task, _Done]):
+    """Runs tasks in processes, each with a number of its own.
+
+    Parameters
+    ----------
+    module, arguments
+        What a worker runs, see `start_child`.  It sends `Ready`, then one message for each task.
+    workers
+        How many processes, at most.
+    decode
+        Reads a worker's message.
+    finished
+        Called with each task's message.
+    died
+        Called with a task that a worker died of, and how.
+    ahead
+        Tasks that a worker has at a time, so that it need not wait for the next one.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        arguments: list[str],
+        *,
+        workers: int,
+        decode: Callable[[bytes], _Done | Ready],
+        finished: Callable[[_Task, _Done], None],
+        died: Callable[[_Task, str], None],
+        ahead: int = 1,
+    ) -> None:
+        self._module = module
+        self._arguments = arguments
+        self._limit = workers
+        self._decode = decode
+        self._finished = finished
+        self._died = died
+        self._ahead = ahead
+        self._tasks: Iterator[_Task] = iter(())
+        self._again: list[_Task] = []
+        self._selector = selectors.DefaultSelector()
+        self._workers: list[_Worker[_Task]] = []
+        self._failed_starts = 0
+
+    def run(self, tasks: Iterator[_Task]) -> None:
+        """Work off all tasks.
+
+        Raises
+        ------
+        InternalError
+            No worker can be started.
+        """
+        self._tasks = tasks
+        try:
+            while True:
+                while len(self._workers) < self._limit and (task := self._next()) is not None:
+                    self._start(task)
+                if not self._workers or not any(worker.tasks for worker in self._workers):
+                    break
+                for key, _ in self._selector.select():
+                    self._receive(key.data)
+        finally:
+            for worker in list(self._workers):
+                self._end(worker)
+            self._selector.close()
+
+    def _next(self) -> _Task | None:
+        """The next task: one given back, or a new one."""
+        return self._again.pop() if self._again else next(self._tasks, None)
+
+    def _start(self, task: _Task) -> None:
+        process, ours = start_child(self._module, *self._arguments, new_session=False)
+        worker: _Worker[_Task] = _Worker(process, ours)
+        self._workers.append(worker)
+        self._selector.register(ours, selectors.EVENT_READ, worker)
+        self._feed(worker, task)
+
+    def _feed(self, worker: _Worker[_Task], task: _Task) -> None:
+        worker.tasks[task.number] = task
+        with contextlib.suppress(OSError):  # its end is reported by its channel
+            worker.channel.send(encode(task))
+
+    def _fill(self, worker: _Worker[_Task]) -> None:
+        while len(worker.tasks) < self._ahead and (task := self._next()) is not None:
+            self._feed(worker, task)
+
+    def _receive(self, worker: _Worker[_Task]) -> None:
+        try:
+            data = worker.channel.recv(MAX_PACKET_BYTES)
+            message = self._decode(data) if data else None
+        except (OSError, msgspec.MsgspecError):
+            message = None
+        if message is None:
+            self._lost(worker)
+        elif isinstance(message, Ready):
+            worker.ready = True
+            self._failed_starts = 0
+            self._fill(worker)
+        else:
+            self._finished(worker.tasks.pop(message.number), message)
+            self._fill(worker)
+
+    def _lost(self, worker: _Worker[_Task]) -> None:
+        how = self._end(worker)
+        tasks = list(worker.tasks.values())
+        if not worker.ready:
+            self._failed_starts += 1
+            if self._failed_starts >= _FAILED_STARTS:
+                raise InternalError(f"no worker can be started: {how}")
+            self._again += tasks
+        elif len(tasks) > 1:  # one of them: found by giving each to a worker that has no other
+            self._ahead = 1
+            self._again += tasks
+        else:
+            for task in tasks:
+                self._died(task, how)
+
+    def _end(self, worker: _Worker[_Task]) -> str:
+        self._workers.remove(worker)
+        self._selector.unregister(worker.channel)
+        worker.channel.close()
+        worker.process.kill()
+        return how_ended(worker.process.wait())

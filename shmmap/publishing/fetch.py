@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A published map back into files: a divided map, as Autoware reads it, every object verified on the way.
+
+The directory appears complete or not at all.  What a run that was stopped has fetched is not fetched again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.dividing.progress import Progress
+from shmmap.dividing.workspace import Workspace
+from shmmap.errors import BadRequest, MapDataError, MapMissing
+from shmmap.failpoints import step
+from shmmap.formats.durable_file import writing_errors
+from shmmap.formats.pcd.writer import write_pcd
+from shmmap.origin.map_frame import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
+from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
+from shmmap.origin.remote.map_versions import read_entry, read_root, read_shards, require_current
+from shmmap.origin.remote.published_index import POINTS, Root, Shard
+from shmmap.origin.remote.published_object import ObjectName, read_bare_header, rows_of, unpack_object
+from shmmap.origin.remote.store import Store
+
+__all__ = ["FetchedMap", "fetch_map"]
+
+_CELLS: Final = "pointcloud_map.pcd"
+_FETCHED_AT_ONCE: Final = 16
+_SAME_M: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedMap:
+    """What was made.
+
+    Attributes
+    ----------
+    path
+        The map's directory.
+    version, map_version
+        Of the published map.
+    fetched_cells, fetched_bytes
+        What was fetched, without what a run that was stopped had; bytes of objects.
+    """
+
+    path: str
+    version: int
+    map_version: int
+    cells: int
+    points: int
+    fetched_cells: int
+    fetched_bytes: int
+
+
+class _Cell(NamedTuple):
+    name: str
+    object: ObjectName
+
+
+def fetch_map(
+    store: Store, out: str, *, version: int | None = None, force: bool = False, progress: Progress
+) -> FetchedMap:
+    """Write a version of a published map as a divided map.
+
+    Parameters
+    ----------
+    out
+        The directory to make; must not exist, or be empty, unless ``force`` replaces it.
+    version
+        None: the current one.
+
+    Raises
+    ------
+    BadRequest
+        ``out`` exists, or the map cannot be written in that format.
+    MapMissing, MapDataError, Offline
+        There is no such version, an object is gone or damaged, or the store does not answer.
+    CannotWrite
+        The disk is full or not writable.
+    InstanceBusy
+        Another run is making ``out``.
+    """
+    out = os.path.abspath(out)
+    if not force and os.path.lexists(out) and not (os.path.isdir(out) and not os.listdir(out)):
+        raise BadRequest(f"{out} exists already", hint="choose another directory, or --force to replace it")
+    if version is None:
+        current = require_current(store)
+    else:
+        try:
+            current = read_entry(store, version).current
+        except MapMissing:
+            raise MapMissing(f"there is no version {version} at {store.url}") from None
+    root = read_root(store, current)
+    with Workspace(out, "fetching", keep_failed=True) as workspace, writing_errors(out):
+        begun = {"root": current.root}
+        found = workspace.state()
+        if found is None or found.get("root") != current.root:
+            workspace.empty()
+            workspace.save(begun)
+        fetched = _Fetch(store, root, workspace.directory("map")).run(progress)
+        step("fetch.whole")
+        workspace.publish(replace=force, durable=True)
+        step("fetch.renamed")
+    progress.done(root.cells)
+    return FetchedMap(
+        out, current.version, root.map_version, root.cells, fetched.points, fetched.cells, fetched.bytes
+    )
+
+
+@dataclass(slots=True)
+class _Counts:
+    points: int = 0
+    cells: int = 0
+    bytes: int = 0
+
+
+class _Fetch:
+    """Fetches the cells of a root into a directory."""
+
+    def __init__(self, store: Store, root: Root, directory: str) -> None:
+        self._store = store
+        self._root = root
+        self._directory = directory
+        self._cells_dir = os.path.join(directory, _CELLS)
+
+    def run(self, progress: Progress) -> _Counts:
+        counts = _Counts()
+        boxes: list[NDArray[np.float64]] = []
+        names: list[str] = []
+        progress.stage("fetch", self._root.cells)
+        os.makedirs(self._cells_dir, exist_ok=True)
+        with ThreadPoolExecutor(_FETCHED_AT_ONCE, "fetch") as pool:
+            for shard in read_shards(self._store, self._root):
+                boxes.append(shard.boxes)
+                names += (name.decode() for name in shard.names)
+                counts.points += int(shard.points.sum(dtype=np.uint64))
+                for nbytes in pool.map(self._fetch, _cells_of(shard)):
+                    counts.cells += nbytes > 0
+                    counts.bytes += nbytes
+                    progress.advance(1)
+        self._write_metadata(names, np.concatenate(boxes))
+        self._write_report()
+        return counts
+
+    def _fetch(self, cell: _Cell) -> int:
+        """Write a cell's file; returns how many bytes were fetched for it, 0 if it was there."""
+        path = os.path.join(self._cells_dir, cell.name)
+        if os.path.exists(path):  # files have their names once they are whole
+            return 0
+        frame = self._store.get_exactly(cell.object.path, cell.object.size)
+        unpacked = unpack_object(frame, cell.object)
+        header = read_bare_header(unpacked, POINTS, name=f"{self._store.url}/{cell.object.path}")
+        if any(header.origin):
+            raise MapDataError("its coordinates have an origin of their own", path=cell.object.path)
+        columns: dict[str, NDArray[Any]] = {
+            column.name: rows_of(unpacked, column) for column in header.columns
+        }
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        interim = f"{path}.fetching"
+        with open(interim, "wb") as file:
+            write_pcd(file, columns)
+        step("fetch.cell")
+        os.rename(interim, path)
+        return cell.object.size
+
+    def _write_metadata(self, names: list[str], boxes: NDArray[np.float64]) -> None:
+        size_x, size_y = (_only_size(boxes[:, axis], boxes[:, axis + 2]) for axis in (0, 1))
+        entries = [
+            (os.path.basename(name), (_number_text(x), _number_text(y)))
+            for name, (x, y) in zip(names, boxes[:, :2].tolist(), strict=True)
+        ]
+        corners = dict(entries)
+        if any(corners[name] != corner for name, corner in entries):
+            raise BadRequest(
+                "two cells have one file name and different places: a divided map cannot say that"
+            )
+        text = metadata_text(_number_text(size_x), corners.items(), _number_text(size_y))
+        with open(os.path.join(self._directory, METADATA_NAME), "w", encoding="utf-8") as file:
+            file.write(text)
+
+    def _write_report(self) -> None:
+        frame = MapFrame(self._root.origin, self._root.crs, self._root.unit_m)
+        if frame == UNKNOWN_FRAME:
+            return
+        report = {**REPORT_HEAD, "origin": frame.origin, "crs": frame.crs, "unit_m": frame.unit_m}
+        with open(os.path.join(self._directory, REPORT_NAME), "w", encoding="utf-8") as file:
+            json.dump(report, file, indent=2)
+
+
+def _cells_of(shard: Shard) -> Iterator[_Cell]:
+    objects = shard.layers[POINTS]
+    return (_Cell(name.decode(), objects.name(row)) for row, name in enumerate(shard.names))
+
+
+def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
+    """The size that all cells have along an axis, such that a corner and it give the box again."""
+    sizes = high - low
+    for size in (round(float(sizes[0]), 9), float(sizes[0])):
+        if (low + size == high).all():
+            return size
+    if np.ptp(sizes) > _SAME_M:
+        raise BadRequest("its cells are of different sizes: a divided map cannot say that")
+    return float(np.median(sizes))
+
+
+def _number_text(value: float) -> str:
+    """Shortest text that gives the same bits, an integer whenever it is whole."""
+    return str(int(value)) if value.is_integer() else repr(value)

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Removing versions that have not been current for long, and the objects that no version has.
+
+Entries go first; then the entries are listed again, and only objects that none of these has, and that are as
+old, are removed.  So whatever is being published, restored or read meanwhile keeps its objects.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Final
+
+from shmmap.errors import BadRequest, MapMissing
+from shmmap.failpoints import step
+from shmmap.origin.remote.map_versions import (
+    Current,
+    Entry,
+    earlier_versions,
+    entry_path,
+    list_entries,
+    read_entry,
+    require_current,
+)
+from shmmap.origin.remote.store import Listed, Store
+from shmmap.prepare.run import PrepareProgress
+from shmmap.publishing.restore import objects_of
+
+__all__ = ["KEEP_DAYS", "LEAST_KEEP_DAYS", "Pruned", "prune_versions"]
+
+KEEP_DAYS: Final = 30.0
+LEAST_KEEP_DAYS: Final = 7.0
+_DAY_S: Final = 86_400.0
+_BLOBS: Final = "blobs/"
+
+
+@dataclass(slots=True)
+class Pruned:
+    """What was removed: the numbers of versions, objects and their bytes; and what is kept."""
+
+    versions: list[int] = field(default_factory=list)
+    objects: int = 0
+    bytes: int = 0
+    kept_versions: list[int] = field(default_factory=list)
+    kept_objects: int = 0
+    kept_bytes: int = 0
+
+
+def prune_versions(
+    store: Store, *, keep_days: float = KEEP_DAYS, progress: PrepareProgress, now_s: float | None = None
+) -> Pruned:
+    """Remove versions that have not been current for ``keep_days``, and what only they have.
+
+    Parameters
+    ----------
+    keep_days
+        7 or more.
+    now_s
+        Unix time; None: the clock's.
+
+    Raises
+    ------
+    BadRequest
+        ``keep_days`` is too few, or the store takes nothing.
+    MapMissing, MapDataError, Offline
+        Nothing is published there; a version that is kept cannot be read, so that nobody knows what it has.
+    """
+    if store.read_only:
+        raise BadRequest(f"{store.url}: {store.read_only}")
+    if not keep_days >= LEAST_KEEP_DAYS:
+        raise BadRequest(f"versions are kept for {LEAST_KEEP_DAYS:g} days at least")
+    old_s = (time.time() if now_s is None else now_s) - keep_days * _DAY_S
+    current = require_current(store)
+    result = Pruned()
+    for version in _old_versions(store, current, old_s):
+        step("prune.entry")
+        store.delete(entry_path(version))
+        result.versions.append(version)
+    step("prune.listed")
+    needed = _needed(store, progress, result)
+    _remove_objects(store, needed, old_s, progress, result)
+    return result
+
+
+def _old_versions(store: Store, current: Current, old_s: float) -> list[int]:
+    """Versions that have not been current since then, or were made before and never served; ascending."""
+    old: list[int] = []
+    replaced_s: float | None = None  # when the one after it became current
+    served: set[int] = set()
+    for entry in earlier_versions(store, current):
+        served.add(entry.version)
+        if replaced_s is not None and replaced_s < old_s:
+            old.append(entry.version)
+        replaced_s = entry.created_s
+    for version in list_entries(store):
+        if version not in served and version != current.version:
+            unserved = _entry(store, version)
+            if unserved is not None and unserved.created_s < old_s:
+                old.append(version)
+    return sorted(old)
+
+
+def _entry(store: Store, version: int) -> Entry | None:
+    try:
+        return read_entry(store, version)
+    except MapMissing:  # pruned by another one
+        return None
+
+
+def _needed(store: Store, progress: PrepareProgress, result: Pruned) -> set[bytes]:
+    """Hashes of all objects that a version has: of what is listed now, and of what is current now."""
+    roots: dict[str, Current] = {}
+    for version in list_entries(store):
+        if (entry := _entry(store, version)) is not None:
+            roots[entry.root] = entry.current
+            result.kept_versions.append(version)
+    current = require_current(store)
+    roots[current.root] = current
+    served = {current.root, *(entry.root for entry in earlier_versions(store, current))}
+    progress.stage("read versions", len(roots))
+    needed: set[bytes] = set()
+    for named in roots.values():
+        try:
+            needed.update(objects_of(store, named))
+        except MapMissing:  # what was never served need not be whole
+            if named.root in served:
+                raise
+        progress.advance(1)
+    return needed
+
+
+def _remove_objects(
+    store: Store, needed: set[bytes], old_s: float, progress: PrepareProgress, result: Pruned
+) -> None:
+    names = {digest.hex() for digest in needed}
+    needed.clear()
+    listed = list(store.list(_BLOBS))
+    progress.stage("remove objects", len(listed))
+    for found in listed:
+        if found.path.rpartition("/")[2] in names or not _is_old(store, found, old_s):
+            result.kept_objects += 1
+            result.kept_bytes += found.size
+        else:
+            step("prune.object")
+            store.delete(found.path)
+            result.objects += 1
+            result.bytes += found.size
+        progress.advance(1)
+    progress.done(len(listed))
+
+
+def _is_old(store: Store, listed: Listed, old_s: float) -> bool:
+    """Whether an object is as old as it was listed: a publisher may have sent it again meanwhile."""
+    if listed.modified_s >= old_s:
+        return False
+    found = store.head(listed.path)
+    return found is not None and found.modified_s < old_s

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An earlier version's content becomes current again, under a new number."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final, NamedTuple
+
+from shmmap.errors import BadRequest, MapDataError, MapMissing
+from shmmap.failpoints import step
+from shmmap.origin.remote.map_versions import (
+    Current,
+    Entry,
+    add_version,
+    earlier_versions,
+    new_entry,
+    read_current,
+    read_entry,
+    read_root,
+    read_shards,
+)
+from shmmap.origin.remote.published_index import LayerObjects, Root
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.store import Store
+from shmmap.prepare.run import PrepareProgress
+
+__all__ = ["Restored", "object_sizes", "objects_of", "restore_version"]
+
+_ASKED_AT_ONCE: Final = 32
+_NAMED: Final = 3
+
+
+class Restored(NamedTuple):
+    """``version`` is the new number, None where that content is current; ``objects`` were looked for."""
+
+    version: int | None
+    restored: int
+    current: int
+    objects: int
+
+
+def restore_version(store: Store, version: int, progress: PrepareProgress) -> Restored:
+    """Make the content of an earlier version current again, all of whose objects must be there.
+
+    Raises
+    ------
+    MapMissing
+        Nothing is published, or there is no such version (any more).
+    BadRequest
+        It was never served.
+    MapDataError
+        Some of its objects are gone.
+    InstanceBusy
+        Another publisher has switched meanwhile.
+    """
+    seen = read_current(store)
+    if seen.current is None:
+        raise MapMissing(f"no map is published at {store.url}")
+    served = {entry.version: entry for entry in earlier_versions(store, seen.current)}
+    old = served.get(version)
+    if old is None:
+        try:
+            read_entry(store, version)
+        except MapMissing:
+            raise MapMissing(
+                f"there is no version {version} at {store.url}", hint="`shmmap versions URL` lists them"
+            ) from None
+        raise BadRequest(
+            f"version {version} was never served: its publisher did not finish",
+            hint="`shmmap versions URL` says which were",
+        )
+    if old.root == seen.current.root:
+        return Restored(None, version, seen.current.version, 0)
+    step("restore.entry")
+    # from here on pruning spares its objects; had it begun before, the old entry would be gone now
+    entry = new_entry(store, old.root, old.bytes, seen.current, restored=version)
+    _require_entry(store, old)
+    objects = _look_for_objects(store, old.current, progress)
+    step("restore.looked")
+    add_version(store, entry, seen)
+    return Restored(entry.version, version, entry.version, objects)
+
+
+def _require_entry(store: Store, entry: Entry) -> None:
+    try:
+        read_entry(store, entry.version)
+    except MapMissing:
+        raise MapMissing(f"version {entry.version} at {store.url} has just been pruned") from None
+
+
+def _look_for_objects(store: Store, current: Current, progress: PrepareProgress) -> int:
+    root = read_root(store, current)
+    progress.stage("look for objects", root.cells)
+    missing: list[str] = []
+    looked = 0
+
+    def is_missing(named: tuple[bytes, int]) -> bool:
+        found = store.head(blob_path(named[0]))
+        return found is None or found.size != named[1]
+
+    with ThreadPoolExecutor(_ASKED_AT_ONCE, "head") as pool:
+        for shard in read_shards(store, root):  # which reads the shards themselves
+            objects = {named for layer in shard.layers.values() for named in object_sizes(layer)}
+            ordered = sorted(objects)
+            gone = pool.map(is_missing, ordered)
+            missing += itertools.compress((blob_path(digest) for digest, _ in ordered), gone)
+            looked += len(ordered)
+            progress.advance(len(shard))
+    progress.done(root.cells)
+    if missing:
+        named = ", ".join(missing[:_NAMED])
+        raise MapDataError(
+            f"{len(missing):,} objects of version {current.version} are not there: {named}",
+            path=store.url,
+            hint="publish its map again",
+        )
+    return looked
+
+
+def object_sizes(layer: LayerObjects) -> Iterator[tuple[bytes, int]]:
+    """Hash and size of each object."""
+    hashes = layer.hashes.tobytes()
+    return ((hashes[32 * row : 32 * row + 32], size) for row, size in enumerate(layer.sizes.tolist()))
+
+
+def objects_of(store: Store, current: Current) -> Iterator[bytes]:
+    """Hashes of all objects of a version: its root, shards, and layers.
+
+    Raises
+    ------
+    MapMissing, MapDataError, Offline
+        Its root or a shard cannot be read.
+    """
+    root: Root = read_root(store, current)
+    yield bytes.fromhex(current.root)
+    for number in range(len(root.keys)):
+        yield root.shard_sha256(number)
+    for shard in read_shards(store, root):
+        for layer in shard.layers.values():
+            yield from (digest for digest, _ in object_sizes(layer))

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A publishing worker: a process that makes the layers of one cell after the other and sends their objects.
+
+Layers are made as `shmmap.prepare` and loaders make them.  While one cell is sent, the next is made.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Final
+
+from shmmap.errors import InternalError, MapDataError, ShmmapError
+from shmmap.layers.derive import CellJob
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.making import make_layer
+from shmmap.layers.points import LAYER
+from shmmap.layers.spec import LayerSpec, layer_spec
+from shmmap.origin.remote.opened_store import open_store
+from shmmap.origin.remote.published_object import MAX_OBJECT_BYTES, ObjectName, bare_object, pack_object
+from shmmap.origin.remote.store import Store
+from shmmap.prepare.work import Ready
+from shmmap.prepare.worker import CellPoints
+from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.publishing.known_objects import KnownObjects
+from shmmap.publishing.messages import (
+    CellSent,
+    CellToSend,
+    LayerSent,
+    NotSent,
+    decode_settings,
+    decode_task,
+    encode,
+)
+from shmmap.publishing.sending import send_object
+from shmmap.quantities import format_bytes
+from shmmap.segment.layout import SegmentHeader, SourceStamp
+
+__all__ = ["TASKS_AHEAD", "main"]
+
+_NICENESS: Final = 5
+TASKS_AHEAD: Final = 8
+"""Cells that a worker has at a time: as many are sent while the next is made."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Layer:
+    """A layer's object; ``frame`` is None where the version before has it."""
+
+    name: ObjectName
+    frame: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    points: SegmentHeader
+    layers: tuple[_Layer, ...]
+
+
+class _LayerRefused(Exception):
+    """A layer that cannot be made, and why."""
+
+    def __init__(self, layer: str, code: str, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.layer, self.code, self.message, self.hint = layer, code, message, hint
+
+
+class _Maker:
+    """Makes the objects of cells, in one thread."""
+
+    def __init__(self, known: KnownObjects, cache: LayerCache | None) -> None:
+        self._known = known
+        self._cache = cache
+
+    def make(self, task: CellToSend) -> _Cell:
+        specs = [layer_spec(name) for name in task.layers]
+        source = CellPoints(task.path, task.box, specs)
+        layers, headers = [], []
+        for spec, around in zip(specs, task.around, strict=True):
+            job = CellJob(task.cell_id, task.path, task.box, task.frame_id, around)
+            header, layer = self._layer(spec, job, source)
+            headers.append(header)
+            layers.append(layer)
+        states: set[SourceStamp] = {header.source for header in headers}
+        if len(states) > 1:
+            raise _LayerRefused(
+                str(specs[0]), MapDataError.code, f"{task.path}: the file changed while it was read"
+            )
+        return _Cell(headers[task.layers.index(LAYER)], tuple(layers))
+
+    def _layer(self, spec: LayerSpec, job: CellJob, source: CellPoints) -> tuple[SegmentHeader, _Layer]:
+        name = str(spec)
+        try:
+            fd = os.memfd_create("layer", os.MFD_CLOEXEC)
+            try:
+                made = make_layer(spec, job, fd, cache=self._cache, source=lambda: source.points(spec))
+                header = made.header
+                if header.total_bytes > MAX_OBJECT_BYTES:
+                    raise MapDataError(
+                        f"{name} has {format_bytes(header.total_bytes)}, more than the"
+                        f" {format_bytes(MAX_OBJECT_BYTES)} that a published layer of a cell may have",
+                        path=job.path,
+                        cause="too_large",
+                        hint="divide the map into smaller cells",
+                    )
+                return header, self._object(_contents(fd, header.total_bytes))
+            finally:
+                os.close(fd)
+        except ShmmapError as error:
+            raise _LayerRefused(name, error.code, error.message, error.hint) from None
+        except OSError as error:
+            message = f"{error.filename or job.path}: {error.strerror or error}"
+            raise _LayerRefused(name, MapDataError.code, message) from None
+        except MemoryError:
+            message = f"{job.path}: building {name} ran out of memory"
+            raise _LayerRefused(name, MapDataError.code, message) from None
+        except Exception as error:  # noqa: BLE001  a builder of another package, say
+            message = f"{job.path}: building {name} failed: {error!r}"
+            raise _LayerRefused(name, InternalError.code, message) from None
+
+    def _object(self, segment: memoryview) -> _Layer:
+        unpacked = bare_object(segment)
+        content = sha256(unpacked).digest()
+        found = self._known.find(content)
+        if found is not None:
+            return _Layer(found, None)
+        return _Layer(*pack_object(unpacked, content))
+
+
+def _contents(fd: int, nbytes: int) -> memoryview:
+    data = bytearray(nbytes)
+    view = memoryview(data)
+    at = 0
+    while at < nbytes:
+        got = os.preadv(fd, [view[at:]], at)
+        if not got:
+            raise MapDataError("a layer ended early")
+        at += got
+    return view
+
+
+class _Sender:
+    """Sends objects, in threads."""
+
+    def __init__(self, store: Store, send: Callable[[CellSent | NotSent], None], *, is_first: bool) -> None:
+        self._store = store
+        self._send = send
+        self._is_first = is_first
+        self._lock = threading.Lock()
+        self._there: set[bytes] = set()
+
+    def send(self, number: int, cell: _Cell) -> None:
+        """Send what is not there, and report it."""
+        try:
+            layers = tuple(
+                LayerSent(*layer.name, self._sent(layer.name, layer.frame)) for layer in cell.layers
+            )
+            header = cell.points
+            self._send(CellSent(number, header.rows, header.z_min, header.z_max, layers))
+        except ShmmapError as error:
+            self._send(NotSent(number, "", error.code, error.message, error.hint))
+        except Exception as error:  # noqa: BLE001  reported, the run ends
+            self._send(NotSent(number, "", InternalError.code, repr(error), ""))
+
+    def _sent(self, name: ObjectName, frame: bytes | None) -> int:
+        if frame is None:
+            return 0
+        with self._lock:
+            if name.sha256 in self._there:
+                return 0
+        is_new = send_object(self._store, name.path, frame, look=not self._is_first)
+        with self._lock:
+            self._there.add(name.sha256)
+        return name.size if is_new else 0
+
+
+def _work(channel: socket.socket, argument: str) -> None:
+    settings = decode_settings(argument)
+    store = open_store(
+        settings.url,
+        insecure_http=settings.insecure_http,
+        instance_credentials=settings.instance_credentials,
+    )
+    cache = LayerCache(settings.cache_dir, limit_bytes=1 << 62) if settings.cache_dir else None
+    maker = _Maker(KnownObjects(settings.known), cache)
+
+    def send(message: CellSent | NotSent) -> None:
+        channel.send(encode(message))
+
+    sender = _Sender(store, send, is_first=settings.is_first)
+    channel.send(encode(Ready()))
+    with ThreadPoolExecutor(TASKS_AHEAD, "send") as pool:
+        while data := channel.recv(MAX_PACKET_BYTES):
+            task = decode_task(data)
+            try:
+                cell = maker.make(task)
+            except _LayerRefused as error:
+                send(NotSent(task.number, error.layer, error.code, error.message[:2000], error.hint))
+            else:
+                pool.submit(sender.send, task.number, cell)
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SETTINGS``, the settings as JSON."""
+    channel = socket.socket(fileno=int(arguments[0]))
+    die_with(int(arguments[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    os.nice(_NICENESS)
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+        _work(channel, arguments[2])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

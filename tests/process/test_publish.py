@@ -1,0 +1,582 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishing: what is sent, one version at a time, killed wherever; its versions; and back into files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shmmap.layers.build import build_layer
+from tests.support.bucket_server import BucketServer
+from tests.support.daemon_process import ROOT
+from tests.support.divided_map import DividedMap, make_map
+from tests.support.published_map_reader import PublishedMapReader, columns_of
+
+zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
+
+NDT = "ndt(leaf=2.0,min_points=3)"
+DAY_S = 86_400
+
+
+class Shmmap:
+    """Runs the command line, with a home and a cache of its own."""
+
+    def __init__(self, home: Path) -> None:
+        hidden = ("SHMMAP_", "AWS_", "GOOGLE_", "AZURE_")
+        self.environment = {k: v for k, v in os.environ.items() if not k.startswith(hidden)} | {
+            "PYTHONPATH": str(ROOT),
+            "HOME": str(home),
+            "XDG_CACHE_HOME": str(home / "cache"),
+        }
+
+    def start(self, *words: str | Path, env: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+        """Start a verb; one worker is enough for these maps."""
+        if words[0] == "publish":
+            words = (*words, "--workers", "1")
+        return subprocess.Popen(
+            [sys.executable, "-m", "shmmap.cli", *map(str, words)],
+            env={**self.environment, **(env or {})},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def __call__(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> str:
+        process = self.start(*words, env=env)
+        out, errors = process.communicate()
+        assert process.returncode == code, errors + out
+        return out if code in (0, 1) else errors
+
+    def json(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> dict[str, Any]:
+        found = json.loads(self(*words, "--json", code=code, env=env))
+        assert isinstance(found, dict)
+        return found
+
+
+@pytest.fixture
+def shmmap(tmp_path: Path) -> Shmmap:
+    return Shmmap(tmp_path)
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> DividedMap:
+    return make_map(tmp_path / "town", columns=2, rows=2, points=300)
+
+
+@pytest.fixture(scope="session")
+def _stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Where the town is published, and where two more versions of it are."""
+    folder = tmp_path_factory.mktemp("published")
+    made = make_map(folder / "town", columns=2, rows=2, points=300)
+    run = Shmmap(folder)
+    run("publish", made.root, folder / "one", "--id-prefix", "/store/")
+    shutil.copytree(folder / "one", folder / "three")
+    for seed in (1, 2):
+        made.change("0_0.pcd", seed)
+        run("publish", made.root, folder / "three")
+    return folder / "one", folder / "three"
+
+
+@pytest.fixture
+def store(tmp_path: Path, _stores: tuple[Path, Path]) -> Path:
+    """A directory in which the town is published."""
+    return Path(shutil.copytree(_stores[0], tmp_path / "store"))
+
+
+@pytest.fixture
+def three(tmp_path: Path, town: DividedMap, _stores: tuple[Path, Path]) -> Path:
+    """A directory with three versions of the town, which is as in the third."""
+    town.change("0_0.pcd", 2)
+    return Path(shutil.copytree(_stores[1], tmp_path / "three"))
+
+
+def check(store: Path, town: DividedMap, prefix: str = "/store/") -> PublishedMapReader:
+    """The current version is whole and has the map's points, bit by bit, read by other programs."""
+    read = PublishedMapReader(store)
+    assert set(read.cells) == {prefix + name for name in town.corners}
+    for name in town.corners:
+        source, cell = town.points(name), read.cells[prefix + name]
+        xyz = np.column_stack([source["x"], source["y"], source["z"]])
+        assert cell.columns["points"]["xyz"].tobytes() == xyz.tobytes()
+        assert cell.columns["points"]["intensity"].tobytes() == source["intensity"].tobytes()
+        assert cell.box == town.box(name)
+        assert cell.points == len(xyz)
+        assert cell.z == (xyz[:, 2].min(), xyz[:, 2].max())
+    return read
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+# --- what is published --------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("layer_kernels")
+def test_another_reader_finds_every_layer_bit_by_bit(
+    shmmap: Shmmap, town: DividedMap, tmp_path: Path
+) -> None:
+    done = shmmap.json("publish", town.root, tmp_path / "store", "--layer", NDT, "voxel(leaf=1.0)")
+    assert (done["changed"], done["version"], done["cells"], done["failed"]) == (True, 1, 4, [])
+    assert done["layers"] == ["points", NDT, "voxel(leaf=1.0)"]
+    read = check(tmp_path / "store", town)
+    assert f"{read.map_version:016x}" == done["map_version"]
+    assert len({version for cell in read.cells.values() for version in cell.versions.values()}) == 12
+    assert sorted(cell.index for cell in read.cells.values()) == [0, 1, 2, 3]
+    for name in town.corners:
+        source, cell = town.points(name), read.cells["/store/" + name]
+        xyz = np.column_stack([source["x"], source["y"], source["z"]])
+        table = build_layer(NDT, {"xyz": xyz, "intensity": source["intensity"]})
+        assert set(cell.columns[NDT]) == set(table.columns)
+        for column, values in table.columns.items():
+            assert cell.columns[NDT][column].tobytes() == values.tobytes(), column
+
+
+def test_the_same_map_is_nothing_changed_wherever_it_lies(
+    shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
+) -> None:
+    """Objects that the server receives: none, none, none; of one changed cell five."""
+    url = buckets.url("received")
+    first = shmmap.json("publish", town.root, url, env=buckets.environment)
+    assert first["sent_objects"] == 9
+    assert len(buckets.received()) == 11  # 4 cells, 4 shards, root, entry, CURRENT
+    again = shmmap.json("publish", town.root, url, env=buckets.environment)
+    assert (again["changed"], again["version"], again["map_version"]) == (False, 1, first["map_version"])
+    for file in town.pcd_dir.iterdir():
+        os.utime(file)
+    assert not shmmap.json("publish", town.root, url, env=buckets.environment)["changed"]
+    copied = tmp_path / "elsewhere"
+    shutil.copytree(town.root, copied)
+    assert not shmmap.json("publish", copied, url, env=buckets.environment)["changed"]
+    assert buckets.received() == []
+    town.change("0_0.pcd", seed=7)
+    changed = shmmap.json("publish", town.root, url, env=buckets.environment)
+    assert (changed["changed"], changed["version"], changed["sent_objects"]) == (True, 2, 3)
+    received = [path.removeprefix("/maps/received/") for path in buckets.received()]
+    assert received[3:] == ["versions/2.json", "CURRENT"]
+    assert [path[:13] for path in received[:3]] == ["blobs/sha256/"] * 3
+
+
+def recompressed(store: Path) -> None:
+    """Make every object as another release of zstd would."""
+    from tests.support.message_pack import pack, unpack
+
+    def again(digest: bytes, change: Callable[[bytes], bytes] = bytes) -> tuple[bytes, bytes]:
+        path = store / "blobs/sha256" / digest.hex()
+        unpacked = zstandard.ZstdDecompressor().decompress(path.read_bytes())
+        frame = zstandard.ZstdCompressor(level=1, write_checksum=True).compress(change(unpacked))
+        path.unlink(missing_ok=True)
+        path.with_name(hashlib.sha256(frame).hexdigest()).write_bytes(frame)
+        return hashlib.sha256(frame).digest(), frame
+
+    def shard(unpacked: bytes) -> bytes:
+        found = unpack(unpacked)
+        for layer in found["layers"].values():
+            made = [again(layer["sha256"][at : at + 32]) for at in range(0, len(layer["sha256"]), 32)]
+            layer["sha256"] = b"".join(digest for digest, _ in made)
+            layer["size"] = np.array([len(frame) for _, frame in made], "<u4").tobytes()
+        return pack(found)
+
+    def root(unpacked: bytes) -> bytes:
+        found = unpack(unpacked)
+        digests = found["shard_sha256"]
+        made = [again(digests[at : at + 32], shard) for at in range(0, len(digests), 32)]
+        found["shard_sha256"] = b"".join(digest for digest, _ in made)
+        found["shard_bytes"] = np.array([len(frame) for _, frame in made], "<u4").tobytes()
+        return pack(found)
+
+    current = json.loads((store / "CURRENT").read_bytes())
+    digest, frame = again(bytes.fromhex(current["root"]), root)
+    current |= {"root": digest.hex(), "bytes": len(frame)}
+    entry = json.loads((store / f"versions/{current['version']}.json").read_bytes())
+    (store / "CURRENT").write_text(json.dumps(current))
+    (store / f"versions/{current['version']}.json").write_text(json.dumps({**entry, **current}))
+
+
+def test_after_another_release_of_zstd_no_cell_is_sent(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+    before = PublishedMapReader(store)
+    recompressed(store)
+    versions = {cell_id: cell.versions for cell_id, cell in check(store, town).cells.items()}
+    assert versions == {cell_id: cell.versions for cell_id, cell in before.cells.items()}
+    assert not shmmap.json("publish", town.root, store)["changed"]
+    town.change("0_0.pcd", seed=8)
+    assert shmmap.json("publish", town.root, store)["sent_objects"] == 3
+    check(store, town)
+
+
+def test_cells_that_come_move_and_go(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    shmmap("publish", town.root, store, "--id-prefix", "/city/")
+    points = town.points("0_0.pcd")
+    town.write_cell("renamed.pcd", (0, 0), {key: points[key] for key in ("x", "y", "z", "intensity")})
+    town.remove_cell("0_0.pcd")
+    town.write_metadata()
+    done = shmmap.json("publish", town.root, store)
+    assert (done["id_prefix"], done["sent_objects"]) == ("/city/", 2)  # a shard and the root
+    check(store, town, "/city/")
+    errors = shmmap("publish", town.root, store, "--id-prefix", "/other/", code=2)
+    assert "begin with /city/" in errors
+
+
+def test_one_cloud_is_a_map(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+    shmmap("publish", town.pcd_dir / "0_0.pcd", f"file://{tmp_path}/store/", "--id-prefix", "/one/")
+    (cell,) = PublishedMapReader(tmp_path / "store").cells.values()
+    assert cell.points == 300
+    shmmap("fetch", tmp_path / "store", tmp_path / "back")
+    assert shmmap.json("publish", tmp_path / "back", tmp_path / "store")["changed"] is False
+
+
+def test_a_cell_that_cannot_be_read_publishes_nothing(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+    before = (store / "CURRENT").read_bytes()
+    (town.pcd_dir / "0_0.pcd").write_bytes(b"# .PCD v0.7\nnot a cloud\n")
+    done = shmmap.json("publish", town.root, store, code=1)
+    assert [one["id"] for one in done["failed"]] == [town.id("0_0.pcd")]
+    assert (done["changed"], done["version"]) == (False, 1)
+    assert (store / "CURRENT").read_bytes() == before
+    assert "the current version stays" in shmmap("publish", town.root, store, code=1)
+
+
+def test_what_is_damaged_in_the_store_is_sent_again(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+    for damaged in (store / "blobs/sha256").iterdir():
+        damaged.write_bytes(b"")
+    assert "has 0 bytes" in shmmap("publish", town.root, store, code=65)
+    assert shmmap.json("publish", town.root, store, "--resend")["sent_objects"] == 9
+    check(store, town)
+    again = shmmap.json("publish", town.root, store)
+    assert (again["changed"], again["version"]) == (False, 2)
+
+
+# --- killed, and two at a time ------------------------------------------------------------------------
+
+
+PUBLISH_STEPS = (
+    "publish.shard", "publish.root", "version.entry", "version.switch", "version.switched",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("label", PUBLISH_STEPS)
+def test_killed_anywhere_the_current_version_is_whole(
+    label: str, shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    before = make_map(tmp_path / "before", columns=2, rows=2, points=300)
+    for seed, name in enumerate(list(town.corners)[:2]):
+        town.change(name, seed)
+    shmmap("publish", town.root, store, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    check(store, town if label == "version.switched" else before)
+    again = shmmap.json("publish", town.root, store)
+    assert again["changed"] == (label != "version.switched")
+    assert again["sent_objects"] <= {"publish.shard": 3, "publish.root": 1}.get(label, 0)
+    check(store, town)
+    rows = shmmap.json("versions", store)["versions"]
+    unserved = [row["version"] for row in rows if row["state"] == "never served"]
+    assert unserved == ([2] if label == "version.switch" else [])
+
+
+def test_killed_while_cells_are_sent_it_goes_on(
+    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    before = make_map(tmp_path / "before", columns=2, rows=2, points=300)
+    for seed, name in enumerate(town.corners):
+        town.change(name, seed)
+    count = len(os.listdir(store / "blobs/sha256"))
+    process = shmmap.start("publish", town.root, store)
+    while process.poll() is None and len(os.listdir(store / "blobs/sha256")) == count:
+        time.sleep(0.001)
+    process.kill()
+    process.communicate()
+    read = PublishedMapReader(store)
+    check(store, before if read.current["version"] == 1 else town)
+    shmmap("publish", town.root, store)
+    check(store, town)
+
+
+def test_a_worker_that_is_killed_costs_nothing(
+    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    for seed, name in enumerate(town.corners):
+        town.change(name, seed)
+    crash = f"publish.send:2:{tmp_path}/died"
+    done = shmmap.json("publish", town.root, store, env={"SHMMAP_TEST_CRASH": crash})
+    assert done["changed"]
+    assert (tmp_path / "died").exists()
+    check(store, town)
+
+
+def test_of_two_publishers_one_wins_and_the_other_learns_it(
+    shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
+) -> None:
+    other = make_map(tmp_path / "other", columns=2, rows=2, points=300, seed=9)
+    url = buckets.url("raced")
+    running = [shmmap.start("publish", one.root, url, env=buckets.environment) for one in (town, other)]
+    answers = [process.communicate() for process in running]
+    codes = [process.returncode for process in running]
+    assert 0 in codes, answers  # they may also have come one after the other
+    for (_, errors), code in zip(answers, codes, strict=True):
+        assert code in (0, 75), errors
+        assert code == 0 or "another publisher has changed" in errors
+    shmmap("fetch", url, tmp_path / "back", env=buckets.environment)
+    back = files_of(tmp_path / "back/pointcloud_map.pcd")
+    assert back in (files_of(town.pcd_dir), files_of(other.pcd_dir))
+
+
+HOLDING = """
+import fcntl, sys
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+    """It is stopped before its switch, while the other one publishes."""
+    town.change("0_0.pcd", seed=1)
+    hold = subprocess.Popen(
+        [sys.executable, "-c", HOLDING, str(store / ".lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert hold.stdout is not None
+    assert hold.stdout.readline() == "held\n"
+    slow = shmmap.start("publish", town.root, store)
+    while not (store / "versions/2.json").exists():
+        assert slow.poll() is None
+        time.sleep(0.01)
+    # what another publisher would have made current meanwhile
+    faster = json.loads((store / "CURRENT").read_bytes()) | {"version": 3}
+    entry = json.loads((store / "versions/1.json").read_bytes())
+    (store / "versions/3.json").write_text(json.dumps({**entry, "version": 3, "before": 1}))
+    (store / "CURRENT").write_text(json.dumps(faster))
+    hold.communicate("")
+    _, errors = slow.communicate()
+    assert slow.returncode == 75, errors
+    assert "another publisher has changed" in errors
+    assert json.loads((store / "CURRENT").read_bytes()) == faster
+    states = {row["version"]: row["state"] for row in shmmap.json("versions", store)["versions"]}
+    assert states == {1: "earlier", 2: "never served", 3: "current"}
+    assert shmmap.json("publish", town.root, store)["version"] == 4
+
+
+# --- versions -----------------------------------------------------------------------------------------
+
+
+def test_going_back_is_a_new_number(shmmap: Shmmap, town: DividedMap, three: Path, tmp_path: Path) -> None:
+    before = make_map(tmp_path / "before", columns=2, rows=2, points=300)
+    for label in ("restore.entry", "restore.looked", "version.switch"):
+        shmmap("versions", three, "--rollback", "1", code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+        check(three, town)
+    done = shmmap.json("versions", three, "--rollback", "1")
+    assert (done["changed"], done["version"], done["restored"], done["objects"]) == (True, 6, 1, 4)
+    read = check(three, before)
+    assert (read.entry["before"], read.entry["restored"]) == (3, 1)
+    assert not shmmap.json("versions", three, "--rollback", "1")["changed"]
+    assert not shmmap.json("publish", before.root, three)["changed"]
+    assert "was never served" in shmmap("versions", three, "--rollback", "4", code=2)
+    assert "there is no version 9" in shmmap("versions", three, "--rollback", "9", code=66)
+    rows = shmmap.json("versions", three)["versions"]
+    assert [(row["version"], row["state"], row["restored"]) for row in rows] == [
+        (6, "current", 1), (5, "never served", 1), (4, "never served", 1),
+        (3, "earlier", 0), (2, "earlier", 0), (1, "earlier", 0),
+    ]  # fmt: skip
+    assert re.search(r"6 +current .* version 1\n", shmmap("versions", three))
+
+
+def test_a_version_that_is_not_whole_does_not_come_back(
+    shmmap: Shmmap, town: DividedMap, three: Path, store: Path
+) -> None:
+    """An object that version 1 has and version 3 has not is gone."""
+    first = {cell.columns["points"]["xyz"].tobytes() for cell in PublishedMapReader(store).cells.values()}
+    third = {cell.columns["points"]["xyz"].tobytes() for cell in check(three, town).cells.values()}
+    assert len(first - third) == 1
+    for path in (store / "blobs/sha256").iterdir():
+        frame = path.read_bytes()
+        unpacked = zstandard.ZstdDecompressor().decompress(frame)
+        if unpacked.startswith(b"SHMMAP") and columns_of(unpacked, "points", 1)["xyz"].tobytes() not in third:
+            (three / "blobs/sha256" / path.name).unlink()
+    errors = shmmap("versions", three, "--rollback", "1", code=65)
+    assert "1 objects of version 1 are not there" in errors
+    check(three, town)
+
+
+def aged(store: Path, days: float, *versions: int) -> None:
+    """Let entries and all objects be so old."""
+    then = time.time() - days * DAY_S
+    for version in versions:
+        path = store / f"versions/{version}.json"
+        entry = json.loads(path.read_bytes())
+        entry["created"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(then))
+        path.write_text(json.dumps(entry))
+    for path in (store / "blobs/sha256").iterdir():
+        os.utime(path, (then, then))
+
+
+@pytest.mark.parametrize("label", ["", "prune.entry", "prune.listed", "prune.object"])
+def test_pruning_takes_what_only_old_versions_have(
+    label: str, shmmap: Shmmap, town: DividedMap, three: Path, tmp_path: Path
+) -> None:
+    names = set(os.listdir(three / "blobs/sha256"))
+    if not label:
+        kept = shmmap.json("versions", three, "--prune")
+        assert (kept["versions"], kept["objects"], kept["kept_versions"]) == ([], 0, [1, 2, 3])
+    aged(three, 40, 1, 2)
+    aged(three, 20, 3)  # since then 2 is not current
+    aged(three, 40)
+    if label:
+        shmmap("versions", three, "--prune", code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+        check(three, town)
+    done = shmmap.json("versions", three, "--prune")
+    assert done["kept_versions"] == [2, 3]
+    assert (done["versions"], done["objects"]) == ([1] if label in ("", "prune.entry") else [], 3)
+    assert len(names - set(os.listdir(three / "blobs/sha256"))) == 3  # a cell, a shard, a root
+    check(three, town)
+    if label:
+        return
+    shmmap("fetch", three, tmp_path / "two", "--at", "2")
+    assert "there is no version 1" in shmmap("fetch", three, tmp_path / "one", "--at", "1", code=66)
+    done = shmmap.json("versions", three, "--prune", "--keep", "7")
+    assert (done["versions"], done["objects"]) == ([2], 3)
+    check(three, town)
+
+
+def test_pruning_spares_what_is_young_and_what_is_being_published(
+    shmmap: Shmmap, town: DividedMap, store: Path
+) -> None:
+    aged(store, 99, 1)
+    town.change("0_0.pcd", seed=1)
+    shmmap("publish", town.root, store, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": "version.switch"})
+    done = shmmap.json("versions", store, "--prune", "--keep", "7")
+    assert (done["versions"], done["objects"], done["kept_versions"]) == ([], 0, [1, 2])
+    aged(store, 8, 2)
+    aged(store, 99, 1)
+    done = shmmap.json("versions", store, "--prune", "--keep", "7")
+    assert (done["versions"], done["objects"]) == ([2], 3)
+    assert "7 or more" in shmmap("versions", store, "--prune", "--keep", "6", code=2)
+    assert "goes with --prune" in shmmap("versions", store, "--keep", "9", code=2)
+
+
+# --- back into files ----------------------------------------------------------------------------------
+
+
+def test_fetched_files_have_every_field_bit_by_bit(
+    shmmap: Shmmap, town: DividedMap, tmp_path: Path, web: tuple[str, Path]
+) -> None:
+    url, folder = web
+    shmmap("publish", town.root, folder / "town")
+    done = shmmap.json("fetch", f"{url}/town", tmp_path / "back")
+    assert (done["version"], done["cells"], done["fetched_cells"], done["points"]) == (1, 4, 4, 1200)
+    assert files_of(tmp_path / "back/pointcloud_map.pcd") == files_of(town.pcd_dir)
+    assert not shmmap.json("publish", tmp_path / "back", folder / "town")["changed"]
+    assert "exists already" in shmmap("fetch", f"{url}/town", tmp_path / "back", code=2)
+    town.change("0_0.pcd", seed=3)
+    shmmap("publish", town.root, folder / "town")
+    shmmap("fetch", f"{url}/town", tmp_path / "back", "--force")
+    assert files_of(tmp_path / "back/pointcloud_map.pcd") == files_of(town.pcd_dir)
+    assert [row["version"] for row in shmmap.json("versions", f"{url}/town")["versions"]] == [2, 1]
+    assert "a web server takes nothing" in shmmap("publish", town.root, f"{url}/town", code=2)
+    assert "a web server takes nothing" in shmmap("versions", f"{url}/town", "--prune", code=2)
+    assert not list(tmp_path.glob(".*fetching*"))
+
+
+def test_a_divided_cloud_keeps_its_frame(shmmap: Shmmap, tmp_path: Path) -> None:
+    from tests.support.clouds import cloud_file, xyzircaedt
+
+    columns = xyzircaedt(500)
+    for axis, shift in (("x", 390_000), ("y", 5_820_000)):
+        columns[axis] = columns[axis].astype(np.float64) + shift
+    cloud_file(tmp_path / "cloud.pcd", columns)
+    shmmap("divide", tmp_path / "cloud.pcd", tmp_path / "divided", "--translate", "auto")
+    shmmap("publish", tmp_path / "divided", tmp_path / "store")
+    report = json.loads((tmp_path / "divided/shmmap_divide.json").read_bytes())
+    read = PublishedMapReader(tmp_path / "store")
+    assert any(report["origin"])
+    assert read.root["origin"] == report["origin"]
+    shmmap("fetch", tmp_path / "store", tmp_path / "back")
+    back = json.loads((tmp_path / "back/shmmap_divide.json").read_bytes())
+    assert (back["origin"], back["unit_m"]) == (report["origin"], report["unit_m"])
+    assert not shmmap.json("publish", tmp_path / "back", tmp_path / "store")["changed"]
+
+
+@pytest.mark.parametrize("label", ["fetch.cell:3", "fetch.whole", "fetch.renamed"])
+def test_a_fetch_that_is_killed_goes_on(
+    label: str, shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "back"
+    shmmap("fetch", store, out, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    assert out.exists() == (label == "fetch.renamed")
+    if label != "fetch.renamed":
+        done = shmmap.json("fetch", store, out)
+        assert done["fetched_cells"] <= (0 if label == "fetch.whole" else 3)
+    assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+
+
+def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Shmmap, store: Path, tmp_path: Path) -> None:
+    blobs = store / "blobs/sha256"
+    largest = max(blobs.iterdir(), key=lambda path: path.stat().st_size)
+    whole = largest.read_bytes()
+    largest.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert "its SHA-256 is not its name" in shmmap("fetch", store, tmp_path / "back", code=65)
+    largest.unlink()
+    assert "is not there" in shmmap("fetch", store, tmp_path / "back", code=66)
+    assert not (tmp_path / "back").exists()
+    largest.write_bytes(whole)
+    done = shmmap.json("fetch", store, tmp_path / "back")
+    assert done["fetched_cells"] >= 1
+    (store / "CURRENT").write_bytes(b"{")
+    assert "CURRENT" in shmmap("fetch", store, tmp_path / "other", code=65)
+    assert "no map is published" in shmmap("fetch", tmp_path / "nothing", tmp_path / "other", code=66)
+
+
+# --- wrong usage and what is missing ------------------------------------------------------------------
+
+
+def test_urls_that_cannot_be_meant(shmmap: Shmmap, town: DividedMap) -> None:
+    for url, says in (
+        ("s3://key:hunter2@maps/town", "may hold a secret"),
+        ("ftp://maps/town", "cannot lie at a ftp:// URL"),
+        ("http://192.0.2.1/town", "plain http://"),
+    ):
+        errors = shmmap("publish", town.root, url, code=2)
+        assert says in errors
+        assert "hunter2" not in errors
+
+
+def test_a_store_that_does_not_answer(shmmap: Shmmap) -> None:
+    pytest.importorskip("obstore", reason="obstore is not installed")
+    errors = shmmap(
+        "versions",
+        "s3://maps/town",
+        code=75,
+        env={
+            "AWS_ENDPOINT_URL": "http://127.0.0.1:9",
+            "AWS_ACCESS_KEY_ID": "k",
+            "AWS_SECRET_ACCESS_KEY": "hunter2",
+        },
+    )
+    assert "s3://maps/town/CURRENT: no answer" in errors
+    assert "hunter2" not in errors
+
+
+@pytest.mark.parametrize("package", ["obstore", "zstandard"])
+def test_without_the_packages_a_url_says_what_to_install(
+    package: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
+) -> None:
+    (tmp_path / "without").mkdir()
+    (tmp_path / "without" / f"{package}.py").write_text(f"raise ModuleNotFoundError(name={package!r})\n")
+    path = f"{tmp_path / 'without'}:{ROOT}"
+    errors = shmmap("publish", town.root, "s3://maps/town", code=69, env={"PYTHONPATH": path})
+    assert f"needs the package {package}" in errors
+    assert f"pip install {package}" in errors

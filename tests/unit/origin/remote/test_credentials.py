@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Credentials: from the environment, the service manager, a profile; other kinds are refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shmmap.errors import ConfigError
+from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
+
+SECRET = "hunter2"
+ANONYMOUS = {"region": "us-east-1", "skip_signature": True}
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / ".aws").mkdir()
+    return tmp_path
+
+
+def profile(path: Path, name: str = "default", key: str = "k", **more: str) -> None:
+    lines = [f"[{name}]", f"aws_access_key_id = {key}", f"aws_secret_access_key = {SECRET}"]
+    lines += [f"{one} = {value}" for one, value in more.items()]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_without_any_nobody_is_asked_for_some(home: Path) -> None:
+    del home
+    assert s3_settings({}) == (ANONYMOUS, None)
+    assert s3_settings({}, instance=True) == ({"region": "us-east-1"}, None)
+    assert google_settings({}) == {"skip_signature": True}
+    assert google_settings({}, instance=True) == {}
+    assert azure_settings({}) == {"skip_signature": True}
+    assert azure_settings({}, instance=True) == {}
+
+
+def test_the_environment_comes_first(home: Path) -> None:
+    profile(home / ".aws/credentials")
+    found, provider = s3_settings(
+        {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_SESSION_TOKEN": "c", "AWS_REGION": "eu"}
+    )
+    assert found == {"access_key_id": "a", "secret_access_key": "b", "session_token": "c"}
+    assert provider is None
+    assert s3_settings({"AWS_SKIP_SIGNATURE": "true"}) == (ANONYMOUS, None)
+    with pytest.raises(ConfigError, match="only together"):
+        s3_settings({"AWS_SECRET_ACCESS_KEY": SECRET})
+
+
+def keys(environment: dict[str, str]) -> tuple[str, str | None]:
+    found, provider = s3_settings(environment)
+    assert "skip_signature" not in found
+    assert provider is not None
+    given = provider()
+    assert given["secret_access_key"] == SECRET
+    return given["access_key_id"], given["token"]
+
+
+def test_files_of_profiles(home: Path) -> None:
+    profile(home / ".aws/credentials", aws_session_token="t")
+    assert keys({}) == ("k", "t")
+    other = home / "other"
+    profile(other, "fleet", "f")
+    assert keys({"AWS_SHARED_CREDENTIALS_FILE": str(other), "AWS_PROFILE": "fleet"}) == ("f", None)
+    given = home / "given"
+    given.mkdir()
+    profile(given / "shmmap.aws", key="of-the-unit")
+    assert keys({"CREDENTIALS_DIRECTORY": str(given)}) == ("of-the-unit", None)
+    assert keys({"CREDENTIALS_DIRECTORY": str(home)}) == ("k", "t")
+
+
+def test_a_file_that_is_written_again_is_read_again(home: Path) -> None:
+    profile(home / ".aws/credentials")
+    _, provider = s3_settings({})
+    assert provider is not None
+    profile(home / ".aws/credentials", key="new")
+    assert provider()["access_key_id"] == "new"
+
+
+def test_the_region_of_a_profile(home: Path) -> None:
+    (home / ".aws/config").write_text("[default]\nregion = eu-west-1\n[profile fleet]\nregion = us-west-2\n")
+    assert s3_settings({})[0]["region"] == "eu-west-1"
+    profile(home / ".aws/credentials", "fleet")
+    assert s3_settings({"AWS_PROFILE": "fleet"})[0]["region"] == "us-west-2"
+    assert "region" not in s3_settings({"AWS_DEFAULT_REGION": "x"})[0]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["sso_session = x", "sso_start_url = https://x", "role_arn = arn:x", "credential_process = /bin/x",
+     "web_identity_token_file = /x"],
+)  # fmt: skip
+@pytest.mark.parametrize("file", ["config", "credentials"])
+def test_other_kinds_are_refused_by_name(home: Path, line: str, file: str) -> None:
+    (home / ".aws" / file).write_text(f"[default]\n{line}\n")
+    with pytest.raises(ConfigError) as error:
+        s3_settings({})
+    assert line.split(" ")[0] in str(error.value)
+    assert "aws configure export-credentials" in error.value.hint
+
+
+def test_profiles_that_cannot_be_used_are_errors_without_secrets(home: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no profile 'fleet'"):
+        s3_settings({"AWS_PROFILE": "fleet"})
+    credentials = home / ".aws/credentials"
+    for text in (f"aws_secret_access_key = {SECRET}\n", f"[default\nkey = {SECRET}\n", f"\xff{SECRET}"):
+        credentials.write_text(text, encoding="latin-1")
+        with pytest.raises(ConfigError) as error:
+            s3_settings({})
+        assert SECRET not in str(error.value)
+    credentials.write_text(f"[default]\naws_secret_access_key = {SECRET}\n")
+    with pytest.raises(ConfigError, match="no whole pair") as error:
+        s3_settings({})
+    assert SECRET not in str(error.value)
+
+
+def test_google_and_azure(home: Path) -> None:
+    assert google_settings({"GOOGLE_APPLICATION_CREDENTIALS": "/x"}) == {}
+    (home / "shmmap.google").write_text("{}")
+    (home / "shmmap.azure").write_text(
+        f"# account\nAZURE_STORAGE_ACCOUNT_NAME=a\nAZURE_STORAGE_SAS_TOKEN={SECRET}\n"
+    )
+    given = {"CREDENTIALS_DIRECTORY": str(home)}
+    assert google_settings(given) == {"application_credentials": str(home / "shmmap.google")}
+    assert azure_settings(given) == {"account_name": "a", "sas_key": SECRET}
+    assert azure_settings({"AZURE_STORAGE_ACCOUNT_NAME": "a", "AZURE_STORAGE_ACCOUNT_KEY": "k"}) == {
+        "account_name": "a", "account_key": "k",
+    }  # fmt: skip
+    assert azure_settings({"AZURE_STORAGE_ACCOUNT_NAME": "a"}) == {
+        "account_name": "a",
+        "skip_signature": True,
+    }
+    (home / "shmmap.azure").write_text(SECRET)
+    with pytest.raises(ConfigError) as error:
+        azure_settings(given)
+    assert SECRET not in str(error.value)
