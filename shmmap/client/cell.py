@@ -215,12 +215,12 @@ class Cell:
 
     @property
     def source(self) -> SourceStamp:
-        """Size (bytes), mtime and ctime (ns) of the source when it was read."""
+        """Size (bytes), mtime and ctime (ns) of the source file when read; of no file what names its state."""
         return self.header.source
 
     @property
     def source_digest(self) -> bytes:
-        """XXH3-128 of the source, 16 bytes."""
+        """XXH3-128 of the source file, 16 bytes; of no file, what names its content."""
         return self.header.source_digest
 
     @property

@@ -52,7 +52,7 @@ from shmmap.prepare.task_pool import TaskPool
 from shmmap.publishing.known_objects import write_known_objects
 from shmmap.publishing.messages import CellSent, CellToSend, NotSent, PublishSettings, decode_sent
 from shmmap.publishing.sending import send_object
-from shmmap.publishing.shards import CellObjects, divide_into_shards, shard_side
+from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
 from shmmap.publishing.worker import TASKS_AHEAD
 
 __all__ = ["Published", "publish_map"]
@@ -156,6 +156,7 @@ def publish_map(
         raise BadRequest(f"{store.url}: {store.read_only}")
     began_s = time.monotonic()
     names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
+    check_names(catalogue)
     before = _read_before(store, progress, resend=resend)
     prefix = _prefix(before.root, id_prefix, store.url)
     result = Published(len(catalogue), names, prefix)

@@ -21,7 +21,7 @@ from shmmap.origin.remote.published_index import (
 )
 from shmmap.publishing.messages import CellSent
 
-__all__ = ["CellObjects", "divide_into_shards", "shard_side"]
+__all__ = ["CellObjects", "check_names", "divide_into_shards", "shard_side"]
 
 _CELLS_ALONG_A_SHARD: Final = 32
 _MAX_CELLS: Final = 8192
@@ -62,6 +62,13 @@ class CellObjects:
         return sum(int(objects.sizes.sum(dtype=np.uint64)) for objects in self.layers.values())
 
 
+def check_names(catalogue: Catalogue) -> None:
+    """Refuse a map in which the name of a cell is no text (`BadRequest`)."""
+    for name in catalogue.names.tolist():
+        if not is_relative_path(name):
+            raise BadRequest(f"a cell named {name!r} cannot be published", hint="rename its file")
+
+
 def shard_side(catalogue: Catalogue, layers: int, before: float | None) -> float:
     """Return the side of a shard in metres: some 32 cells; that of the version before while it will do.
 
@@ -96,13 +103,7 @@ def _rounded(length: float) -> float:
 def divide_into_shards(
     catalogue: Catalogue, objects: CellObjects, side: float
 ) -> Iterator[tuple[tuple[int, int], Shard]]:
-    """Yield the key (row, column) of each shard, ascending, and the shard.
-
-    Raises
-    ------
-    BadRequest
-        The name of a cell is no text, or leaves the map.
-    """
+    """Yield the key (row, column) of each shard, ascending, and the shard."""
     keys = shard_keys(catalogue.boxes, side).astype(np.int64)
     order = np.lexsort((np.arange(len(keys)), keys[:, 1], keys[:, 0]))  # within a shard by name, as they are
     ordered = keys[order]
@@ -110,9 +111,6 @@ def divide_into_shards(
     for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), len(order)], strict=True):
         rows = order[begin:end]
         names = tuple(catalogue.names[rows].tolist())
-        for name in names:
-            if not is_relative_path(name):
-                raise BadRequest(f"a cell named {name!r} cannot be published", hint="rename its file")
         row, column = ordered[begin].tolist()
         yield (
             (row, column),

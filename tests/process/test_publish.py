@@ -371,6 +371,43 @@ def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: Divi
     assert shmmap.json("publish", town.root, store)["version"] == 4
 
 
+def test_an_interrupted_run_says_how_to_go_on(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+    town.change("0_0.pcd", seed=1)
+    hold = subprocess.Popen(
+        [sys.executable, "-c", HOLDING, str(store / ".lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert hold.stdout is not None
+    assert hold.stdout.readline() == "held\n"
+    process = shmmap.start("publish", town.root, store)
+    while not (store / "versions/2.json").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate()
+    hold.communicate("")
+    assert process.returncode == 130
+    assert "the same command continues" in errors
+    assert json.loads((store / "CURRENT").read_bytes())["version"] == 1
+
+
+@pytest.mark.root
+def test_a_full_disk_leaves_the_current_version(
+    shmmap: Shmmap, town: DividedMap, store: Path, private_tmpfs: Callable[[str], str]
+) -> None:
+    small = Path(private_tmpfs("200k")) / "store"
+    shutil.copytree(store, small)
+    before = (small / "CURRENT").read_bytes()
+    for seed, name in enumerate(town.corners):
+        town.change(name, seed, count=8000)
+    errors = shmmap("publish", town.root, small, code=73)
+    assert "No space left on device" in errors
+    assert (small / "CURRENT").read_bytes() == before
+    PublishedMapReader(small)
+
+
 # --- versions -----------------------------------------------------------------------------------------
 
 

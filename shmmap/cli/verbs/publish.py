@@ -13,6 +13,7 @@ from shmmap.cli.options import (
     add_verb,
     at_least,
 )
+from shmmap.cli.program import complain
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -35,7 +36,8 @@ stopped run, started again, sends only what is missing.
 JSON (fields may be added, none is removed):
   {"map", "url", "changed", "version": the current one, "map_version": hex, "root": hash of its object,
    "cells", "layers": [spec], "id_prefix", "objects": layers of cells, "bytes": of their objects,
-   "sent_objects", "sent_bytes", "seconds", "failed": [{"id", "layer", "message"}]}
+   "sent_objects", "sent_bytes", "seconds", "failed": [{"id", "layer", "message"}],
+   "notes": [text], oddities of the map}
 Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
 or damaged version, 66 no map or bucket, 69 a package is missing, 73 cannot write, 75 the store does not
 answer or refuses, or another publisher was quicker, 78 unusable credentials."""
@@ -106,21 +108,26 @@ def run(args: argparse.Namespace) -> int:
         args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir,
         unit=args.unit or "", vertical_unit=args.vertical_unit or "",
     )  # fmt: skip
-    done = publish_map(
-        origin.load(fresh=True),
-        store,
-        layers,
-        settings=PublishSettings(
-            store.url,
-            args.insecure_http,
-            args.instance_credentials,
-            cache_dir if os.path.isdir(os.path.join(cache_dir, "layers")) else "",
-        ),
-        id_prefix=args.id_prefix,
-        workers=args.workers or len(os.sched_getaffinity(0)),
-        resend=args.resend,
-        progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
-    )
+    catalogue = origin.load(fresh=True)
+    try:
+        done = publish_map(
+            catalogue,
+            store,
+            layers,
+            settings=PublishSettings(
+                store.url,
+                args.insecure_http,
+                args.instance_credentials,
+                cache_dir if os.path.isdir(os.path.join(cache_dir, "layers")) else "",
+            ),
+            id_prefix=args.id_prefix,
+            workers=args.workers or len(os.sched_getaffinity(0)),
+            resend=args.resend,
+            progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+        )
+    except KeyboardInterrupt:
+        complain("shmmap", "interrupted", "the same command continues")
+        raise
     seconds = time.monotonic() - began_s
     if args.json:
         print_json(
@@ -142,9 +149,12 @@ def run(args: argparse.Namespace) -> int:
                 "failed": [
                     {"id": one.cell_id, "layer": one.layer, "message": one.message} for one in done.failures
                 ],
+                "notes": list(catalogue.problems),
             }
         )
         return 1 if done.failures else 0
+    for problem in catalogue.problems:
+        print_line(f"note: {problem}")
     for failure in done.failures[:_SHOWN_FAILURES]:
         print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
     if done.failures:

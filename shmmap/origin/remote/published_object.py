@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, Final, NamedTuple
@@ -50,7 +50,7 @@ MILLIMETRES: Final = 2  # reserved: not written yet, and refused
 MAX_PLANED_COMPONENTS: Final = 8
 _FLAGS: Final = struct.Struct("<I")
 _STAMP: Final = struct.Struct("<Qqq")
-_BLOCK_ROWS: Final = 1 << 12  # turned at a time: what is read and written stays in the cache
+_BLOCK_ROWS: Final = 1 << 14  # at a time: what is read and written stays in the cache
 
 
 class ObjectName(NamedTuple):
@@ -118,13 +118,13 @@ def bare_object(segment: memoryview) -> bytearray:
     unpacked = bytearray(bare.total_bytes)
     unpacked[:header_bytes] = _flagged(pack_header(bare), PLANES)
     for column in filter(_has_bytes, header.columns):
-        rows = np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(
-            -1, _plane_count(column)
-        )
-        planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset + shift)
-        target = planes.reshape(rows.shape[::-1])
+        count = _plane_count(column)
+        rows = np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(-1, count)
+        planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset + shift).reshape(count, -1)
         for begin in range(0, len(rows), _BLOCK_ROWS):
-            target[:, begin : begin + _BLOCK_ROWS] = rows[begin : begin + _BLOCK_ROWS].T
+            end = begin + _BLOCK_ROWS
+            for plane in range(count):  # one at a time is up to three times as fast as a transposed copy
+                planes[plane, begin:end] = rows[begin:end, plane]
     return unpacked
 
 
@@ -269,13 +269,24 @@ def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray
     """Return a column of an unpacked object as it will be in memory, dtype and shape as its header says."""
     if not column.nbytes:
         return np.empty(column.shape, column.dtype)
-    planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(_plane_count(column), -1)
-    return np.ascontiguousarray(planes.T).reshape(-1).view(column.dtype).reshape(column.shape)
+    rows = np.concatenate([block.copy() for block in _row_blocks(unpacked, column)])
+    return rows.reshape(-1).view(column.dtype).reshape(column.shape)
+
+
+def _row_blocks(unpacked: bytes | bytearray | memoryview, column: Column) -> Iterator[NDArray[np.uint8]]:
+    """The rows of a column, (n, bytes of a row), some at a time; each is valid until the next is taken."""
+    count = _plane_count(column)
+    planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(count, -1)
+    buffer = np.empty((min(_BLOCK_ROWS, planes.shape[1]), count), np.uint8)
+    for begin in range(0, planes.shape[1], _BLOCK_ROWS):
+        block = planes[:, begin : begin + _BLOCK_ROWS]
+        rows = buffer[: block.shape[1]]
+        for plane in range(count):
+            rows[:, plane] = block[plane]
+        yield rows
 
 
 def _write_rows(fd: int, unpacked: bytes | memoryview, column: Column, offset: int) -> None:
-    count = _plane_count(column)
-    planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(count, -1)
-    for begin in range(0, planes.shape[1], _BLOCK_ROWS):
-        rows = np.ascontiguousarray(planes[:, begin : begin + _BLOCK_ROWS].T)
-        write_all(fd, rows.data.cast("B"), offset + begin * count)
+    for rows in _row_blocks(unpacked, column):
+        write_all(fd, rows.data.cast("B"), offset)
+        offset += rows.nbytes
