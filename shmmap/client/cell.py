@@ -215,7 +215,7 @@ class Cell:
 
     @property
     def source(self) -> SourceStamp:
-        """Size (bytes), mtime and ctime (ns) of the source file when read; of no file what names its state."""
+        """Size (bytes), mtime and ctime (ns) of the source file; of another source what names its state."""
         return self.header.source
 
     @property

@@ -22,7 +22,7 @@ from shmmap.origin.remote.map_versions import (
     read_entry,
     require_current,
 )
-from shmmap.origin.remote.store import Listed, Store
+from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.restore import objects_of
 
@@ -137,21 +137,23 @@ def _remove_objects(
     listed = list(store.list(_BLOBS))
     progress.stage("remove objects", len(listed))
     for found in listed:
-        if found.path.rpartition("/")[2] in names or not _is_old(store, found, old_s):
-            result.kept_objects += 1
-            result.kept_bytes += found.size
-        else:
+        if found.path.rpartition("/")[2] not in names and found.modified_s < old_s:
             step("prune.object")
-            store.delete(found.path)
-            result.objects += 1
-            result.bytes += found.size
+            removed = _remove_if_old(store, found.path, old_s)
+        else:
+            removed = False
+        result.objects += removed
+        result.bytes += found.size * removed
+        result.kept_objects += not removed
+        result.kept_bytes += found.size * (not removed)
         progress.advance(1)
     progress.done(len(listed))
 
 
-def _is_old(store: Store, listed: Listed, old_s: float) -> bool:
-    """Whether an object is as old as it was listed: a publisher may have sent it again meanwhile."""
-    if listed.modified_s >= old_s:
+def _remove_if_old(store: Store, path: str, old_s: float) -> bool:
+    """Remove an object, unless a publisher has sent it again since it was listed."""
+    found = store.head(path)
+    if found is None or found.modified_s >= old_s:
         return False
-    found = store.head(listed.path)
-    return found is not None and found.modified_s < old_s
+    store.delete(path)
+    return True

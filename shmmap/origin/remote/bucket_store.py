@@ -34,12 +34,18 @@ _IMMUTABLE: Final = {
 }
 _CHANGES: Final = {"Cache-Control": "no-cache", "Content-Type": "application/json"}
 _STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([45]\d\d)")
+_AGAIN: Final = "try again later"
+_REGION: Final = "is AWS_REGION that of the bucket?"
+_CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
 _LISTED_AT_ONCE: Final = 1000
 
 
 class BucketStore:
-    """A `shmmap.origin.remote.store.Store` below a URL; `opened_store.open_store` makes it."""
+    """A `shmmap.origin.remote.store.Store` below a URL; `opened_store.open_store` makes it.
+
+    Once something was asked of any, a forked process cannot ask: obstore's threads are not in it.
+    """
 
     def __init__(
         self, where: StoreUrl, *, patience: Patience, insecure_http: bool, instance_credentials: bool
@@ -174,12 +180,21 @@ class BucketStore:
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError):
             raise Offline(f"{self._name(path)}: refused, no permission", hint=_CLOCK) from None
         except (exceptions.BaseError, OSError) as error:
-            found = _STATUS.search(str(error))
-            if found is None:
-                raise Offline(f"{self._name(path)}: no answer") from None
-            status = found[1] or found[2]
-            hint = _CLOCK if status.startswith("4") else ""
-            raise Offline(f"{self._name(path)}: refused (status {status})", hint=hint) from None
+            raise _out_of_reach(self._name(path), str(error)) from None
+
+
+def _out_of_reach(name: str, text: str) -> Offline:
+    """Return the error for what obstore says, of which only what is known to hold no secret is repeated."""
+    found = _STATUS.search(text)
+    if found is not None:
+        status = found[1] or found[2]
+        hint = _CLOCK if status.startswith("4") else _AGAIN
+        return Offline(f"{name}: refused (status {status})", hint=hint)
+    if "redirect" in text.lower():
+        return Offline(f"{name}: refused, it is somewhere else", hint=_REGION)
+    if "certificate" in text.lower():
+        return Offline(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
+    return Offline(f"{name}: no answer", hint=_AGAIN)
 
 
 def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bool) -> Any:

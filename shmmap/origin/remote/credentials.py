@@ -34,6 +34,11 @@ _EXPORT: Final = (
     "export them as AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_SESSION_TOKEN:"
     ' eval "$(aws configure export-credentials --format env)"'
 )
+_ASKED_OF_OTHERS: Final = (
+    "AWS_WEB_IDENTITY_TOKEN_FILE",
+    "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
+    "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+)
 _AGAIN_AFTER: Final = timedelta(minutes=5)
 _TRUE: Final = ("1", "true", "yes", "on")
 
@@ -64,6 +69,15 @@ def s3_settings(
         return {**settings, **given}, None
     if key or secret:
         raise ConfigError("AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY are set only together")
+    if not instance:
+        for name in _ASKED_OF_OTHERS:
+            if environment.get(name):
+                raise ConfigError(
+                    f"{name} is set: credentials would be asked of another server",
+                    key=name,
+                    origin="environment",
+                    hint=f"allow it: --instance-credentials; or {_EXPORT}",
+                )
     if _static_keys(environment) is not None:
 
         def provide() -> dict[str, Any]:

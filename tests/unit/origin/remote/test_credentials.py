@@ -101,6 +101,21 @@ def test_other_kinds_are_refused_by_name(home: Path, line: str, file: str) -> No
     assert "aws configure export-credentials" in error.value.hint
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
+     "AWS_CONTAINER_CREDENTIALS_FULL_URI"],
+)  # fmt: skip
+def test_other_servers_are_asked_for_credentials_only_where_that_is_wanted(home: Path, name: str) -> None:
+    del home
+    with pytest.raises(ConfigError, match=name) as error:
+        s3_settings({name: "x"})
+    assert "--instance-credentials" in error.value.hint
+    assert s3_settings({name: "x"}, instance=True) == ({"region": "us-east-1"}, None)
+    given = {name: "x", "AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b"}
+    assert s3_settings(given)[0]["access_key_id"] == "a"
+
+
 def test_profiles_that_cannot_be_used_are_errors_without_secrets(home: Path) -> None:
     with pytest.raises(ConfigError, match="there is no profile 'fleet'"):
         s3_settings({"AWS_PROFILE": "fleet"})

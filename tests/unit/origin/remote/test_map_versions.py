@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+
 from shmmap.origin.remote.map_versions import (
     Current,
     CurrentState,

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -17,9 +20,12 @@ from pathlib import Path
 import pytest
 
 from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapDataError, MapMissing, Offline
+from tests.support.bucket_server import BucketServer
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.store import HASTY, Patience, Store, read_url
-from tests.support.bucket_server import BucketServer
 
 SOON = Patience(connect_s=0.5, read_s=0.3, retries=0, retry_s=0.5)
 
@@ -254,6 +260,7 @@ def answer(status: str, body: str = "") -> bytes:
         (answer("401 Unauthorized"), Offline, "refused, no permission"),
         (answer("400 Bad Request", f"ExpiredToken {SECRET}"), Offline, "refused (status 400)"),
         (answer("503 Slow Down", SECRET), Offline, "refused (status 503)"),
+        (answer("301 Moved Permanently", SECRET), Offline, "refused, it is somewhere else"),
         (b"HTTP/1.1 200 OK\r\nContent-Length: 9\r\nConnection: close\r\n\r\n123", Offline, "no answer"),
         (b"what is this\r\n\r\n", Offline, "no answer"),
         (answer("200 OK", "x" * 100), MapDataError, "it has 100 bytes, at most 99"),
@@ -277,6 +284,34 @@ def test_answers_become_errors_without_secrets(
     assert SECRET not in "".join(traceback.format_exception(error.value))
 
 
+def test_a_certificate_that_nobody_vouches_for(tmp_path: Path) -> None:
+    pytest.importorskip("obstore", reason="obstore is not installed")
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is missing")
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
+         "-keyout", str(key), "-out", str(certificate), "-days", "1", "-subj", "/CN=localhost"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    listener = socket.create_server(("127.0.0.1", 0))
+
+    def shake_hands() -> None:
+        one, _ = listener.accept()
+        with one, contextlib.suppress(ssl.SSLError, OSError):
+            context.wrap_socket(one, server_side=True).close()
+
+    thread = threading.Thread(target=shake_hands)
+    thread.start()
+    with pytest.raises(Offline, match="certificate is not accepted") as error:
+        open_store(f"https://127.0.0.1:{listener.getsockname()[1]}/m", patience=SOON).get("CURRENT", 9)
+    assert "SSL_CERT_FILE" in error.value.hint
+    thread.join()
+    listener.close()
+
+
 GUARDED = """
 import json, socket, sys
 from shmmap.errors import ShmmapError
@@ -294,8 +329,6 @@ for url in sys.argv[1:]:
 
 def test_no_address_but_the_given_one_is_asked(tmp_path: Path) -> None:
     """Without credentials in sight: what the kernel saw of connections is written down by strace."""
-    import shutil
-
     pytest.importorskip("obstore", reason="obstore is not installed")
     if shutil.which("strace") is None:
         pytest.skip("strace is missing")
