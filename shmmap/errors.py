@@ -288,7 +288,8 @@ class SegmentCorrupt(SegmentError):
 class CellError(ShmmapError):
     """One cell, ``cell_id``, ``layer``, could not be had; other cells and requests are unaffected.
 
-    ``holders``, for `OverBudget`, says who uses the memory; ``str`` of each is a line to read.
+    ``holders``, for `OverBudget`, says who uses the memory; ``str`` of each is a line to read.  ``box`` says
+    where the cell lies, ``min_x, min_y, max_x, max_y`` in metres, map frame; None where that is not known.
     """
 
     code = "cell_error"
@@ -296,12 +297,13 @@ class CellError(ShmmapError):
 
     def __init__(
         self, message: str, *, cell_id: str = "", layer: str = "", holders: Sequence[Holder] = (),
-        hint: str = "",
+        box: tuple[float, float, float, float] | None = None, hint: str = "",
     ) -> None:  # fmt: skip
         super().__init__(message, hint=hint)
         self.cell_id = cell_id
         self.layer = layer
         self.holders = tuple(holders)
+        self.box = box
 
 
 class UnknownCell(CellError):

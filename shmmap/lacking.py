@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.errors import LoadTimeout, ShmmapError, ShmmapWarning, UnknownCell
+from shmmap.errors import LoadTimeout, Offline, ShmmapError, ShmmapWarning, UnknownCell
 from shmmap.quantities import counted, format_bytes, format_metres
 
 if TYPE_CHECKING:
@@ -22,18 +22,19 @@ if TYPE_CHECKING:
     from shmmap.protocol.messages import Holder, Welcome
 
 __all__ = [
-    "NOT_COVERED",
     "area_text",
     "extent_text",
     "failure_lines",
     "judge",
     "near_cells_hint",
     "no_cell_there",
+    "not_covered",
     "pending_lines",
     "unknown_ids",
 ]
 
-NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
+_NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
+_OUT_OF_REACH: Final = "the list of cells there cannot be reached at present"
 _NAMED_CELLS: Final = 3
 _MOST_CELLS: Final = 20_000  # to look at each for one that looks alike takes a second at most
 _MOST_LINES: Final = 10  # of a warning
@@ -72,7 +73,7 @@ def judge(
     if waited:
         lines += pending_lines(found.pending)
     if not found.covered:
-        lines.append(f"{NOT_COVERED} (ask again later)")
+        lines.append("{} ({})".format(*not_covered(found)))
     if unknown := unknown_ids(found.failed):
         lines.append(f"hint: {near_cells_hint(client, unknown)}")
     if found.complete and new:
@@ -87,6 +88,11 @@ def judge(
     warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
 
 
+def not_covered(found: CellSet) -> tuple[str, str]:
+    """Why an answer does not have all that the map has there, and a hint."""
+    return _OUT_OF_REACH if found.reason else _NOT_COVERED, "ask again later"
+
+
 def _error_of(client: Client, found: CellSet, area: Area | None, new: bool) -> ShmmapError | None:
     if found.failed:
         return found.failed[0]
@@ -99,7 +105,8 @@ def _error_of(client: Client, found: CellSet, area: Area | None, new: bool) -> S
             hint="ask again, or wait longer: wait=SECONDS",
         )
     if not found.covered:
-        return LoadTimeout(NOT_COVERED, hint="ask again later")
+        message, hint = not_covered(found)
+        return Offline(message) if found.reason else LoadTimeout(message, hint=hint)
     nothing = _nothing(client, found, area) if new else []
     return next((UnknownCell(message, hint=hint) for message, hint in nothing), None)
 

@@ -53,7 +53,8 @@ class Answer:
             except SegmentCorrupt as error:
                 cell_id = self._whole(handle.id)
                 message = f"{cell_id} ({handle.layer}): {error}"
-                failure = LoadFailed(message, cell_id=cell_id, layer=handle.layer)
+                box = (handle.min_x, handle.min_y, handle.max_x, handle.max_y)
+                failure = LoadFailed(message, cell_id=cell_id, layer=handle.layer, box=box)
                 failure.__cause__ = error
                 self._failed.append(failure)
         whole = self._whole
@@ -105,4 +106,5 @@ class Answer:
             reply.map_version,
             reply.layers,
             reply.covered,
+            reply.reason,
         )

@@ -46,9 +46,22 @@ class CellSet(Sequence[Cell]):
         Whether the daemon knows all that the map has of what was asked for.  Where it does not (a map that
         comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may
         exist: ask again.
+    reason : str
+        Why that is not about to change: ``"offline"``, where the list of cells cannot be reached at present;
+        empty where it is being fetched, where all is covered, and from a daemon older than protocol 1.6.
     """
 
-    __slots__ = ("cells", "covered", "epoch", "failed", "layers", "map_version", "pending", "removed")
+    __slots__ = (
+        "cells",
+        "covered",
+        "epoch",
+        "failed",
+        "layers",
+        "map_version",
+        "pending",
+        "reason",
+        "removed",
+    )
 
     def __init__(
         self,
@@ -60,6 +73,7 @@ class CellSet(Sequence[Cell]):
         map_version: int = 0,
         layers: tuple[str, ...] = (),
         covered: bool = True,
+        reason: str = "",
     ) -> None:
         self.cells = cells
         self.failed = failed
@@ -69,12 +83,13 @@ class CellSet(Sequence[Cell]):
         self.map_version = map_version
         self.layers = layers
         self.covered = covered
+        self.reason = reason
 
     def __repr__(self) -> str:
         return (
             f"<CellSet of {len(self.cells)} cells, {len(self.removed)} removed,"
             f" {len(self.pending)} pending, {len(self.failed)} failed"
-            f"{'' if self.covered else ', not covered'}>"
+            f"{'' if self.covered else ', not covered'}{self.reason and f' ({self.reason})'}>"
         )
 
     @property
@@ -119,4 +134,5 @@ def cell_error(failure: FailedCell, cell_id: str) -> CellError:
         cell_id=cell_id,
         layer=failure.layer,
         holders=failure.holders,
+        box=failure.box,
     )

@@ -102,11 +102,6 @@ class Connection:
         self._socket = self._watch.socket
         self._greet(deadline_s)
 
-    @property
-    def handshakes(self) -> int:
-        """How often the connection was made."""
-        return self._watch.handshakes
-
     def close(self) -> None:
         """End the connection; messages just sent get a short moment to leave."""
         self._watch.stop()

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zmq
 
-from shmmap.client.orphans import running
+from shmmap.client.orphans import enter, running
 from shmmap.errors import LimitReached
 from shmmap.segment.process_limits import check_files, check_threads, no_threads_left
 
@@ -52,7 +52,6 @@ FILES: Final = 10
 """Descriptors that libzmq needs (context, socket, monitor, connection), and one to map segments by."""
 THREADS: Final = 2
 """Threads of libzmq for a context, beside the one that makes it."""
-_MADE_S: Final = 0.001
 _OVER_S: Final = 0.5  # who waits for the end looks again after this long, should another have waited, too
 
 
@@ -125,6 +124,7 @@ class ConnectionWatch:
         self._made: SimpleQueue[BaseException | None] = SimpleQueue()
         self._connected: SimpleQueue[None] = SimpleQueue()
         self._over: SimpleQueue[None] = SimpleQueue()
+        self._stopping = False
         self._ended = False
         self._thread = 0
         self._socket: zmq.Socket[bytes] | None = None
@@ -160,10 +160,8 @@ class ConnectionWatch:
 
     def tell_to_stop(self) -> None:
         """Have the thread close the socket and end."""
-        while not self._ended and not self._elsewhere:
-            if self._socket is None:  # an exception came while it was being made
-                time.sleep(_MADE_S)
-                continue
+        self._stopping = True  # where there is no socket yet, the thread looks at this when it has made it
+        while self._socket is not None and not self._ended and not self._elsewhere:
             try:
                 self._socket.disable_monitor()
             except zmq.error.InterruptedSystemCall:
@@ -176,10 +174,10 @@ class ConnectionWatch:
         self._thread = _thread.get_ident()
         try:
             _signal.pthread_sigmask(_signal.SIG_BLOCK, _signal.valid_signals() - _OURS)
-            check_threads(THREADS, CONNECTION)
             with contextlib.ExitStack() as ends:
-                running.add(self)
                 ends.callback(running.discard, self)
+                enter(self)
+                check_threads(THREADS, CONNECTION)
                 # a context of our own: no other library's sockets can hold up its end
                 context = zmq.Context()
                 ends.callback(context.term)
@@ -192,7 +190,8 @@ class ConnectionWatch:
                 socket.connect(endpoint)
                 self._socket = socket
                 self._made.put(None)
-                self._listen(monitor)
+                if not self._stopping:
+                    self._listen(monitor)
         except zmq.ZMQError as error:  # the last descriptors went to others since they were counted
             self._made.put(LimitReached(f"no connection to the daemon: {error.strerror or error}"))
         except BaseException as error:  # noqa: BLE001  it is raised where the socket is waited for

@@ -10,7 +10,7 @@ from __future__ import annotations
 import weakref
 from typing import Final, Protocol
 
-__all__ = ["Running", "running", "stop_orphans"]
+__all__ = ["Running", "enter", "running", "stop_orphans"]
 
 
 class Running(Protocol):
@@ -26,6 +26,13 @@ class Running(Protocol):
 
 running: Final[set[Running]] = set()
 """Each thread enters and leaves by itself."""
+
+
+def enter(one: Running) -> None:
+    """Begin what runs in this thread; its owner may be gone already, and no connection may come later."""
+    running.add(one)
+    if one.owner() is None:
+        one.tell_to_stop()
 
 
 def stop_orphans() -> None:

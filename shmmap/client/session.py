@@ -21,7 +21,7 @@ from shmmap.client.cell import Access, Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.connection import Connection
 from shmmap.client.turn import Turn, check_not_within, closed, out_of_time
-from shmmap.client.visible import check_visible, owner_of_segments, statistics_path
+from shmmap.client.visible import check_visible, owner_of_segments
 from shmmap.errors import BadRequest
 from shmmap.failpoints import step
 from shmmap.protocol import messages
@@ -98,23 +98,14 @@ class Session:
         """`time.monotonic` of when the connection broke; None while it stands, or has yet to be made."""
         return self._connection.lost_since if self._connection is not None else None
 
-    @property
-    def handshakes(self) -> int:
-        """How often the present connection was made: it changes when a daemon comes back."""
-        return self._connection.handshakes if self._connection is not None else 0
-
-    @property
-    def statistics_path(self) -> str:
-        """Where the daemon's statistics segment is, as this process sees it."""
-        return statistics_path(self._shm_dir or self.welcome.shm_dir, self.welcome.segment_prefix)
-
     def tell_when_lost(self, queue: SimpleQueue[Any]) -> None:
         """From now on put a None into a queue when the connection breaks."""
         self._waiting.append(queue)
 
     def stop_telling(self, queue: SimpleQueue[Any]) -> None:
-        """End `tell_when_lost`."""
-        self._waiting.remove(queue)
+        """End `tell_when_lost`; may be repeated."""
+        if queue in self._waiting:
+            self._waiting.remove(queue)
 
     def __reduce__(self) -> NoReturn:
         raise TypeError(

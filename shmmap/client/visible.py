@@ -7,7 +7,7 @@ import os
 
 from shmmap.errors import SegmentError
 
-__all__ = ["check_visible", "owner_of_segments", "statistics_path"]
+__all__ = ["check_visible", "owner_of_segments"]
 
 
 def statistics_path(shm_dir: str, segment_prefix: str) -> str:

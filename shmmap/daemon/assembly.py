@@ -43,6 +43,7 @@ from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
+from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import Chore, ServingLoop
@@ -116,12 +117,16 @@ class Service:
             config, cache, sessions, self._pins, memory.map_switch, scheduler.loads, memory.event_log,
             events_path(socket_path),
         )  # fmt: skip
-        operators = OperatorRequests(cache, self._pins, reloader)
+        self._operators = operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
             sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
             cache.events.minutes,
         )  # fmt: skip
-        change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log)
+        paging = Paging(
+            cache, scheduler, memory.map_switch, cells, queries, memory.adoption, sessions, watched
+        )  # fmt: skip
+        paging.follow()
+        change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, change.collect, "map")
         defects = Defects(statistics)
         dispatch = Dispatch(
@@ -137,7 +142,7 @@ class Service:
             self._inbox.due,
         )
         chores: deque[tuple[str, Chore]] = deque()
-        chores += [("usage", cache.survey), ("map", memory.map_switch)]
+        chores += [("usage", cache.survey), ("map", memory.map_switch), ("map", paging)]
         chores += [("memory", scheduler.prefetcher)]
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
         self._handshake = handshake
@@ -255,6 +260,7 @@ class Service:
         if not any(self._connections):  # nobody can leave who would make room
             self._connections.try_again()
         self._pins.keep(now_s)
+        self._operators.answer_overdue(now_s)
         self._live.beat(now_s)
         self._look_after_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):

@@ -130,7 +130,8 @@ class MapInMemory:
                 prefetch_share=config.prefetch_share,
                 ride_out_s=config.ride_out_s,
             )
-            Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced).take_over(time.monotonic())
+            self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
+            self.adoption.take_over(time.monotonic())
             self.cache.tell_all()
             self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
             if pins.fd >= 0:
@@ -148,6 +149,7 @@ class MapInMemory:
     def close(self, *, keep: bool) -> None:
         """End the loaders, and take every name away or leave those of the segments to the next life."""
         self.scheduler.pool.close()
+        self.adoption.close(keep=keep)
         self.cache.close(keep=keep)
         self.statistics.close()
         self.watched.close()

@@ -84,7 +84,8 @@ class Load:
     it, ``sources`` and ``version`` what the catalogue knew of its file and its neighbours', and which version
     that makes, when a worker was given the job.  ``computed`` says that it is a layer that is computed, which
     may take long.  ``payer`` is whose turn was used for it, ``charged_s`` the loader's time that it was taken
-    to need, and ``spent_s`` the time that it did; ``losses`` counts loaders that were lost without its doing.
+    to need, ``spent_s`` the time that it did, and ``took_s`` how long it took, fetching included; ``losses``
+    counts loaders that were lost without its doing.
     ``prefetch`` says that nobody has asked for it yet, ``unread`` that what it reads could not be read.
     """
 
@@ -104,6 +105,7 @@ class Load:
     payer: Hashable = None
     charged_s: float = 0.0
     spent_s: float = 0.0
+    took_s: float = 0.0
     losses: int = 0
     computed: bool = False
     prefetch: bool = False

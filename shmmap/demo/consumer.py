@@ -173,7 +173,7 @@ class PrivateMap:
             cell_id = self._catalogue.id(index)
             cloud = before.get(cell_id)
             if cloud is None:
-                columns = read_pcd(self._catalogue.path(index)).columns
+                columns = read_pcd(self._catalogue.source(index).name).columns
                 cloud = Cloud.survey(self._catalogue.box(index), columns.values(), columns["xyz"])
                 self._new.append(cloud)
             self.clouds[cell_id] = cloud

@@ -30,7 +30,6 @@ from shmmap.formats.block_reader import READABLE_SUFFIXES
 from shmmap.formats.coordinate_system import FEET
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.origin.map_frame import read_report
 from shmmap.origin.map_layout import absolute_path
@@ -132,7 +131,7 @@ class DividedCloud:
         self._tell = tell
         self._use_lock = -1
 
-    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
         """Divide the cloud unless that is done, and return the catalogue of its cells.
 
         Raises

@@ -12,10 +12,13 @@ import xxhash
 
 from shmmap.layers.build import build_spec
 from shmmap.layers.contract import Box
+from shmmap.layers.halo import read_halo
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellSource, read_halo, read_source
+from shmmap.layers.source_reader import FILES, SourceReader
+from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
 from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.source import Source
 from shmmap.segment.table_writer import SegmentOrigin, write_table
 from shmmap.segment.version import cell_version, layer_version
 
@@ -23,25 +26,33 @@ __all__ = ["CellJob", "Derived", "Neighbour", "combined_digest", "derive"]
 
 
 class Neighbour(NamedTuple):
-    """A cell that a layer of another one looks into; its file's path is its id, ``box`` in metres."""
+    """A cell that a layer of another one looks into: source, box in metres, id (empty: the source's name)."""
 
-    path: str
+    source: Source
     box: Box
+    cell_id: str = ""
+
+    @classmethod
+    def of(cls, cell_id: str, source: Source, box: Box) -> Neighbour:
+        """Return the cell of this id."""
+        return cls(source, box, "" if cell_id == source.name else cell_id)
 
 
 @dataclass(frozen=True, slots=True)
 class CellJob:
-    """Which cell: id, source file, box (metres), frame, and for a layer with a halo the cells around it.
+    """Which cell: id, source, box (metres), frame, and for a layer with a halo the cells around it.
 
-    ``at`` says where to find what a path names.
+    ``reader`` reads the sources; ``ready`` is the version of a layer that the origin has ready made, 0 of
+    one that is computed.
     """
 
     cell_id: str
-    path: str
+    source: Source
     box: Box
     frame_id: str = "map"
     neighbours: tuple[Neighbour, ...] = ()
-    at: Callable[[str], str] = str
+    reader: SourceReader = FILES
+    ready: int = 0
 
     def version(self, spec: LayerSpec, source: SourceStamp, around: Sequence[SourceStamp]) -> int:
         """Version of a layer of the cell for these states of its file and of its neighbours'."""
@@ -49,7 +60,7 @@ class CellJob:
         if spec.kind.name == LAYER:
             return cell
         near = [
-            cell_version(one.path, stamp.token, one.box)
+            cell_version(one.cell_id or one.source.name, stamp.token, one.box)
             for one, stamp in zip(self.neighbours, around, strict=True)
         ]
         return layer_version(cell, str(spec), spec.builder_version, near)
@@ -99,13 +110,13 @@ def derive(
         ENOSPC if the file system is full.
     """
     if source is None:
-        source = read_source(job.at(job.path), job.box, spec.source_columns)
+        source = job.reader.read(job.source, job.box, spec.source_columns)
     points, warnings = source.points, source.warnings
     around: tuple[tuple[SourceStamp, bytes], ...] = ()
     if job.neighbours:
-        paths = [job.at(near.path) for near in job.neighbours]
-        halo = read_halo(paths, job.box, spec.halo_m, points.xyz.dtype)
-        points.halo, around, warnings = halo.xyz, halo.files, (*warnings, *halo.warnings)
+        around_it = [near.source for near in job.neighbours]
+        halo = read_halo(job.reader, around_it, job.box, spec.halo_m, points.xyz.dtype)
+        points.halo, around, warnings = halo.xyz, halo.seen, (*warnings, *halo.warnings)
     table = build_spec(spec, points)
     header = write_table(
         fd,

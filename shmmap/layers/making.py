@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.derive import CellJob, derive
 from shmmap.layers.disk_cache import LayerCache
-from shmmap.layers.points import LAYER, build_points
-from shmmap.layers.sources import CellSource, state_of
+from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
 from shmmap.logfmt import log
 from shmmap.segment.layout import NO_SOURCE, SegmentHeader, SourceStamp
+from shmmap.segment.source import Source
 
 __all__ = ["Made", "cache_key", "make_layer"]
 
@@ -25,9 +25,9 @@ class Made:
     Attributes
     ----------
     version
-        Of the layer, for the states of the files that it was made from.
+        Of the layer, for the states of the sources that it was made from.
     neighbours
-        States of the neighbours' files that it stands for.
+        States of the neighbours' sources that it stands for.
     cached
         It came out of the cache.
     """
@@ -40,11 +40,17 @@ class Made:
 
 
 def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
-    """Key of a layer for the files as they are now; None where the cell's own cannot be looked at."""
-    source = state_of(job.at(job.path))
+    """Key of a layer for the sources as they are now; None where the cell's own cannot be looked at."""
+    source = _state(job, job.source)
     if source is NO_SOURCE:
         return None
-    return CacheKey(spec, job, source, tuple(state_of(job.at(near.path)) for near in job.neighbours))
+    return CacheKey(spec, job, source, tuple(_state(job, near.source) for near in job.neighbours))
+
+
+def _state(job: CellJob, source: Source) -> SourceStamp:
+    """State of a source as it is now; zeros where it cannot be looked at."""
+    stamp = job.reader.stamp(source)
+    return SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
 
 
 def make_layer(
@@ -77,23 +83,18 @@ def make_layer(
     OSError
         ENOSPC if the file system is full.
     """
+    if job.ready:
+        cache = None  # its origin keeps it
     key = cache_key(spec, job) if cache is not None else None
     if cache is not None and key is not None:
         header = cache.load(key, fd, reserve=reserve)
         if header is not None:
             return Made(header, key.version, key.neighbours, cached=True)
-    if spec.kind.name == LAYER:
-        warnings: list[str] = []
-        header = build_points(
-            job.at(job.path),
-            fd,
-            cell_id=job.cell_id,
-            box=job.box,
-            frame_id=job.frame_id,
-            reserve=reserve,
-            warn=warnings.append,
-        )
-        made = Made(header, job.version(spec, header.source, ()), warnings=tuple(warnings))
+    warnings: list[str] = []
+    header = job.reader.fill(spec, job, fd, reserve=reserve, warn=warnings.append)
+    if header is not None:
+        version = job.ready or job.version(spec, header.source, ())
+        made = Made(header, version, warnings=tuple(warnings))
     else:
         derived = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
         version = job.version(spec, derived.header.source, derived.neighbours)

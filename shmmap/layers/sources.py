@@ -11,23 +11,23 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.errors import MapDataError, SegmentCorrupt
+from shmmap.errors import SegmentCorrupt
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers.contract import Box, PointTable
 from shmmap.layers.outside import OutsideBox
 from shmmap.quantities import format_bytes
-from shmmap.segment.layout import NO_SOURCE, SourceStamp
+from shmmap.segment.layout import SourceStamp
 from shmmap.segment.verify import read_header
 
-__all__ = ["MOST_SOURCE_BYTES", "CellSource", "Halo", "read_halo", "read_segment", "read_source", "state_of"]
+__all__ = ["MOST_SOURCE_BYTES", "CellSource", "read_segment", "read_source"]
 
 MOST_SOURCE_BYTES: Final = 1 << 30
 """Points of one cell, uncompressed, that a layer is computed of: all of them are in a process's memory then.
 
 A compressed file of a few megabytes may claim more.  A cloud that is served as one cell has fewer."""
 
-_SMALLER: Final = "divide the map into smaller cells"
+SMALLER: Final = "divide the map into smaller cells"
 
 
 @dataclass(slots=True)
@@ -128,62 +128,6 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
     )
 
 
-@dataclass(slots=True)
-class Halo:
-    """Points around a cell.
-
-    Attributes
-    ----------
-    xyz
-        (M, 3), of the cell's dtype.
-    files
-        Each neighbour's stamp and digest.
-    warnings
-        Which neighbours have no points here, and why.
-    """
-
-    xyz: NDArray[Any]
-    files: tuple[tuple[SourceStamp, bytes], ...]
-    warnings: tuple[str, ...]
-
-
-def read_halo(paths: Sequence[str], box: Box, halo_m: float, dtype: np.dtype[Any]) -> Halo:
-    """Read the neighbours' points within ``halo_m`` of a cell's box, as ``dtype``.
-
-    One that cannot be read has no points, the stamp of before the attempt and a digest of zeros: it must
-    not cost its neighbours their layers.
-
-    Raises
-    ------
-    MapDataError
-        If there is not enough memory for a neighbour: another time there may be, so that no layer is
-        made without it.
-    """
-    found: list[NDArray[Any]] = [np.empty((0, 3), dtype)]
-    seen: list[tuple[SourceStamp, bytes]] = []
-    warnings: list[str] = []
-    for path in paths:
-        before = state_of(path)  # afterwards it may be that of a file that nobody has read
-        try:
-            source = read_source(path, box, ("xyz",))
-        except MapDataError as error:
-            seen.append((before, bytes(16)))
-            warnings.append(f"made without a neighbour: {error.message}")
-            continue
-        except MemoryError as error:
-            raise refusal(
-                "too_large", "this neighbour takes more memory than there is", path=path, hint=_SMALLER
-            ) from error
-        xyz = source.points.xyz
-        x, y = xyz[:, 0], xyz[:, 1]
-        inside = (
-            (x >= box[0] - halo_m) & (x <= box[2] + halo_m) & (y >= box[1] - halo_m) & (y <= box[3] + halo_m)
-        )
-        found.append(xyz[inside].astype(dtype))
-        seen.append((source.stamp, source.digest))
-    return Halo(np.concatenate(found), tuple(seen), tuple(warnings))
-
-
 def _check_size(nbytes: int, name: str) -> None:
     if nbytes > MOST_SOURCE_BYTES:
         raise refusal(
@@ -191,13 +135,5 @@ def _check_size(nbytes: int, name: str) -> None:
             f"a layer is computed of at most {format_bytes(MOST_SOURCE_BYTES)} of points, not of"
             f" {format_bytes(nbytes)}",
             path=name,
-            hint=_SMALLER,
+            hint=SMALLER,
         )
-
-
-def state_of(path: str) -> SourceStamp:
-    """Return the state of a file as it is now; zeros where it cannot be looked at."""
-    try:
-        return SourceStamp.of(os.stat(path))
-    except OSError:
-        return NO_SOURCE

@@ -33,6 +33,14 @@ _SLACK_M: Final = 1e-3
 """Cells are looked for a little farther than a halo reaches, and then compared as `neighbours` does it."""
 
 
+class ReadyLayer(Protocol):
+    """A layer that the origin has ready made."""
+
+    @property
+    def version(self) -> int:
+        """Its version."""
+
+
 class Cells(Protocol):
     """What is asked of a map's catalogue: its cells by index."""
 
@@ -47,12 +55,14 @@ class Cells(Protocol):
     def mean_size(self) -> tuple[float, float]:
         """Mean extent of the cells along x and y, metres."""
 
-    @property
-    def boxes(self) -> NDArray[np.float64]:
-        """(N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame."""
+    def boxes_of(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(K, 4) float64, ``min_x, min_y, max_x, max_y`` of these cells, metres, map frame."""
 
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
+
+    def ready(self, index: int, layer: str) -> ReadyLayer | None:
+        """What is known of a layer that the origin has ready made; None: it is computed here."""
 
     def box(self, index: int) -> tuple[float, float, float, float]:
         """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
@@ -89,18 +99,27 @@ class LayerVersions:
         self._count = 0
 
     def version(self, index: int, layer: str) -> int:
-        """Current version of one layer of a cell, see `shmmap.segment.version`."""
-        cell = self._catalogue().version
+        """Current version of one layer of a cell, see `shmmap.segment.version`.
+
+        0 where it is not known yet: not all of the cells are that it looks into.
+        """
+        catalogue = self._catalogue()
+        cell = catalogue.version
         if layer == LAYER:
             return cell(index)
+        if (ready := catalogue.ready(index, layer)) is not None:
+            return ready.version
         kind = _kind(layer)
         if not kind.halo_m:
             return layer_version(cell(index), layer, kind.builder_version)
         known = self._known.get(layer)
         version = known.get(index) if known is not None else None
         if version is None:
-            around = self.neighbours(index, layer)
-            version = layer_version(cell(index), layer, kind.builder_version, list(map(cell, around)))
+            around, complete = self._around(index, kind.halo_m)
+            if not complete:
+                return 0
+            near = [cell(one) for one in around[: MAX_NEIGHBOURS + 1].tolist()]
+            version = layer_version(cell(index), layer, kind.builder_version, near)
             self._remember(index, layer, version)
         return version
 
@@ -112,18 +131,37 @@ class LayerVersions:
                 yield from ((index, layer) for index in indices if known is None or index not in known)
 
     def neighbours(self, index: int, layer: str) -> list[int]:
-        """Catalogue indices of the cells that a layer of this one looks into, ascending.
+        """Catalogue indices of the cells that a layer of this one looks into, in id order.
 
         Of more than `MAX_NEIGHBOURS` the first ones, one more than that: such a layer cannot be made.
         """
         halo_m = _kind(layer).halo_m
-        return self._around(index, halo_m)[: MAX_NEIGHBOURS + 1].tolist() if halo_m else []
+        if not halo_m or self._catalogue().ready(index, layer) is not None:
+            return []
+        around: list[int] = self._around(index, halo_m)[0][: MAX_NEIGHBOURS + 1].tolist()
+        return around
 
-    def _around(self, index: int, halo_m: float) -> NDArray[np.intp]:
+    def halo_m(self, layers: Iterable[str]) -> float:
+        """How far the farthest-looking of some layers looks beyond a cell, metres."""
+        return max((_kind(layer).halo_m for layer in layers if layer != LAYER), default=0.0)
+
+    def is_computed(self, index: int, layer: str) -> bool:
+        """Whether a layer of a cell is computed here, which may take long."""
+        return layer != LAYER and self._catalogue().ready(index, layer) is None
+
+    def looks_into(self, index: int, layer: str) -> Box | None:
+        """Where a layer of a cell looks; None if it takes that cell alone."""
+        halo_m = _kind(layer).halo_m if self.is_computed(index, layer) else 0.0
+        return self._reach(index, halo_m) if halo_m else None
+
+    def _reach(self, index: int, halo_m: float) -> Box:
         min_x, min_y, max_x, max_y = self._catalogue().box(index)
-        area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
-        found, _ = self._catalogue().query(area)
-        return np.delete(found, found == index)
+        return Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
+
+    def _around(self, index: int, halo_m: float) -> tuple[NDArray[np.intp], bool]:
+        """Known cells around one, in id order, and whether these are all."""
+        found, known = self._catalogue().query(self._reach(index, halo_m))
+        return np.delete(found, found == index), known
 
     def check_reach(self, layer: str) -> None:
         """Refuse a layer that would look into too many cells of this map.
@@ -160,8 +198,8 @@ class LayerVersions:
         """For each of these layers, the cells whose version has this one's in it, itself first."""
         halos = [(layer, _kind(layer).halo_m) for layer in layers]
         widest_m = max((halo_m for _, halo_m in halos), default=0.0)
-        around = self._around(index, widest_m + _SLACK_M) if widest_m else np.zeros(0, np.intp)
-        boxes, (min_x, min_y, max_x, max_y) = self._catalogue().boxes[around], self._catalogue().box(index)
+        around = self._around(index, widest_m + _SLACK_M)[0] if widest_m else np.zeros(0, np.intp)
+        boxes, (min_x, min_y, max_x, max_y) = self._catalogue().boxes_of(around), self._catalogue().box(index)
         for layer, halo_m in halos:
             near = around[:0]
             if halo_m:

@@ -12,11 +12,13 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
+from shmmap.origin.catalogue_change import CatalogueChange, compare
 from shmmap.origin.cell_names import CellNames
 from shmmap.origin.map_frame import UNKNOWN_FRAME, MapFrame
 from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
+from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp, cell_version
 from shmmap.sparse_table import sparse_zeros
 
@@ -204,9 +206,18 @@ class Catalogue:
         min_x, min_y, max_x, max_y = self.boxes[index].tolist()
         return min_x, min_y, max_x, max_y
 
-    def path(self, index: int) -> str:
-        """File to load for a cell."""
-        return self.id(index)
+    def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
+        """(K, 4) float64, boxes of these cells, as `box`."""
+        boxes: NDArray[np.float64] = self.boxes[indices]
+        return boxes
+
+    def source(self, index: int) -> Source:
+        """Where a cell's points come from: the file whose path is its id."""
+        return Source(self.id(index))
+
+    def ready(self, index: int, layer: str) -> None:
+        """None: all layers are made here, of files."""
+        del index, layer
 
     def stamp(self, index: int) -> Stamp:
         """Stamp of a cell's file as last known."""
@@ -268,8 +279,20 @@ class Catalogue:
         cells = self._stamps[block * _BLOCK_CELLS : (block + 1) * _BLOCK_CELLS]
         return xxh3_64_intdigest(np.ascontiguousarray(cells).data)
 
-    complete = True
+    pages = None
     """All cells of the map are here, see `shmmap.daemon.map.catalogue_view.CatalogueView`."""
+    complete = True
+
+    @property
+    def tables(self) -> Catalogue:
+        """Its cells as tables: itself."""
+        return self
+
+    def changes_from(self, before: object) -> CatalogueChange:
+        """Find what differs from an earlier catalogue of the map."""
+        if not isinstance(before, Catalogue):
+            raise TypeError(f"{type(before).__name__} is no catalogue of the same kind")
+        return compare(before, self)
 
     def query(self, area: Area, most: int | None = None) -> tuple[Indices, bool]:
         """Cells whose box touches ``area``, ascending (which is id order), and that the map is known: True.

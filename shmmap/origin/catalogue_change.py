@@ -11,7 +11,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CatalogueChange", "Tables", "compare"]
+__all__ = ["CatalogueChange", "CellIds", "Tables", "compare"]
 
 Indices = NDArray[np.intp]
 Names = NDArray[np.bytes_]
@@ -19,7 +19,14 @@ Names = NDArray[np.bytes_]
 _BLOCK_CELLS: Final = 1 << 15
 
 
-class Tables(Protocol):
+class CellIds(Protocol):
+    """What tells the ids of cells."""
+
+    def ids(self, indices: Indices) -> list[str]:
+        """Ids of several cells, in the order given."""
+
+
+class Tables(CellIds, Protocol):
     """What is compared of two catalogues; each as `Catalogue` has it."""
 
     @property
@@ -30,15 +37,14 @@ class Tables(Protocol):
     def boxes(self) -> NDArray[np.float64]: ...
     @property
     def stamps(self) -> NDArray[np.int64]: ...
-    def ids(self, indices: Indices) -> list[str]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CatalogueChange:
     """What differs between two catalogues of a map; indices ascending, which is id order."""
 
-    old: Tables
-    new: Tables
+    old: CellIds
+    new: CellIds
     added: Indices
     """In the new one only."""
     removed: Indices
@@ -47,6 +53,8 @@ class CatalogueChange:
     """In both with different stamps: another version."""
     moved: Indices
     """In both with different boxes (the metadata was edited): another version, too."""
+    known: bool = True
+    """These are all: the cells of both were known wherever the two differ."""
 
     def __bool__(self) -> bool:
         return self.count > 0
@@ -59,12 +67,12 @@ class CatalogueChange:
     @property
     def same_cells(self) -> bool:
         """Whether indices mean the same cells as before."""
-        return not len(self.added) and not len(self.removed)
+        return self.known and not len(self.added) and not len(self.removed)
 
     def ids(self, how: str, most: int | None = None) -> tuple[str, ...]:
         """Ids of the cells that were ``how``: added, removed, changed or moved; the first ``most``."""
-        tables = self.old if how == "removed" else self.new
-        return tuple(tables.ids(getattr(self, how)[:most]))
+        cells = self.old if how == "removed" else self.new
+        return tuple(cells.ids(getattr(self, how)[:most]))
 
 
 def compare(old: Tables, new: Tables) -> CatalogueChange:

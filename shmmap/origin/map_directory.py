@@ -15,7 +15,6 @@ import numpy as np
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import Source
-from shmmap.origin.catalogue_change import Tables
 from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
 from shmmap.origin.map_frame import read_map_frame
@@ -94,7 +93,7 @@ class MapDirectory:
         find_layout(self.path, self.metadata, self.pcd_paths)
         return self
 
-    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
         """Read which cells there are now, with their boxes and their files' stamps.
 
         A large map's catalogue comes from the cache while the metadata and the directories are
@@ -118,7 +117,7 @@ class MapDirectory:
         return catalogue
 
     def _catalogue(
-        self, key: str, fresh: bool, before: Tables | None, opened: OpenedDirectories
+        self, key: str, fresh: bool, before: object | None, opened: OpenedDirectories
     ) -> Catalogue:
         sidecar = sidecar_file(self.cache_dir, key)
         if not fresh and (cached := load_sidecar(sidecar, key, opened.at)) is not None:

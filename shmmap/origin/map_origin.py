@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import Protocol
 
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import Tables
 
 __all__ = ["MapOrigin"]
 
@@ -22,7 +21,7 @@ class MapOrigin(Protocol):
     def path(self) -> str:
         """The map as a person would name it."""
 
-    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
         """Find out which cells there are now.
 
         ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.  What has not

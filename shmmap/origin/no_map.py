@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import Tables
 
 __all__ = ["NoMap"]
 
@@ -14,7 +13,7 @@ class NoMap:
 
     path = ""
 
-    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
         """An empty catalogue."""
         del fresh, before
         return Catalogue.from_cells([])

@@ -76,7 +76,7 @@ class _Count:
         self._progress.advance(1)
 
     def died(self, task: work.CellWork, how: str) -> None:
-        message = f"{task.path}: the worker died of it ({how})"
+        message = f"{task.source.name}: the worker died of it ({how})"
         self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
         self._progress.advance(1)
 
@@ -122,7 +122,7 @@ def prepare_map(
             yield work.CellWork(
                 index,
                 catalogue.id(index),
-                catalogue.path(index),
+                catalogue.source(index),
                 catalogue.box(index),
                 catalogue.frame_id,
                 tuple(around),
@@ -158,5 +158,7 @@ def neighbours_of(
             message = f"{layer} looks into more than {MAX_NEIGHBOURS} cells around one"
             crowded.append(Failure(catalogue.id(index), layer, message))
         else:
-            around[layer] = tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in near)
+            around[layer] = tuple(
+                Neighbour.of(catalogue.id(i), catalogue.source(i), catalogue.box(i)) for i in near
+            )
     return around, crowded

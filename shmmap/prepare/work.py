@@ -8,6 +8,7 @@ from typing import Final, TypeAlias
 import msgspec
 
 from shmmap.layers.derive import Neighbour
+from shmmap.segment.source import Source
 
 __all__ = ["CellDone", "CellWork", "FromWorker", "LayerDone", "Ready", "decode_done", "decode_work", "encode"]
 
@@ -20,7 +21,7 @@ class CellWork(msgspec.Struct, array_like=True, tag="cell"):
 
     number: int
     cell_id: str
-    path: str
+    source: Source
     box: tuple[float, float, float, float]
     frame_id: str
     layers: tuple[str, ...]

@@ -22,11 +22,13 @@ from shmmap.layers.derive import CellJob, combined_digest
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import cache_key, make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellSource, read_source
+from shmmap.layers.source_reader import FILES
+from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.segment.source import Source
 
 __all__ = ["CellPoints", "main"]
 
@@ -40,10 +42,10 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
     missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []
     for name, around in zip(task.layers, task.around, strict=True):
         spec = layer_spec(name)
-        job = CellJob(task.cell_id, task.path, task.box, task.frame_id, around)
+        job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around)
         key = cache_key(spec, job)
         if key is None:
-            done[name] = work.LayerDone(name, "failed", 0, f"{task.path}: it cannot be looked at")
+            done[name] = work.LayerDone(name, "failed", 0, f"{task.source.name}: it cannot be looked at")
         elif cache.has(key):
             done[name] = work.LayerDone(name, "kept", cache.size_of(key))
         else:
@@ -55,7 +57,7 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
             if cache.recognise(key, _content(job, digests)):
                 done[str(spec)] = work.LayerDone(str(spec), "recognised", cache.size_of(key))
                 missing.remove(entry)
-    source = CellPoints(task.path, task.box, [spec for spec, _, _ in missing])
+    source = CellPoints(task.source, task.box, [spec for spec, _, _ in missing])
     for spec, job, _ in missing:
         done[str(spec)] = _build(spec, job, cache, source)
     return work.CellDone(task.number, tuple(done[name] for name in task.layers))
@@ -64,8 +66,8 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
 class CellPoints:
     """The cell's points, read when first asked for, with the columns that all layers need together."""
 
-    def __init__(self, path: str, box: Box, specs: list[LayerSpec]) -> None:
-        self._path = path
+    def __init__(self, source: Source, box: Box, specs: list[LayerSpec]) -> None:
+        self._source = source
         self._box = box
         self._read: CellSource | None = None
         needs = [spec.source_columns for spec in specs if spec.kind.name != LAYER]
@@ -76,7 +78,7 @@ class CellPoints:
     def points(self, spec: LayerSpec) -> CellSource:
         """The columns that one layer takes: exactly those, whatever the others need."""
         if self._read is None:
-            self._read = read_source(self._path, self._box, self._needs)
+            self._read = FILES.read(self._source, self._box, self._needs)
         names = spec.source_columns
         table = self._read.points
         columns = {n: c for n, c in table.columns.items() if names is None or n in names}
@@ -99,21 +101,21 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints)
     except ShmmapError as error:
         message = str(error)
     except OSError as error:
-        message = f"{error.filename or job.path}: {error.strerror or error}"
+        message = f"{error.filename or job.source.name}: {error.strerror or error}"
     except MemoryError:
-        message = f"{job.path}: building {name} ran out of memory"
+        message = f"{job.source.name}: building {name} ran out of memory"
     except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one layer
-        message = f"{job.path}: building {name} failed: {error!r}"
+        message = f"{job.source.name}: building {name} failed: {error!r}"
     return work.LayerDone(name, "failed", 0, message[:2000])
 
 
 def _content(job: CellJob, known: dict[str, bytes]) -> bytes:
     """Digest of the files that a layer is computed from, each read once; zeros where one cannot be."""
-    around = [near.path for near in job.neighbours]
-    for path in (job.path, *around):
+    around = [near.source.name for near in job.neighbours]
+    for path in (job.source.name, *around):
         if path not in known:
             known[path] = _digest(path)
-    return combined_digest(known[job.path], [known[path] for path in around])
+    return combined_digest(known[job.source.name], [known[path] for path in around])
 
 
 def _digest(path: str) -> bytes:

@@ -110,14 +110,16 @@ def encode_cells(
     covered: bool = True,
     pending: PackedArray = _NOTHING,
     failed: PackedArray = _NOTHING,
+    *,
+    reason: str = "",
 ) -> bytes:
     """Return a `Cells` reply put together from what is encoded already."""
     start = encode(("cells", request, epoch, map_version))
     dropped = encode((removed, removed_packed))
-    end = encode((layers, covered))
-    # one array of eleven elements instead of three: replace their one-byte heads
+    end = encode((layers, covered, reason))
+    # one array of twelve elements instead of three: replace their one-byte heads
     parts = (start[1:], _head(len(handles)), *handles, dropped[1:], bytes(pending), bytes(failed), end[1:])
-    return b"".join((b"\x9b", *parts))
+    return b"".join((b"\x9c", *parts))
 
 
 def decode_request(data: bytes | memoryview) -> Request:

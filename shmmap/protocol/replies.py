@@ -131,13 +131,17 @@ class Holder(msgspec.Struct, array_like=True, frozen=True):
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix."""
+    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix.
+
+    ``box`` says where it lies, ``min_x, min_y, max_x, max_y`` in metres; None where that is not known.
+    """
 
     id: str
     layer: str
     code: str
     message: str
     holders: tuple[Holder, ...] = ()
+    box: tuple[float, float, float, float] | None = None
 
 
 class Cells(msgspec.Struct, array_like=True, tag="cells"):
@@ -146,7 +150,8 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     ``removed`` repeats held ids that the client should drop, in the order it gave them;
     ``removed_packed`` the same for packed versions, in any order.  ``layers`` are those of the request,
     one for each that it named, in their canonical form.  ``covered`` is false where part of what was asked
-    about is not known yet; nothing lying there is removed.
+    about is not known yet; nothing lying there is removed.  ``reason`` says why that is not waited for:
+    ``offline``, where it cannot be reached at present; empty where it is about to become known.
     """
 
     request: int
@@ -159,6 +164,7 @@ class Cells(msgspec.Struct, array_like=True, tag="cells"):
     failed: tuple[FailedCell, ...] = ()
     layers: tuple[str, ...] = ()
     covered: bool = True
+    reason: str = ""
 
 
 class MetadataRow(msgspec.Struct, array_like=True, frozen=True, gc=False):

@@ -9,6 +9,7 @@ import msgspec
 
 from shmmap.layers.derive import Neighbour
 from shmmap.prepare.work import Ready
+from shmmap.segment.source import Source
 
 __all__ = [
     "CellSent",
@@ -49,7 +50,7 @@ class CellToSend(msgspec.Struct, array_like=True, tag="cell"):
 
     number: int
     cell_id: str
-    path: str
+    source: Source
     box: tuple[float, float, float, float]
     frame_id: str
     layers: tuple[str, ...]

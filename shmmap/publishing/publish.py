@@ -36,6 +36,7 @@ from shmmap.origin.remote.map_versions import (
 )
 from shmmap.origin.remote.published_index import (
     EXACT,
+    MAX_ROOT_BYTES,
     LayerObjects,
     Root,
     Shard,
@@ -81,7 +82,7 @@ class Published:
 
     cells: int
     layers: tuple[str, ...]
-    id_prefix: str
+    id_prefix: str = ""
     version: int | None = None
     current: int = 0
     map_version: int = 0
@@ -93,24 +94,13 @@ class Published:
     failures: list[Failure] = field(default_factory=list)
 
 
-@dataclass(slots=True)
-class _Before:
-    """The version that was current when a run began."""
-
-    state: CurrentState
-    root: Root | None = None
-    shards: dict[tuple[int, int], tuple[bytes, int]] = field(default_factory=dict)  # key: content, row
-    layers: list[LayerObjects] = field(default_factory=list)
-
-
-class _SentShard(NamedTuple):
-    """A shard's row of the root; whether its object was sent now."""
+class _ShardRow(NamedTuple):
+    """What the root says of a shard."""
 
     key: tuple[int, int]
     cells: int
     size: int
     sha256: bytes
-    is_new: bool
 
 
 def publish_map(
@@ -154,212 +144,232 @@ def publish_map(
     """
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")
-    began_s = time.monotonic()
-    names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
     check_names(catalogue)
-    before = _read_before(store, progress, resend=resend)
-    prefix = _prefix(before.root, id_prefix, store.url)
-    result = Published(len(catalogue), names, prefix)
-    if before.state.current is not None:
-        result.current = before.state.current.version
-    side = shard_side(catalogue, len(names), before.root.shard_m if before.root is not None else None)
-    with tempfile.NamedTemporaryFile(prefix="shmmap-publish-") as known:
-        if write_known_objects(known.name, before.layers):
-            settings = msgspec.structs.replace(settings, known=known.name)
-        before.layers.clear()
-        has_none = before.root is None and next(iter(store.list("blobs/")), None) is None
-        look = not (resend or has_none)
-        settings = msgspec.structs.replace(settings, is_first=not look)
-        objects = _send_cells(catalogue, names, settings, workers, progress, result)
-    if result.failures:
+    names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
+    return _Run(catalogue, store, names, progress, resend=resend).run(settings, id_prefix, max(1, workers))
+
+
+class _Run:
+    """One run: what it publishes, and what was current when it began."""
+
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        store: Store,
+        names: tuple[str, ...],
+        progress: PrepareProgress,
+        *,
+        resend: bool,
+    ) -> None:
+        self._catalogue = catalogue
+        self._store = store
+        self._names = names
+        self._progress = progress
+        self._resend = resend
+        self._began_s = time.monotonic()
+        self._seen: CurrentState = read_current(store)
+        self._before: Root | None = self._read_root()
+        self._shards: dict[tuple[int, int], tuple[bytes, int]] = {}  # before: key, content, row of the root
+        has_none = self._before is None and next(iter(store.list("blobs/")), None) is None
+        self._look = not (resend or has_none)
+        self._result = Published(len(catalogue), names)
+        if self._seen.current is not None:
+            self._result.current = self._seen.current.version
+
+    def run(self, settings: PublishSettings, id_prefix: str, workers: int) -> Published:
+        result, before, seen = self._result, self._before, self._seen
+        result.id_prefix = self._prefix(id_prefix)
+        side = shard_side(self._catalogue, len(self._names), before.shard_m if before is not None else None)
+        with tempfile.NamedTemporaryFile(prefix="shmmap-publish-") as known:
+            settings = msgspec.structs.replace(settings, is_first=not self._look)
+            if write_known_objects(known.name, self._known_layers()):
+                settings = msgspec.structs.replace(settings, known=known.name)
+            objects = self._send_cells(settings, workers)
+        if result.failures:
+            return result
+        result.objects = len(self._catalogue) * len(self._names)
+        result.bytes = objects.nbytes
+        unpacked = pack_root(self._root(side, self._send_shards(objects, side)))
+        if len(unpacked) > MAX_ROOT_BYTES:
+            raise MapDataError(
+                f"its index has {len(unpacked):,} bytes, more than {MAX_ROOT_BYTES:,}",
+                path=self._store.url,
+                cause="too_large",
+                hint="publish it as several maps",
+            )
+        result.map_version = map_version_of(unpacked)
+        is_same = before is not None and unpacked == pack_root(before)
+        if seen.current is not None and is_same and not self._resend:
+            result.root = seen.current.root
+            self._progress.done(len(self._catalogue))
+            return result
+        entry = self._send_root(unpacked)
+        add_version(self._store, entry, seen)
+        result.version = result.current = entry.version
+        self._progress.done(len(self._catalogue))
         return result
-    result.objects = len(catalogue) * len(names)
-    result.bytes = objects.nbytes
-    root = _send_shards(catalogue, objects, side, store, before, names, prefix, progress, result, look=look)
-    unpacked = pack_root(root)
-    result.map_version = map_version_of(unpacked)
-    if before.root is not None and unpacked == pack_root(before.root) and not resend:
-        assert before.state.current is not None  # noqa: S101  where there is a root
-        result.root = before.state.current.root
-        progress.done(len(catalogue))
-        return result
-    entry = _send_root(store, unpacked, before.state, began_s, result, look=look)
-    add_version(store, entry, before.state)
-    result.version = result.current = entry.version
-    progress.done(len(catalogue))
-    return result
 
+    # --- the version before ---------------------------------------------------------------------
 
-def _read_before(store: Store, progress: PrepareProgress, *, resend: bool) -> _Before:
-    before = _Before(read_current(store))
-    if before.state.current is None:
-        return before
-    try:
-        before.root = root = read_root(store, before.state.current)
-    except (MapMissing, MapDataError):
-        if resend:
-            return before
-        raise
-    if resend:
-        return before
-    progress.stage("read the current version", root.cells)
-    for number, shard in enumerate(read_shards(store, root)):
-        row, column = root.keys[number].tolist()
-        before.shards[row, column] = sha256(pack_shard(shard)).digest(), number
-        before.layers += shard.layers.values()
-        progress.advance(len(shard))
-    return before
+    def _read_root(self) -> Root | None:
+        if self._seen.current is None:
+            return None
+        try:
+            return read_root(self._store, self._seen.current)
+        except (MapMissing, MapDataError):
+            if self._resend:
+                return None
+            raise
 
-
-def _prefix(before: Root | None, wanted: str, url: str) -> str:
-    if wanted and not is_id_prefix(wanted):
-        raise BadRequest(f"ids cannot begin with {wanted!r}", hint="a prefix begins and ends with /")
-    if before is not None:
-        if wanted not in ("", before.id_prefix):
+    def _prefix(self, wanted: str) -> str:
+        url = self._store.url
+        if wanted and not is_id_prefix(wanted):
+            raise BadRequest(f"ids cannot begin with {wanted!r}", hint="a prefix begins and ends with /")
+        if self._before is not None:
+            if wanted not in ("", self._before.id_prefix):
+                raise BadRequest(
+                    f"ids of the map at {url} begin with {self._before.id_prefix}, in all its versions",
+                    hint="publish to another URL for other ids",
+                )
+            return self._before.id_prefix
+        if not wanted and self._seen.current is not None:
             raise BadRequest(
-                f"ids of the map at {url} begin with {before.id_prefix}, in all its versions",
-                hint="publish to another URL for other ids",
+                f"the current version at {url} cannot be read: what do its ids begin with?",
+                hint="name it: --id-prefix",
             )
-        return before.id_prefix
-    last = re.sub(r"[^\w.-]", "_", url.rpartition("/")[2]) or "map"
-    return wanted or f"/{last}/"
+        last = re.sub(r"[^\w.-]", "_", url.rpartition("/")[2]) or "map"
+        return wanted or f"/{last}/"
 
+    def _known_layers(self) -> Iterator[LayerObjects]:
+        """The objects of the version before, by shard and layer; none where all is sent again."""
+        root = self._before
+        if root is None or self._resend:
+            return
+        self._progress.stage("read the current version", root.cells)
+        for number, shard in enumerate(read_shards(self._store, root)):
+            row, column = root.keys[number].tolist()
+            self._shards[row, column] = sha256(pack_shard(shard)).digest(), number
+            self._progress.advance(len(shard))
+            yield from shard.layers.values()
 
-def _send_cells(
-    catalogue: Catalogue,
-    names: tuple[str, ...],
-    settings: PublishSettings,
-    workers: int,
-    progress: PrepareProgress,
-    result: Published,
-) -> CellObjects:
-    """Have the objects of all cells in the store; failures go into the result."""
-    objects = CellObjects(len(catalogue), names)
-    versions = LayerVersions(lambda: catalogue)
+    # --- sending --------------------------------------------------------------------------------
 
-    def tasks() -> Iterator[CellToSend]:
-        for index in range(len(catalogue)):
-            around, crowded = neighbours_of(catalogue, versions, index, names)
-            if crowded:
-                result.failures.extend(crowded)
-                progress.advance(1)
-                continue
-            yield CellToSend(
-                index,
-                catalogue.id(index),
-                catalogue.path(index),
-                catalogue.box(index),
-                catalogue.frame_id,
-                tuple(around),
-                tuple(around.values()),
-            )
+    def _send_cells(self, settings: PublishSettings, workers: int) -> CellObjects:
+        """Have the objects of all cells in the store; failures go into the result."""
+        catalogue, result = self._catalogue, self._result
+        objects = CellObjects(len(catalogue), self._names)
+        versions = LayerVersions(lambda: catalogue)
 
-    def finished(task: CellToSend, done: CellSent | NotSent) -> None:
-        if isinstance(done, CellSent):
-            objects.set(task.number, done)
-            sent = [layer.sent for layer in done.layers if layer.sent]
-            result.sent_objects += len(sent)
-            result.sent_bytes += sum(sent)
-        elif not done.layer:  # the store refuses: so it would each other cell
-            raise error_from_wire(done.code, done.message, done.hint)
-        else:
-            result.failures.append(Failure(task.cell_id, done.layer, done.message))
-        progress.advance(1)
+        def tasks() -> Iterator[CellToSend]:
+            for index in range(len(catalogue)):
+                around, crowded = neighbours_of(catalogue, versions, index, self._names)
+                if crowded:
+                    result.failures.extend(crowded)
+                    self._progress.advance(1)
+                    continue
+                yield CellToSend(
+                    index,
+                    catalogue.id(index),
+                    catalogue.source(index),
+                    catalogue.box(index),
+                    catalogue.frame_id,
+                    tuple(around),
+                    tuple(around.values()),
+                )
 
-    def died(task: CellToSend, how: str) -> None:
-        message = f"{task.path}: the worker died of it ({how})"
-        result.failures.append(Failure(task.cell_id, ", ".join(task.layers), message))
-        progress.advance(1)
+        def finished(task: CellToSend, done: CellSent | NotSent) -> None:
+            if isinstance(done, CellSent):
+                objects.set(task.number, done)
+                for layer in done.layers:
+                    self._count(layer.sent)
+            elif not done.layer:  # the store refuses: so it would each other cell
+                raise error_from_wire(done.code, done.message, done.hint)
+            else:
+                result.failures.append(Failure(task.cell_id, done.layer, done.message))
+            self._progress.advance(1)
 
-    progress.stage("publish", len(catalogue))
-    pool: TaskPool[CellToSend, CellSent | NotSent] = TaskPool(
-        "shmmap.publishing.worker",
-        [msgspec.json.encode(settings).decode()],
-        workers=max(1, workers),
-        decode=decode_sent,
-        finished=finished,
-        died=died,
-        ahead=TASKS_AHEAD,
-    )
-    pool.run(tasks())
-    return objects
+        def died(task: CellToSend, how: str) -> None:
+            message = f"{task.source.name}: the worker died of it ({how})"
+            result.failures.append(Failure(task.cell_id, ", ".join(task.layers), message))
+            self._progress.advance(1)
 
+        self._progress.stage("publish", len(catalogue))
+        pool: TaskPool[CellToSend, CellSent | NotSent] = TaskPool(
+            "shmmap.publishing.worker",
+            [msgspec.json.encode(settings).decode()],
+            workers=workers,
+            decode=decode_sent,
+            finished=finished,
+            died=died,
+            ahead=TASKS_AHEAD,
+        )
+        pool.run(tasks())
+        return objects
 
-def _send_shards(
-    catalogue: Catalogue,
-    objects: CellObjects,
-    side: float,
-    store: Store,
-    before: _Before,
-    names: tuple[str, ...],
-    prefix: str,
-    progress: PrepareProgress,
-    result: Published,
-    *,
-    look: bool,
-) -> Root:
-    """Send the shards that are new, and return the root."""
+    def _count(self, sent_bytes: int) -> None:
+        self._result.sent_objects += sent_bytes > 0
+        self._result.sent_bytes += sent_bytes
 
-    def send(keyed: tuple[tuple[int, int], Shard]) -> _SentShard:
+    def _send_shards(self, objects: CellObjects, side: float) -> list[_ShardRow]:
+        """Send the shards that are new, and return what the root says of all."""
+        rows: list[_ShardRow] = []
+        self._progress.stage("index", len(self._catalogue))
+        divided = divide_into_shards(self._catalogue, objects, side)
+        with ThreadPoolExecutor(_SENT_AT_ONCE, "shard") as pool:
+            while some := list(itertools.islice(divided, _SENT_AT_ONCE)):
+                for row, sent_bytes in pool.map(self._send_shard, some):
+                    rows.append(row)
+                    self._count(sent_bytes)
+                    self._progress.advance(row.cells)
+        return rows
+
+    def _send_shard(self, keyed: tuple[tuple[int, int], Shard]) -> tuple[_ShardRow, int]:
         key, shard = keyed
         unpacked = pack_shard(shard)
-        known = before.shards.get(key)
-        if known is not None and before.root is not None and known[0] == sha256(unpacked).digest():
-            number = known[1]
-            size, digest = int(before.root.sizes[number]), before.root.shard_sha256(number)
-            return _SentShard(key, len(shard), size, digest, False)
+        content, number = self._shards.get(key, (b"", -1))
+        if self._before is not None and content == sha256(unpacked).digest():
+            size = int(self._before.sizes[number])
+            return _ShardRow(key, len(shard), size, self._before.shard_sha256(number)), 0
         frame = pack_frame(unpacked)
         digest = sha256(frame).digest()
         step("publish.shard")
-        is_new = send_object(store, blob_path(digest), frame, look=look)
-        return _SentShard(key, len(shard), len(frame), digest, is_new)
+        is_new = send_object(self._store, blob_path(digest), frame, look=self._look)
+        return _ShardRow(key, len(shard), len(frame), digest), len(frame) * is_new
 
-    rows: list[_SentShard] = []
-    progress.stage("index", len(catalogue))
-    divided = divide_into_shards(catalogue, objects, side)
-    with ThreadPoolExecutor(_SENT_AT_ONCE, "shard") as pool:
-        while some := list(itertools.islice(divided, _SENT_AT_ONCE)):
-            rows += pool.map(send, some)
-            progress.advance(sum(len(shard) for _, shard in some))
-    result.sent_objects += sum(row.is_new for row in rows)
-    result.sent_bytes += sum(row.size for row in rows if row.is_new)
-    boxes = catalogue.boxes
-    largest_x, largest_y = (boxes[:, 2:] - boxes[:, :2]).max(axis=0).tolist()
-    bounds = catalogue.bounds
-    assert bounds is not None  # noqa: S101  a catalogue without cells is not loaded
-    return Root(
-        id_prefix=prefix,
-        frame_id=catalogue.frame_id,
-        crs=catalogue.frame.crs,
-        origin=catalogue.frame.origin,
-        unit_m=catalogue.frame.unit_m,
-        encoding=EXACT,
-        cells=len(catalogue),
-        bounds=bounds,
-        shard_m=side,
-        largest_m=(largest_x, largest_y),
-        mean_m=catalogue.mean_size,
-        layers={name: layer_spec(name).builder_version for name in names},
-        keys=np.array([row.key for row in rows], np.int32),
-        counts=np.array([row.cells for row in rows], np.uint32),
-        sizes=np.array([row.size for row in rows], np.uint32),
-        hashes=np.frombuffer(b"".join(row.sha256 for row in rows), np.uint8).reshape(-1, 32),
-    )
-
-
-def _send_root(
-    store: Store, unpacked: bytes, seen: CurrentState, began_s: float, result: Published, *, look: bool
-) -> Entry:
-    frame = pack_frame(unpacked)
-    result.root = sha256(frame).hexdigest()
-    step("publish.root")
-    if send_object(store, blob_path(bytes.fromhex(result.root)), frame, look=look):
-        result.sent_objects += 1
-        result.sent_bytes += len(frame)
-    if time.monotonic() - began_s > _LONGEST_S:
-        raise CannotWrite(
-            f"publishing to {store.url} took longer than a day: the version is not made current",
-            hint="run the same command again: what was sent within a day is not sent again",
+    def _root(self, side: float, rows: list[_ShardRow]) -> Root:
+        catalogue = self._catalogue
+        largest_x, largest_y = (catalogue.boxes[:, 2:] - catalogue.boxes[:, :2]).max(axis=0).tolist()
+        bounds = catalogue.bounds
+        assert bounds is not None  # noqa: S101  a catalogue without cells is not loaded
+        return Root(
+            id_prefix=self._result.id_prefix,
+            frame_id=catalogue.frame_id,
+            crs=catalogue.frame.crs,
+            origin=catalogue.frame.origin,
+            unit_m=catalogue.frame.unit_m,
+            encoding=EXACT,
+            cells=len(catalogue),
+            bounds=bounds,
+            shard_m=side,
+            largest_m=(largest_x, largest_y),
+            mean_m=catalogue.mean_size,
+            layers={name: layer_spec(name).builder_version for name in self._names},
+            keys=np.array([row.key for row in rows], np.int32),
+            counts=np.array([row.cells for row in rows], np.uint32),
+            sizes=np.array([row.size for row in rows], np.uint32),
+            hashes=np.frombuffer(b"".join(row.sha256 for row in rows), np.uint8).reshape(-1, 32),
         )
-    step("version.entry")
-    return new_entry(store, result.root, len(frame), seen.current)
+
+    def _send_root(self, unpacked: bytes) -> Entry:
+        frame = pack_frame(unpacked)
+        digest = sha256(frame).digest()
+        self._result.root = digest.hex()
+        step("publish.root")
+        self._count(len(frame) * send_object(self._store, blob_path(digest), frame, look=self._look))
+        if time.monotonic() - self._began_s > _LONGEST_S:
+            raise CannotWrite(
+                f"publishing to {self._store.url} took longer than a day: the version is not made current",
+                hint="run the same command again: what was sent within a day is not sent again",
+            )
+        step("version.entry")
+        return new_entry(self._store, self._result.root, len(frame), self._seen.current)

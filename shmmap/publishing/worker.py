@@ -45,7 +45,7 @@ from shmmap.publishing.sending import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 
-__all__ = ["TASKS_AHEAD", "main"]
+__all__ = ["TASKS_AHEAD", "CellMaker", "LayerRefused", "main"]
 
 _NICENESS: Final = 5
 TASKS_AHEAD: Final = 8
@@ -66,7 +66,7 @@ class _Cell:
     layers: tuple[_Layer, ...]
 
 
-class _LayerRefused(Exception):
+class LayerRefused(Exception):
     """A layer that cannot be made, and why."""
 
     def __init__(self, layer: str, code: str, message: str, hint: str = "") -> None:
@@ -74,7 +74,7 @@ class _LayerRefused(Exception):
         self.layer, self.code, self.message, self.hint = layer, code, message, hint
 
 
-class _Maker:
+class CellMaker:
     """Makes the objects of cells, in one thread."""
 
     def __init__(self, known: KnownObjects, cache: LayerCache | None) -> None:
@@ -82,18 +82,19 @@ class _Maker:
         self._cache = cache
 
     def make(self, task: CellToSend) -> _Cell:
+        """Make the objects of a cell's layers; `LayerRefused` where one cannot be made."""
         specs = [layer_spec(name) for name in task.layers]
-        source = CellPoints(task.path, task.box, specs)
+        source = CellPoints(task.source, task.box, specs)
         layers, headers = [], []
         for spec, around in zip(specs, task.around, strict=True):
-            job = CellJob(task.cell_id, task.path, task.box, task.frame_id, around)
+            job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around)
             header, layer = self._layer(spec, job, source)
             headers.append(header)
             layers.append(layer)
         states: set[SourceStamp] = {header.source for header in headers}
         if len(states) > 1:
-            raise _LayerRefused(
-                str(specs[0]), MapDataError.code, f"{task.path}: the file changed while it was read"
+            raise LayerRefused(
+                str(specs[0]), MapDataError.code, f"{task.source.name}: the file changed while it was read"
             )
         return _Cell(headers[task.layers.index(LAYER)], tuple(layers))
 
@@ -108,7 +109,7 @@ class _Maker:
                     raise MapDataError(
                         f"{name} has {format_bytes(header.total_bytes)}, more than the"
                         f" {format_bytes(MAX_OBJECT_BYTES)} that a published layer of a cell may have",
-                        path=job.path,
+                        path=job.source.name,
                         cause="too_large",
                         hint="divide the map into smaller cells",
                     )
@@ -116,16 +117,16 @@ class _Maker:
             finally:
                 os.close(fd)
         except ShmmapError as error:
-            raise _LayerRefused(name, error.code, error.message, error.hint) from None
+            raise LayerRefused(name, error.code, error.message, error.hint) from None
         except OSError as error:
-            message = f"{error.filename or job.path}: {error.strerror or error}"
-            raise _LayerRefused(name, MapDataError.code, message) from None
+            message = f"{error.filename or job.source.name}: {error.strerror or error}"
+            raise LayerRefused(name, MapDataError.code, message) from None
         except MemoryError:
-            message = f"{job.path}: building {name} ran out of memory"
-            raise _LayerRefused(name, MapDataError.code, message) from None
+            message = f"{job.source.name}: building {name} ran out of memory"
+            raise LayerRefused(name, MapDataError.code, message) from None
         except Exception as error:  # noqa: BLE001  a builder of another package, say
-            message = f"{job.path}: building {name} failed: {error!r}"
-            raise _LayerRefused(name, InternalError.code, message) from None
+            message = f"{job.source.name}: building {name} failed: {error!r}"
+            raise LayerRefused(name, InternalError.code, message) from None
 
     def _object(self, segment: memoryview) -> _Layer:
         unpacked = bare_object(segment)
@@ -191,7 +192,7 @@ def _work(channel: socket.socket, argument: str) -> None:
         instance_credentials=settings.instance_credentials,
     )
     cache = LayerCache(settings.cache_dir, limit_bytes=1 << 62) if settings.cache_dir else None
-    maker = _Maker(KnownObjects(settings.known), cache)
+    maker = CellMaker(KnownObjects(settings.known), cache)
 
     def send(message: CellSent | NotSent) -> None:
         channel.send(encode(message))
@@ -203,7 +204,7 @@ def _work(channel: socket.socket, argument: str) -> None:
             task = decode_task(data)
             try:
                 cell = maker.make(task)
-            except _LayerRefused as error:
+            except LayerRefused as error:
                 send(NotSent(task.number, error.layer, error.code, error.message[:2000], error.hint))
             else:
                 pool.submit(sender.send, task.number, cell)

@@ -63,6 +63,11 @@ class SourceStamp(NamedTuple):
         """Stamp of a file from its `os.stat` or `os.fstat` result."""
         return cls(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
+    @classmethod
+    def from_token(cls, token: bytes) -> SourceStamp:
+        """Stamp whose `token` this is."""
+        return cls(*_TOKEN.unpack(token))
+
     @property
     def token(self) -> bytes:
         """The same as bytes, which is all that versions and the daemon know of it."""

@@ -90,6 +90,7 @@ COUNTERS: Final = (
         "How the use of a segment is known: 0 leases, 1 locks of clients, 2 what sessions say",
     ),
     Counter("map_cells", "gauge", "", "Cells in the map's catalogue"),
+    Counter("map_cells_known", "gauge", "", "Cells of it that are known, where the list comes in pages"),
     Counter("reloads_failed", "counter", "", "Times the map's catalogue could not be read again"),
     Counter("last_reload_unix_ns", "gauge", "ns", "When the catalogue was last read, wall clock"),
     Counter("last_reload_failed", "gauge", "", "1 if the last attempt to read the catalogue again failed"),

@@ -36,7 +36,7 @@ def publish_all(one: InnerDaemon, count: int) -> list[str]:
     for index in range(count):
         fd = one.directory.create()
         cell = catalogue.id(index)
-        header = build_points(catalogue.path(index), fd, cell_id=cell, box=catalogue.box(index))
+        header = build_points(catalogue.source(index).name, fd, cell_id=cell, box=catalogue.box(index))
         name = new_segment_name("inner")
         block = PublishBlock(1, catalogue.version(index))
         one.directory.publish(fd, name, block=block, header_bytes=header.header_bytes, mode=0o400, gid=-1)

@@ -80,7 +80,7 @@ class Margin(Nothing):
         if self._area is not None:
             x, y, radius = self._area.x, self._area.y, self._area.radius + MARGIN_M
             cells = catalogue.query(Circle(x, y, radius))[0]
-            middles = catalogue.boxes[cells].reshape(-1, 2, 2).mean(axis=1)
+            middles = catalogue.boxes_of(cells).reshape(-1, 2, 2).mean(axis=1)
             self._cells = cells[np.argsort(-np.hypot(*(middles - (x, y)).T))].tolist()
             self._area = None
         while self._cells:

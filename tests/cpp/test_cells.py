@@ -203,7 +203,7 @@ def test_by_another_compiler_and_standard(
 ) -> None:
     if shutil.which("clang++") is None:
         pytest.skip("clang++ is missing")
-    program = compiled(tmp_path, compiler="clang++", standard="c++20")
+    program = compiled(tmp_path, compiler="clang++", standard="c++20", optimize="-O0")
     assert equal_bytes(program, daemon(divided_map.root).endpoint, QUICK_LAYERS) == 36 * 500
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -36,16 +37,37 @@ def test_the_page_names_every_benchmark_and_no_other() -> None:
     assert sorted(set(re.findall(r"^\| `(\w+)`", PAGE.text, re.MULTILINE))) == MODULES
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_it_starts(name: str) -> None:
+STARTS = """
+import contextlib, io, json, runpy, sys
+told = {}
+for line in sys.argv[1:]:
+    module, *sys.argv[1:] = line.split()
+    out, err, code = io.StringIO(), io.StringIO(), None
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            runpy.run_module("tests.benchmarks." + module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        code = end.code
+    told[module] = code, out.getvalue(), err.getvalue()
+print(json.dumps(told))
+"""
+
+
+def started(*lines: str) -> dict[str, tuple[object, str, str]]:
+    """Return how each of these ended and what it printed; one process for all, they import the same."""
+    environment = {key: value for key, value in os.environ.items() if key != "SHMMAP_TEST_DATA"}
     done = subprocess.run(
-        [sys.executable, "-m", f"tests.benchmarks.{name}", "--help"],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert done.stdout.startswith("usage: ")
+        [sys.executable, "-c", STARTS, *lines],
+        cwd=ROOT, env=environment, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    told: dict[str, tuple[object, str, str]] = json.loads(done.stdout)
+    return told
+
+
+def test_every_one_starts() -> None:
+    told = started(*(f"{name} --help" for name in MODULES))
+    assert {name: one for name, one in told.items() if not one[1].startswith("usage: ") or one[0]} == {}
+    assert sorted(told) == MODULES
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -53,15 +75,11 @@ def test_its_docstring_says_how_to_run_it(name: str) -> None:
     assert f"    python -m tests.benchmarks.{name}" in docstring(name) or name in NEED_DATA
 
 
-@pytest.mark.parametrize("name", NEED_DATA)
-def test_without_data_it_says_how_to_make_some(name: str) -> None:
-    environment = {key: value for key, value in os.environ.items() if key != "SHMMAP_TEST_DATA"}
-    done = subprocess.run(
-        [sys.executable, "-m", f"tests.benchmarks.{name}"],
-        cwd=ROOT, env=environment, check=False, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert "hint: python -m tests.benchmarks.make_data" in done.stderr
+def test_without_data_they_say_how_to_make_some() -> None:
+    told = started(*NEED_DATA)
+    hint = "hint: python -m tests.benchmarks.make_data"  # a message instead of a code is exit 1
+    assert {name: one for name, one in told.items() if hint not in str(one[0])} == {}
+    assert sorted(told) == NEED_DATA
 
 
 def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:

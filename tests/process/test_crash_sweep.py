@@ -178,8 +178,7 @@ def die_in_cpp(request: pytest.FixtureRequest, endpoint: str, crash: str) -> int
 
 
 @pytest.mark.parametrize("label", CLIENT_STEPS)
-@pytest.mark.parametrize("number", [1, 3])
-@pytest.mark.parametrize("die", [die_in_python, die_in_cpp])
+@pytest.mark.parametrize(("die", "number"), [(die_in_python, 1), (die_in_python, 3), (die_in_cpp, 3)])
 def test_client(
     daemon: DaemonFactory,
     divided_map: DividedMap,

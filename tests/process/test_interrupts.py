@@ -8,6 +8,7 @@ instants are for ``tests/benchmarks/interrupts.py``.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import dis
 import gc
@@ -17,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FrameType
@@ -27,6 +28,10 @@ import pytest
 import zmq
 
 import shmmap
+from shmmap.client import connection_watch
+from shmmap.client.connection_watch import start_thread
+from shmmap.client.orphans import running
+from shmmap.client.window import follower
 from shmmap.errors import BadRequest
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
@@ -224,6 +229,40 @@ def test_following_events(daemon: Factory, divided_map: DividedMap) -> None:
         shmmap.EventStream(one.endpoint, name="x", timeout=LONG_S).close()
 
     assert interrupted_everywhere(follow, check) > 100
+
+
+OPENS: dict[str, Callable[[str], Any]] = {
+    "client": shmmap.connect,
+    "events": shmmap.EventStream,
+    "window": lambda endpoint: shmmap.MapWindow(endpoint, 15),
+}
+
+
+@pytest.mark.parametrize("what", OPENS)
+def test_threads_that_begin_when_nobody_wants_them_any_more(
+    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """On a busy machine that may be after the next connection, and no other may come."""
+    one = daemon(divided_map.root)
+    known = threads()
+    begun: list[Callable[[], None]] = []
+
+    def later(run: Callable[..., object], *arguments: object) -> None:
+        begun.append(partial(start_thread, run, *arguments))
+        raise Interrupt
+
+    OPENS[what](one.endpoint).close()
+    await_end_of_threads(known)
+    before = holdings(one), len(running)
+    with monkeypatch.context() as patch:
+        patch.setattr(follower if what == "window" else connection_watch, "start_thread", later)
+        with contextlib.suppress(Interrupt):
+            OPENS[what](one.endpoint)
+    shmmap.connect(one.endpoint).close()
+    (begin,) = begun
+    begin()
+    await_end_of_threads(known)
+    assert (holdings(one), len(running)) == before
 
 
 # --- a signal that comes to another thread ------------------------------------------------------------

@@ -239,6 +239,40 @@ def test_one_cloud_is_a_map(shmmap: Shmmap, town: DividedMap, tmp_path: Path) ->
     assert shmmap.json("publish", tmp_path / "back", tmp_path / "store")["changed"] is False
 
 
+def test_names_of_any_language_in_folders_of_their_own(shmmap: Shmmap, tmp_path: Path) -> None:
+    town = make_map(tmp_path / "town", columns=1, rows=1, points=50)
+    points = town.points("0_0.pcd")
+    for folder, name, corner in (("süd", "straße 1.pcd", (-20, 0)), ("nord/a", "'x': y.pcd", (20, 0))):
+        (town.pcd_dir / folder).mkdir(parents=True)
+        town.write_cell(name, corner, points)
+        (town.pcd_dir / name).rename(town.pcd_dir / folder / name)
+    lines = ["x_resolution: 20", "y_resolution: 20"]
+    lines += [f"{json.dumps(name)}: [{x}, {y}]" for name, (x, y) in town.corners.items()]
+    (town.root / "pointcloud_map_metadata.yaml").write_text("\n".join(lines) + "\n")
+    done = shmmap.json("publish", town.root, tmp_path / "store")
+    assert (done["cells"], done["notes"]) == (3, [])
+    read = PublishedMapReader(tmp_path / "store")
+    assert set(read.cells) == {"/store/0_0.pcd", "/store/süd/straße 1.pcd", "/store/nord/a/'x': y.pcd"}
+    shmmap("fetch", tmp_path / "store", tmp_path / "back")
+    for name in ("süd/straße 1.pcd", "nord/a/'x': y.pcd"):
+        assert (tmp_path / "back/pointcloud_map.pcd" / name).is_file()
+    assert not shmmap.json("publish", tmp_path / "back", tmp_path / "store")["changed"]
+
+
+def test_a_map_that_was_copied_without_its_history_goes_on(
+    shmmap: Shmmap, town: DividedMap, three: Path
+) -> None:
+    shutil.rmtree(three / "versions")
+    rows = shmmap.json("versions", three)["versions"]
+    assert [(row["version"], row["state"], row["created"]) for row in rows] == [(3, "current", "")]
+    assert "current" in shmmap("versions", three)
+    shmmap.json("versions", three, "--prune")
+    town.change("0_0.pcd", seed=9)
+    assert shmmap.json("publish", town.root, three)["version"] == 4
+    assert [row["version"] for row in shmmap.json("versions", three)["versions"]] == [4]
+    check(three, town)
+
+
 def test_a_cell_that_cannot_be_read_publishes_nothing(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
     before = (store / "CURRENT").read_bytes()
     (town.pcd_dir / "0_0.pcd").write_bytes(b"# .PCD v0.7\nnot a cloud\n")
@@ -253,7 +287,8 @@ def test_what_is_damaged_in_the_store_is_sent_again(shmmap: Shmmap, town: Divide
     for damaged in (store / "blobs/sha256").iterdir():
         damaged.write_bytes(b"")
     assert "has 0 bytes" in shmmap("publish", town.root, store, code=65)
-    assert shmmap.json("publish", town.root, store, "--resend")["sent_objects"] == 9
+    assert "--id-prefix" in shmmap("publish", town.root, store, "--resend", code=2)
+    assert shmmap.json("publish", town.root, store, "--resend", "--id-prefix", "/store/")["sent_objects"] == 9
     check(store, town)
     again = shmmap.json("publish", town.root, store)
     assert (again["changed"], again["version"]) == (False, 2)
@@ -585,10 +620,21 @@ def test_urls_that_cannot_be_meant(shmmap: Shmmap, town: DividedMap) -> None:
         ("s3://key:hunter2@maps/town", "may hold a secret"),
         ("ftp://maps/town", "cannot lie at a ftp:// URL"),
         ("http://192.0.2.1/town", "plain http://"),
+        ("file://elsewhere/town", "no directory of this machine"),
     ):
         errors = shmmap("publish", town.root, url, code=2)
         assert says in errors
         assert "hunter2" not in errors
+
+
+def test_what_is_wrong_is_said_before_anything_is_sent(
+    shmmap: Shmmap, town: DividedMap, tmp_path: Path
+) -> None:
+    store = tmp_path / "store"
+    assert "unknown layer 'ntd'" in shmmap("publish", town.root, store, "--layer", "ntd(leaf=2.0)", code=2)
+    assert "ids cannot begin with" in shmmap("publish", town.root, store, "--id-prefix", "town", code=2)
+    shmmap("publish", tmp_path / "nowhere", store, code=66)
+    assert not store.exists()
 
 
 def test_a_store_that_does_not_answer(shmmap: Shmmap) -> None:

@@ -180,8 +180,10 @@ def sizes(cells: CellSet) -> set[int]:
     return {len(cell.xyz) for cell in cells}
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("watch", [True, False])
+@pytest.mark.parametrize(
+    ("way", "watch"),
+    [*((way, False) for way in WAYS), *((way, True) for way in (map_itself, parent, kubernetes, removed))],
+)
 def test_a_link_that_leads_to_another_map(
     daemon: DaemonFactory, tmp_path: Path, way: Callable[..., tuple[Path, Callable[[], object]]], watch: bool
 ) -> None:

@@ -48,12 +48,12 @@ FLAGS: Final = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wpedantic", "-
 _CELL_WORDS: Final = 9
 
 
-def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17") -> Path:
+def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17", optimize: str = "-Og") -> Path:
     """Compile the client with the sanitizers of addresses and of undefined behaviour."""
     program = folder / f"cpp_client.{compiler}.{standard}"
     subprocess.run(
         [
-            compiler, f"-std={standard}", "-Og", "-g1", "-fsanitize=address,undefined",
+            compiler, f"-std={standard}", optimize, "-g1", "-fsanitize=address,undefined",
             "-fno-sanitize-recover=all", *FLAGS, str(SOURCE), "-o", str(program),
         ],
         check=True,

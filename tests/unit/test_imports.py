@@ -68,7 +68,7 @@ PARTS = {
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
     },
-    "prepare": BASE | {"formats", "layers", "origin"},
+    "prepare": BASE | {"formats", "layers", "origin", "segment"},
     "publishing": BASE | {"dividing", "formats", "layers", "origin", "prepare", "segment"},
     "service": BASE,
     "doctor": BASE | {

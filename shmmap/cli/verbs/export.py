@@ -13,7 +13,7 @@ from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import counted, print_json, print_line
 from shmmap.errors import BadRequest
-from shmmap.lacking import NOT_COVERED, area_text, failure_lines, near_cells_hint, unknown_ids
+from shmmap.lacking import area_text, failure_lines, near_cells_hint, not_covered, unknown_ids
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,7 +120,7 @@ def _complain_of(found: CellSet, wait_s: float) -> None:
     for pending in found.pending:
         complain("shmmap", f"{pending.id}: not loaded within {wait_s:g} s")
     if not found.covered:
-        complain("shmmap", NOT_COVERED, "ask again later")
+        complain("shmmap", *not_covered(found))
 
 
 def _format(args: argparse.Namespace) -> str:

@@ -30,7 +30,7 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.cli.screens.refusals import holder_rows
 from shmmap.errors import BadRequest
-from shmmap.lacking import NOT_COVERED, failure_lines, near_cells_hint, pending_lines, unknown_ids
+from shmmap.lacking import failure_lines, near_cells_hint, not_covered, pending_lines, unknown_ids
 
 if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
             _print_text(found, welcome.id_prefix, summed=bool(found.cells) or held_given)
         if not found.complete:
             if not found.covered:
-                complain("shmmap", NOT_COVERED, "ask again later")
+                complain("shmmap", *not_covered(found))
             print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
         return _judge_empty(args, client, area, found)

@@ -27,8 +27,8 @@ _EPILOG = """\
 --rollback gives an old version's content a new number: vehicles never go back to a lower one.
 JSON (fields may be added, none is removed):
   {"url", "current": number, "versions": [{"version", "state": "current", "earlier" or "never served",
-   "created": RFC 3339, "root": hash, "bytes": of the root, "before", "restored": the version whose content
-   it has again, or 0}]}, the latest first; a web server cannot list those that were never served
+   "created": RFC 3339 or "", "root": hash, "bytes": of the root, "before", "restored": the version whose
+   content it has again, or 0}]}, the latest first; a web server cannot list those that were never served
   --rollback: {"url", "changed", "version": the current one, "restored", "objects": that were looked for}
   --prune: {"url", "versions": [number], "objects", "bytes", "kept_versions": [number], "kept_objects",
    "kept_bytes"}
@@ -134,6 +134,7 @@ def _numbers(versions: list[int]) -> str:
 def _list(store: Store, *, as_json: bool) -> None:
     from shmmap.errors import MapMissing
     from shmmap.origin.remote.map_versions import (
+        Entry,
         earlier_versions,
         list_entries,
         read_entry,
@@ -141,7 +142,9 @@ def _list(store: Store, *, as_json: bool) -> None:
     )
 
     current = require_current(store)
-    entries = {entry.version: entry for entry in earlier_versions(store, current)}
+    # a map that was copied may have no entries
+    entries = {current.version: Entry(current.version, current.root, current.bytes, "")}
+    entries |= {entry.version: entry for entry in earlier_versions(store, current)}
     states = {version: "current" if version == current.version else "earlier" for version in entries}
     if not store.read_only:
         import contextlib
@@ -184,7 +187,7 @@ def _list(store: Store, *, as_json: bool) -> None:
             (
                 str(entry.version),
                 states[entry.version],
-                entry.created[:19].replace("T", " ") + " UTC",
+                f"{entry.created[:19].replace('T', ' ')} UTC" if entry.created else "",
                 entry.root[:12],
                 f"version {entry.restored}" if entry.restored else "",
             )

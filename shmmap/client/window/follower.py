@@ -15,7 +15,7 @@ from queue import Empty, SimpleQueue
 from typing import Final
 
 from shmmap.client.connection_watch import start_thread
-from shmmap.client.orphans import running
+from shmmap.client.orphans import enter, running
 from shmmap.client.session import Session
 from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.state import EMPTY, WindowState, moved
@@ -165,8 +165,8 @@ class WindowFollower:
 
     def _run(self) -> None:
         self._thread = _thread.get_ident()
-        running.add(self)
         try:
+            enter(self)
             while self._wait(self._due_s):
                 pose = self._pose
                 if pose is None:

@@ -59,9 +59,8 @@ class MapWindow:
     update_distance
         Metres the pose moves before the daemon is asked again (20 in Autoware).
     refresh_interval
-        Seconds after which it is asked anyhow, to learn of a changed map.  A request that is certain to
-        bring nothing is not sent, except to tell the pose every second or 5 m, and a route that is another
-        one; so small steps and short intervals cost little, where the daemon's statistics can be read.
+        Seconds after which it is asked anyhow, to learn of a changed map.  Of another route or velocity, or a
+        pose 5 m away, the daemon learns after a second at the latest.
     retention
         What to keep attached of what has left the window; default nothing.
     background

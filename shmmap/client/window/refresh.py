@@ -15,9 +15,6 @@ from shmmap import geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client
-from shmmap.client.window import nothing_new
-from shmmap.client.window.failed_boxes import FailedBoxes
-from shmmap.client.window.nothing_new import NothingNew, says_more
 from shmmap.client.window.retention import Departed, RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
@@ -29,6 +26,12 @@ __all__ = ["WindowRefresher"]
 _Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
 
 _SHAPES: Final[dict[str, _Shape]] = {"circle": geometry.Circle, "square": geometry.AutowareSquare}
+
+TELL_S: Final = 1.0
+"""A pose that says more of where a client goes than what was asked with last waits for so long at most."""
+_TELL_M: Final = 5.0
+_TELL_MPS: Final = 1.0
+"""A pose or a velocity that differs by so much says more, as does another route."""
 
 
 class WindowRefresher:
@@ -90,8 +93,6 @@ class WindowRefresher:
         self._retention = retention
         self._populate = populate
         self._timeout_s = timeout_s
-        self._failed_boxes = FailedBoxes(client)
-        self._nothing_new = NothingNew(client, timeout_s)
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
         self._told: tuple[Intent, float] | None = None
@@ -107,10 +108,10 @@ class WindowRefresher:
         Whoever has told of another route or velocity less than a second ago lets that second pass.
         """
         told = self._told
-        return told[1] + nothing_new.TELL_S if told is not None and says_more(pose, told[0]) else math.inf
+        return told[1] + TELL_S if told is not None and _says_more(pose, told[0]) else math.inf
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
-        """Ask the daemon once, unless it is certain that nothing would come (`NothingNew`).
+        """Ask the daemon once.
 
         Returns
         -------
@@ -125,13 +126,7 @@ class WindowRefresher:
             As `Client.differential`; the old state stays true.
         """
         area = self._make_area(pose.x, pose.y, self._radius, self._z)
-        news, asked_s = self._nothing_new, self._clock()
-        if news.certain(state, pose, area, asked_s):
-            self._retain(pose, asked_s)
-            return (
-                state if area == state.area else msgspec.structs.replace(state, asked=pose, area=area)
-            ), False
-        changes = news.changes()
+        asked_s = self._clock()
         answer = self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
             # Another life of the daemon cannot know what versions of an earlier one belonged to, and takes
@@ -158,11 +153,7 @@ class WindowRefresher:
             )
         else:
             after = self._apply(state, answer, area, pose, now_s)
-        if answer.failed or state.failed_boxes:
-            boxes = self._failed_boxes.of(answer.failed, area, answer.map_version)
-            after = msgspec.structs.replace(after, failed_boxes=boxes)
         self._retain(pose, now_s)
-        news.answered(changes, after, pose, asked_s)
         return after, progress
 
     def _ask(
@@ -221,3 +212,12 @@ class WindowRefresher:
         """Drop what is retained; returns the state of a window that holds nothing."""
         self.retained.clear()
         return EMPTY
+
+
+def _says_more(pose: Intent, told: Intent) -> bool:
+    """Whether a pose says more of where a client goes than what the daemon was told last."""
+    return (
+        pose.route != told.route
+        or math.hypot(pose.vx - told.vx, pose.vy - told.vy) >= _TELL_MPS
+        or math.hypot(pose.x - told.x, pose.y - told.y) >= _TELL_M
+    )

@@ -26,6 +26,7 @@ PASSING: Final = (OverBudget, Offline)
 
 LayerKey: TypeAlias = tuple[str, str]
 """Cell id and layer."""
+Box: TypeAlias = tuple[float, float, float, float]
 
 
 class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
@@ -82,8 +83,6 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         By layer, boxes of its cells in the order of ``by_layer``, (N, 4) float64.
     asked
         The pose that was asked about; None before the first answer.
-    failed_boxes
-        Where the cells of ``failed`` lie, by id; of those that are not here nobody could tell.
     area
         What was asked about: all that the map has there is in ``cells``, or named in ``pending`` or
         ``failed``, if the daemon knows all of it (``covered``).
@@ -100,7 +99,6 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     epoch: int = 0
     map_version: int = 0
     covered: bool = True
-    failed_boxes: Mapping[str, tuple[float, float, float, float]] = {}
 
     @property
     def settled(self) -> bool:
@@ -120,18 +118,12 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         """
         if self.area is None or not self.covered or not self.area.contains_circle(x, y, radius):
             return False
-        missing = [(cell.id, cell.layer) for cell in self.pending]
-        missing += [(failure.cell_id, failure.layer) for failure in self.failed]
+        missing: list[tuple[LayerKey, Box | None]] = [((cell.id, cell.layer), None) for cell in self.pending]
+        missing += [((failure.cell_id, failure.layer), failure.box) for failure in self.failed]
         return not any(
-            key not in self.cells and layer in (None, key[1]) and self._may_touch(key[0], x, y, radius)
-            for key in missing
+            key not in self.cells and layer in (None, key[1]) and _may_touch(box, x, y, radius)
+            for key, box in missing
         )
-
-    def _may_touch(self, cell_id: str, x: float, y: float, radius: float) -> bool:
-        box = self.failed_boxes.get(cell_id)
-        if box is None:
-            return True
-        return math.hypot(max(box[0] - x, x - box[2], 0.0), max(box[1] - y, y - box[3], 0.0)) <= radius
 
     @classmethod
     def build(
@@ -164,6 +156,12 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
             map_version,
             covered,
         )
+
+
+def _may_touch(box: Box | None, x: float, y: float, radius: float) -> bool:
+    if box is None:
+        return True
+    return math.hypot(max(box[0] - x, x - box[2], 0.0), max(box[1] - y, y - box[3], 0.0)) <= radius
 
 
 EMPTY: Final = WindowState(covered=False)  # what the map has there is not known yet

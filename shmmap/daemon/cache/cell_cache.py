@@ -153,13 +153,17 @@ class CellCache:
         return self.heights.overlapping(indices, z)
 
     def estimate(self, index: int, layer: str) -> int:
-        """Bytes to reserve before a load: `points` has its file's bytes, plus its header, at most.
+        """Bytes to reserve before a load: what the origin says, or else a guess.
 
-        Only for compressed and ASCII files can it be more; their worker asks for it, as does that of
-        a computed layer, of which this is a guess.
+        `points` has its file's bytes, plus its header, at most.  Only for compressed and ASCII files can it
+        be more; their worker asks for it, as does that of a computed layer.
         """
-        share = 1.0 if layer == LAYER else layer_spec(layer).kind.bytes_ratio
-        size = int(self.catalogue.source_bytes(index) * share) + _HEADER_ALLOWANCE_BYTES
+        ready = self.catalogue.ready(index, layer)
+        if ready is not None:
+            size = ready.nbytes
+        else:
+            share = 1.0 if layer == LAYER else layer_spec(layer).kind.bytes_ratio
+            size = int(self.catalogue.source_bytes(index) * share) + _HEADER_ALLOWANCE_BYTES
         return -(-size // _PAGE_BYTES) * _PAGE_BYTES
 
     def is_current(self, resident: Resident) -> bool:

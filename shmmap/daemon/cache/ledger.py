@@ -11,7 +11,7 @@ Times are seconds on any one clock, injected by the caller.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from shmmap.daemon.cache.eviction.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
@@ -80,6 +80,8 @@ class Ledger:
         Bytes of retired segments that nobody had open at the last look.
     overhead_bytes
         What the daemon itself keeps in shared memory (its statistics); counts as used.
+    aside_bytes
+        Segments of an earlier life that cannot be judged before more of the map is known; counts as used.
     prefetched_bytes
         Memory of what was fetched before anybody asked for it, and nobody has asked for yet.
     unchecked_count
@@ -98,6 +100,7 @@ class Ledger:
         self.condemned_bytes = 0
         self.reserved_bytes = 0
         self.overhead_bytes = 0
+        self.aside_bytes = 0
         self.prefetched_bytes = 0
         self.unchecked_count = 0
         self._by_name: ShardedDict[str, Resident] = ShardedDict()
@@ -108,8 +111,9 @@ class Ledger:
 
     @property
     def used_bytes(self) -> int:
-        """Resident, retired and reserved bytes together, and the daemon's own overhead."""
-        return self.resident_bytes + self.retired_bytes + self.reserved_bytes + self.overhead_bytes
+        """Resident, retired and reserved bytes together, what is set aside, and the daemon's own overhead."""
+        in_memory = self.resident_bytes + self.retired_bytes + self.aside_bytes
+        return in_memory + self.reserved_bytes + self.overhead_bytes
 
     def shortage(self, nbytes: int) -> int:
         """How many bytes must be freed before ``nbytes`` more fit; 0 or less when they fit."""
@@ -145,6 +149,10 @@ class Ledger:
         found = (self.by_key.get(Key(cell_id, layer)) for layer in self._layers)
         return [resident for resident in found if resident is not None]
 
+    def layers(self) -> Iterable[str]:
+        """Layers of which there are segments that can be handed out."""
+        return self._layers.keys()
+
     @property
     def cell_count(self) -> int:
         """Of how many cells there are segments that can be handed out, of the layer that most have."""
@@ -168,6 +176,10 @@ class Ledger:
             self._needed[key] = count
         elif key in self.by_key:
             self.order.again(self.by_key[key])
+
+    def needed(self) -> Iterable[Key]:
+        """What somebody needs."""
+        return self._needed.keys()
 
     def is_needed(self, key: Key) -> bool:
         """Whether somebody needs this."""

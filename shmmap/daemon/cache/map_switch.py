@@ -95,7 +95,7 @@ class MapSwitch:
     def switch(self, new: CatalogueView, change: CatalogueChange) -> None:
         """Serve another state of the map; ``change`` is what it differs in from the one served now."""
         cache = self._cache
-        if change.count <= CELLS_REMEMBERED:
+        if change.known and change.count <= CELLS_REMEMBERED:
             touched = {cell for how in ("changed", "added", "moved") for cell in change.ids(how)}
             if change:
                 self._remember(touched, change.ids("removed"))
@@ -107,6 +107,11 @@ class MapSwitch:
         self._leftovers += cache.serve(new, changed if change.same_cells else None)
         self._unseen = cache.ledger.segments.walk()
         cache.unentered = cache.ledger.resident_count
+
+    def look_again(self) -> None:
+        """More of the map is known: what was of no known version may be current."""
+        self._unseen = self._cache.ledger.segments.walk()
+        self._cache.unentered = self._cache.ledger.resident_count
 
     @property
     def busy(self) -> bool:
@@ -146,7 +151,7 @@ class MapSwitch:
             cache.tell(cache.rows.show, resident, "resident")
         elif resident.checked:
             cache.tell(cache.rows.show, resident, "stale")
-        elif not cache.is_current(resident):
+        elif not cache.is_current(resident) and cache.layers.version(index, resident.key.layer):
             cache.reclaimer.retire(resident, now_s, "map")
 
     def _remember(self, changed: set[str], removed: tuple[str, ...]) -> None:

@@ -5,6 +5,8 @@ Every name of the instance is looked at once, before anything is served:
 
 - a segment that is published, ours, whole by its header, and of the version its cell has in the map
   now is *adopted*: it serves again as soon as a worker has compared its bytes with their checksums;
+- one of which that is not known yet, because the page of the map that its box lies in is not here, is *set
+  aside*: it keeps its name, its bytes count, and it is judged when the page comes;
 - any other segment that somebody still maps is kept as a retired one, known by name and cell, and is
   freed when its last reader lets go;
 - the rest is removed.  What this user may not remove (a stranger's file that squats one of our
@@ -16,15 +18,17 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
-from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.loading.loads import BACKGROUND, Loads
 from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.records import Key, Resident
 from shmmap.errors import BadRequest, SegmentCorrupt
 from shmmap.failpoints import step
+from shmmap.geometry import Box
 from shmmap.layers.spec import layer_spec
 from shmmap.logfmt import log
 from shmmap.segment.directory import measured_bytes
@@ -34,6 +38,13 @@ from shmmap.segment.verify import read_header
 
 __all__ = ["Adoption"]
 
+NOT_IN_MAP: Final = "its cell is not in the map"
+CHANGED: Final = "its cell, or one around it, has changed"
+UNDECIDED: Final = (NOT_IN_MAP, CHANGED)
+"""What may turn out to be otherwise when more of the map is known."""
+ADOPTED: Final = 0.5 * BACKGROUND
+"""Priority of pages that segments of an earlier life are judged by: behind all that somebody waits for."""
+
 
 @dataclass(eq=False, slots=True)
 class Adoption:
@@ -42,10 +53,11 @@ class Adoption:
     cache: CellCache
     loads: Loads
     misplaced: MisplacedCells
+    _aside: dict[str, tuple[Box, int]] = field(default_factory=dict)  # where to look, and the bytes, by name
 
     def take_over(self, now_s: float) -> None:
         """Look at every name once."""
-        counts = dict.fromkeys(("taken_over", "still_in_use", "dropped"), 0)
+        counts = dict.fromkeys(("taken_over", "set_aside", "still_in_use", "dropped"), 0)
         instance = self.cache.instance
         for name in self.cache.directory.names(segment_prefix(instance)):
             if name != statistics_name(instance):
@@ -53,6 +65,40 @@ class Adoption:
         step("daemon.adopted")
         if any(counts.values()):
             log.info("segments of an earlier daemon", **counts)
+
+    def pages_came(self, now_s: float) -> None:
+        """More of the map is known: judge what was set aside for it."""
+        for name, (area, nbytes) in list(self._aside.items()):
+            if not self._has_absent_pages(area):
+                del self._aside[name]
+                self.cache.ledger.aside_bytes -= nbytes
+                self._take(name, now_s)
+
+    def close(self, *, keep: bool) -> None:
+        """Take the names of what is still set aside away, or leave them to the next life."""
+        if not keep:
+            for name in self._aside:
+                self._remove(name, "the daemon ends")
+
+    def _has_absent_pages(self, area: Box) -> bool:
+        pages = self.cache.catalogue.pages
+        return pages is not None and not all(map(pages.is_here, pages.of_area(area)))
+
+    def _may_become_known(self, resident: Resident) -> Box | None:
+        """Where pages of the map are absent that a segment is judged by; None if none are."""
+        if self.cache.catalogue.complete or is_retired(resident.name):
+            return None
+        min_x, min_y, max_x, max_y = resident.box
+        halo_m = self.cache.layers.halo_m((resident.key.layer,))
+        area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
+        return area if self._has_absent_pages(area) else None
+
+    def _set_aside(self, name: str, area: Box, nbytes: int) -> None:
+        self._aside[name] = area, nbytes
+        self.cache.ledger.aside_bytes += nbytes
+        pages = self.cache.catalogue.pages
+        if pages is not None:
+            pages.want(pages.of_area(area), ADOPTED)
 
     def _take(self, name: str, now_s: float) -> str:
         """What becomes of a name."""
@@ -66,6 +112,9 @@ class Adoption:
             if not why_not:
                 self._adopt(fd, resident, outside)
                 return "taken_over"
+            if why_not in UNDECIDED and (area := self._may_become_known(resident)) is not None:
+                self._set_aside(name, area, resident.nbytes)
+                return "set_aside"
             if self._is_used(fd):
                 self._keep_for_readers(name, resident, now_s)
                 return "still_in_use"
@@ -110,11 +159,11 @@ class Adoption:
             return f"layer {header.layer} is built otherwise now"
         index = catalogue.find(header.cell_id)
         if index is None:
-            return "its cell is not in the map"
+            return NOT_IN_MAP
         if resident.key in cache.ledger.by_key:
             return "there is another one"
         if resident.version != cache.layers.version(index, header.layer):
-            return "its cell, or one around it, has changed"
+            return CHANGED
         if header.frame_id != catalogue.frame_id:
             return "it is in another frame"
         if cache.ledger.shortage(status.st_blocks * 512) > 0:

@@ -202,16 +202,26 @@ class Loads:
         """How many of those somebody asked for."""
         return self._queue.count(asker)
 
-    def want(self, key: Key, estimate: int, priority: float, asker: Hashable = None) -> Load:
+    def want(
+        self,
+        key: Key,
+        estimate: int,
+        priority: float,
+        asker: Hashable = None,
+        *,
+        computed: bool | None = None,
+    ) -> Load:
         """Queue a load, or move a queued one forward; however many ask, there is one load.
 
-        Those who ask take turns, in `LoadQueue`.
+        Those who ask take turns, in `LoadQueue`.  ``computed`` says that it may take long; by default what is
+        not ``points`` does.
         """
         load = self.by_key.get(key)
         if load is None:
             self._numbers += 1
+            computed = key.layer != LAYER if computed is None else computed
             load = self.by_key[key] = Load(
-                key, estimate, priority, self._numbers, asker=asker, computed=key.layer != LAYER
+                key, estimate, priority, self._numbers, asker=asker, computed=computed
             )
         load.prefetch = False
         if load.running:
@@ -221,9 +231,9 @@ class Loads:
         self._queue.push(load, priority, asker)
         return load
 
-    def prefetch(self, key: Key, estimate: int, needed_in_s: float) -> Load:
+    def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool | None = None) -> Load:
         """Queue a load that nobody has asked for yet, behind everything that somebody asks for."""
-        load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH)
+        load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH, computed=computed)
         load.wanted, load.prefetch = False, True
         return load
 
@@ -263,6 +273,10 @@ class Loads:
         fits = self._ledger.reserve(extra)
         load.reserved += extra if fits else 0
         return fits
+
+    def set_aside(self, load: Load) -> None:
+        """A queued load cannot be begun yet; `requeue` it when it can."""
+        self._queue.discard(load)
 
     def requeue(self, load: Load) -> None:
         """Put a running load back (its worker died before its turn, or what it read is outdated)."""

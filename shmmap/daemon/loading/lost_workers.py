@@ -89,36 +89,41 @@ class LostWorkers:
         for job in self.pool.remove(worker):
             load = self.jobs.pop(job.number, None)
             if load is not None and give_up:
-                self.fail(load, "load_failed", f"{job.path}: no loader can start: {how}", None, now_s)
+                self.fail(load, "load_failed", f"{job.source.name}: no loader can start: {how}", None, now_s)
             elif load is not None:
                 self.loads.requeue(load)
 
     def _vanished(self, worker: Worker, now_s: float) -> None:
         """Its parent ended: that is no job's fault, unless it happens again and again."""
-        for position, job in enumerate(self.pool.remove(worker)):
+        at_work = worker.at_work or next(iter(worker.queue), 0)
+        for job in self.pool.remove(worker):
             self.room.hungry.pop(job.number, None)
             load = self.jobs.pop(job.number, None)
             if load is None:
                 continue
-            load.losses += position == 0
+            load.losses += job.number == at_work
             if load.losses < LOSSES_ALLOWED:
                 self.loads.requeue(load)
             else:
-                self.fail(load, "load_failed", f"{job.path}: its loaders vanish", None, now_s)
+                self.fail(load, "load_failed", f"{job.source.name}: its loaders vanish", None, now_s)
 
     def _replace(self, worker: Worker, code: str, why: str, now_s: float) -> None:
         """Forget a worker that had begun: the job it worked on fails."""
-        spent_s = now_s - worker.head_since_s
-        for position, job in enumerate(self.pool.remove(worker)):
+        spent_s, at_work = now_s - worker.since_s, worker.at_work
+        if worker.queue and not at_work:
+            log.error("loader replaced", reason=why)
+            self._vanished(worker, now_s)
+            return
+        for job in self.pool.remove(worker):
             self.room.hungry.pop(job.number, None)
             load = self.jobs.pop(job.number, None)
-            if position == 0:
-                log.error("loader replaced", path=job.path, reason=why)
+            if job.number == at_work:
+                log.error("loader replaced", path=job.source.name, reason=why)
                 if load is not None:
                     load.spent_s = spent_s
                     # where it took too long nobody looks again: the file system may be what hangs
                     blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
                     known = load.sources[0] if blamed and load.sources else None
-                    self.fail(load, code, f"{job.path}: {why}", known, now_s)
+                    self.fail(load, code, f"{job.source.name}: {why}", known, now_s)
             elif load is not None:
                 self.loads.requeue(load)

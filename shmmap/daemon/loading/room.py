@@ -127,4 +127,4 @@ class Room:
         Loads that wait for room do not end by themselves, nor do those that come after them in the
         same loader's queue.
         """
-        return any(worker.queue and next(iter(worker.queue)) not in self.hungry for worker in self.pool)
+        return any(worker.queue and self.hungry.keys().isdisjoint(worker.queue) for worker in self.pool)

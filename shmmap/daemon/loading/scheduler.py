@@ -19,7 +19,7 @@ from shmmap.daemon.loading.lost_workers import LostWorkers
 from shmmap.daemon.loading.misplaced import MisplacedCells
 from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
-from shmmap.daemon.loading.worker_messages import Check, Checked, Done, Ended, Failed, Job, Need, Ready
+from shmmap.daemon.loading.worker_messages import Begun, Check, Checked, Done, Ended, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
@@ -76,6 +76,7 @@ class Scheduler:
         self.on_settled: Callable[[Key], None] = lambda _key: None
         self._jobs: dict[int, Load] = {}
         self._doubtful: deque[Key] = deque()
+        self._for_pages: dict[Load, None] = {}  # that wait until it is known which cells they look into
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
         self.room = Room(cache, self.loads, pool, self.prefetcher)
@@ -95,11 +96,12 @@ class Scheduler:
         cache = self._cache
         key = Key(cache.catalogue.id(index), layer)
         failure = self.loads.failures.get(key)
-        if failure is None or key in self.loads.by_key:
-            return self.loads.want(key, cache.estimate(index, layer), priority, asker)
-        if now_s >= failure.retry_at_s:
+        if failure is not None and key not in self.loads.by_key and now_s >= failure.retry_at_s:
             cache.tell(cache.events.retried, key, failure)
-            return self.loads.want(key, cache.estimate(index, layer), priority, asker)
+            failure = None
+        if failure is None or key in self.loads.by_key:
+            computed = cache.layers.is_computed(index, layer)
+            return self.loads.want(key, cache.estimate(index, layer), priority, asker, computed=computed)
         if failure.code in SPACE_CODES or failure.stamp is None:
             return None
         load = self.loads.want(key, 0, priority, asker)
@@ -109,8 +111,36 @@ class Scheduler:
     def map_changed(self) -> None:
         """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
         self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+        self.pages_settled()
         self.misplaced.map_changed()
         self.pool.read_through(self._opened)
+
+    def pages_settled(self) -> None:
+        """Pages of the map have come, or cannot be had: begin what waits for them, or find out."""
+        waiting, self._for_pages = self._for_pages, {}
+        for load in waiting:
+            if self.loads.by_key.get(load.key) is load:
+                self.loads.requeue(load)
+        self.prefetcher.look_again()
+
+    def _waits_for_pages(self, load: Load, now_s: float) -> bool:
+        """Whether a load cannot be begun because it is not known yet which cells it looks into."""
+        cache, pages = self._cache, self._cache.catalogue.pages
+        if pages is None or load.unless is not None or load.adopted is not None:
+            return False
+        index = cache.index_of(load.key.cell_id)
+        area = cache.layers.looks_into(index, load.key.layer) if index is not None else None
+        absent = [] if area is None else [page for page in pages.of_area(area) if not pages.is_here(page)]
+        if not absent:
+            return False
+        pages.want(absent, load.priority)
+        if any(map(pages.is_out_of_reach, absent)):
+            why = "which cells lie around it cannot be found out at present"
+            self._fail(load, "offline", why, None, now_s)
+        else:
+            self.loads.set_aside(load)
+            self._for_pages[load] = None
+        return True
 
     @property
     def _opened(self) -> Opened:
@@ -152,6 +182,8 @@ class Scheduler:
         load = self.loads.next_queued(points=points, layers=layers) if points or layers else None
         if load is None:
             return False
+        if load.computed and self._waits_for_pages(load, now_s):
+            return True
         estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
         if estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
@@ -188,24 +220,30 @@ class Scheduler:
         if index is None:
             return None
         if load.unless is not None:
-            return Check(number, catalogue.path(index), "", load.unless)
+            return Check(number, catalogue.source(index), "", load.unless)
         if load.adopted is not None:
             if cache.ledger.resident_named(load.adopted.name) is load.adopted:
-                return Check(number, catalogue.path(index), load.adopted.name, catalogue.stamp(index))
+                return Check(number, catalogue.source(index), load.adopted.name, catalogue.stamp(index))
             load.adopted = None  # it was retired before its turn came
             if not load.wanted:
                 return None
             load.estimate = cache.estimate(index, load.key.layer)
         layer = load.key.layer
+        ready = catalogue.ready(index, layer)
         around = cache.layers.neighbours(index, layer)
         load.sources = tuple(map(catalogue.stamp, (index, *around)))
         load.version = cache.layers.version(index, layer)
         points = cache.warm.get(index, LAYER) if layer != LAYER else None
         return Job(
-            number, load.key.cell_id, catalogue.path(index), layer, catalogue.box(index), catalogue.frame_id,
-            load.estimate, points.name if points is not None else "",
-            tuple(Neighbour(catalogue.path(i), catalogue.box(i)) for i in around),
+            number, load.key.cell_id, catalogue.source(index), layer, catalogue.box(index),
+            catalogue.frame_id, load.estimate, points.name if points is not None else "",
+            tuple(map(self._neighbour, around)),
+            ready.version if ready is not None else 0,
         )  # fmt: skip
+
+    def _neighbour(self, index: int) -> Neighbour:
+        catalogue = self._cache.catalogue
+        return Neighbour.of(catalogue.id(index), catalogue.source(index), catalogue.box(index))
 
     def next_event_s(self) -> float:
         """When there is something to do although nothing arrives; infinity for never."""
@@ -235,6 +273,8 @@ class Scheduler:
             self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
         elif isinstance(message, Ready):  # this process had no descriptor left to receive it
             self.lost.ended(worker, "too many open files", now_s)
+        elif isinstance(message, Begun):
+            self.pool.works_on(worker, message.number, now_s)
         elif isinstance(message, Need):
             self.room.ask(worker, message)
             self.room.feed(self._jobs, now_s)
@@ -250,6 +290,7 @@ class Scheduler:
             if load is None:
                 return
             load.spent_s = spent_s
+            load.took_s = now_s - load.started_s if worker.fetches else spent_s
             if isinstance(message, Checked):
                 self._on_checked(load, message, now_s)
             elif isinstance(message, Failed):
@@ -365,6 +406,6 @@ class Scheduler:
     def _end(self, load: Load, failure: Failure | None = None) -> None:
         """A load ended; whoever waits for it is told."""
         out = failure is not None and (load.unread or failure.code == "load_timeout")
-        self.prefetcher.ended.append((load, load.running, load.spent_s, out))
+        self.prefetcher.ended.append((load, load.running, load.took_s or load.spent_s, out))
         self.loads.finish(load, failure)
         self.on_settled(load.key)

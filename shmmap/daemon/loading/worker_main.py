@@ -13,12 +13,13 @@ import contextlib
 import errno
 import os
 import resource
+import select
 import signal
 import socket
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from shmmap.daemon.host.scheduling import weigh_less
 from shmmap.daemon.loading import worker_messages
@@ -29,6 +30,7 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import Made, make_layer
 from shmmap.layers.points import LAYER
+from shmmap.layers.source_reader import FILES, Files, SourceReader
 from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
@@ -36,7 +38,6 @@ from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.layout import SourceStamp
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.process_limits import limit_behind
 from shmmap.segment.verify import verify_file
@@ -45,7 +46,9 @@ __all__ = ["WorkerSettings", "limit_memory", "work"]
 
 _NICENESS: Final = 10  # a warm request never waits for a load
 _PAGE_BYTES: Final = 4096
-REPLACED: Final = "another directory has the map's name now: `shmmap reload` reads it"
+
+_Work: TypeAlias = tuple[worker_messages.Job, int]
+"""A job, and the file that its segment goes into."""
 
 
 class _Refused(Exception):
@@ -66,10 +69,11 @@ class _Worker:
     channel: socket.socket
     directory: ShmDirectory
     cache: LayerCache | None
+    reader: SourceReader = FILES
+    _fetching: dict[int, _Work] = field(default_factory=dict)
     _waiting: list[tuple[worker_messages.ToWorker, int]] = field(default_factory=list)
     _light: bool = False
     _buffer: bytearray = field(default_factory=packet_buffer)
-    _opened: OpenedDirectories = field(default_factory=OpenedDirectories)
 
     def run(self) -> None:
         """Work until the daemon closes the channel."""
@@ -77,7 +81,7 @@ class _Worker:
         self._send(worker_messages.Ready(os.getpid()), pidfd)
         os.close(pidfd)
         while True:
-            job, fd = self._waiting.pop(0) if self._waiting else self._receive()
+            job, fd = self._next()
             if job is None:
                 return
             self._light = self._light or weigh_less()
@@ -85,8 +89,39 @@ class _Worker:
                 self._load(job, fd)
             elif isinstance(job, worker_messages.Check):
                 self._check(job)
-            elif isinstance(job, worker_messages.Root):
-                self._opened = OpenedDirectories({job.path: fd} if fd >= 0 else {})
+            elif isinstance(job, worker_messages.Root) and isinstance(self.reader, Files):
+                opened = OpenedDirectories({job.path: fd} if fd >= 0 else {})
+                self.reader = Files(opened.at, opened.named)
+
+    def _next(self) -> tuple[worker_messages.ToWorker | None, int]:
+        """Return what is to be done next; None when the channel is closed.
+
+        Where what jobs need is fetched, that begins when they come, and they are done as it has come.
+        """
+        fetcher = self.reader.fetcher
+        while fetcher is not None:
+            if self._fetching and not self._waiting:
+                both = select.poll()
+                both.register(self.channel, select.POLLIN)
+                both.register(fetcher.fd, select.POLLIN)
+                ready = {fd for fd, _ in both.poll()}
+                if fetcher.fd in ready and (number := fetcher.done()) is not None:
+                    self._send(worker_messages.Begun(number))
+                    return self._fetching.pop(number)
+                if self.channel.fileno() not in ready:
+                    continue
+            message, fd = self._take()
+            if isinstance(message, worker_messages.Job) and (message.neighbours or not message.points):
+                self._fetching[message.number] = message, fd
+                fetcher.begin(message.number, layer_spec(message.layer), self._cell(message))
+                continue
+            if isinstance(message, worker_messages.Job | worker_messages.Check):
+                self._send(worker_messages.Begun(message.number))
+            return message, fd
+        return self._take()
+
+    def _take(self) -> tuple[worker_messages.ToWorker | None, int]:
+        return self._waiting.pop(0) if self._waiting else self._receive()
 
     def _receive(self) -> tuple[worker_messages.ToWorker | None, int]:
         """Return the next message and the descriptor that came with it; None when the channel is closed."""
@@ -122,7 +157,7 @@ class _Worker:
         started_ns = time.monotonic_ns()
         try:
             try:
-                _test_hook(job.path)
+                _test_hook(job.source.name)
                 step("worker.alloc")
                 made = self._make(job, fd)
             finally:
@@ -131,7 +166,7 @@ class _Worker:
             done = worker_messages.Done(
                 job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
                 header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
-                tuple(self._opened.named(warning)[:500] for warning in made.warnings[:20]),
+                tuple(self.reader.named(warning)[:500] for warning in made.warnings[:20]),
                 tuple(stamp.token for stamp in made.neighbours), made.cached, header.outside_points,
             )  # fmt: skip
             step("worker.pass")
@@ -146,27 +181,30 @@ class _Worker:
         except OSError as error:
             limit = limit_behind(error) if error.errno == errno.EFBIG else None
             if limit is not None:  # of the segment, whatever the map's file is like
-                self._fail(job, "load_failed", f"{job.path}: its segment: {limit.message} ({limit.hint})")
+                self._fail(
+                    job, "load_failed", f"{job.source.name}: its segment: {limit.message} ({limit.hint})"
+                )
                 return
-            self._fail(job, failure_code(error), f"{job.path}: {error.strerror or error}", unread=True)
+            self._fail(job, failure_code(error), f"{job.source.name}: {error.strerror or error}", unread=True)
         except MemoryError:
             most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])
             why = f"making {job.layer} takes more than the {most} of memory that a loader may use"
-            self._fail(job, "load_failed", f"{job.path}: {why} (divide the map into smaller cells)")
+            self._fail(job, "load_failed", f"{job.source.name}: {why} (divide the map into smaller cells)")
         except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one cell
-            self._fail(job, "load_failed", f"{job.path}: building {job.layer} failed: {error!r}")
+            self._fail(job, "load_failed", f"{job.source.name}: building {job.layer} failed: {error!r}")
 
     def _make(self, job: worker_messages.Job, fd: int) -> Made:
         """Fill the segment."""
         if len(job.neighbours) > MAX_NEIGHBOURS:
             raise MapDataError(
-                f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one", path=job.path,
+                f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one",
+                path=job.source.name,
                 cause="unsupported_format", hint="use a smaller radius, or larger cells",
             )  # fmt: skip
         spec = layer_spec(job.layer)
         return make_layer(
             spec,
-            CellJob(job.cell_id, job.path, job.box, job.frame_id, job.neighbours, self._opened.at),
+            self._cell(job),
             fd,
             cache=self.cache,
             keep=job.layer != LAYER,  # `shmmap prepare` alone stores the source: it is as quick to read
@@ -174,24 +212,28 @@ class _Worker:
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )
 
+    def _cell(self, job: worker_messages.Job) -> CellJob:
+        return CellJob(
+            job.cell_id, job.source, job.box, job.frame_id, job.neighbours, self.reader, job.ready
+        )  # fmt: skip
+
     def _points_in_memory(self, job: worker_messages.Job, spec: LayerSpec) -> CellSource | None:
-        """The cell's points out of their segment, if that is still there and of this state of the file."""
+        """The cell's points out of their segment, if that is still there and of this state of the source."""
         if not job.points:
             return None
         try:
             with self.directory.opened(job.points) as fd:
                 lock_slot(fd, LOADER_SLOT)
                 source = read_segment(fd, job.box, spec.source_columns)
-                return source if source.stamp == SourceStamp.of(os.stat(self._opened.at(job.path))) else None
+                return source if source.stamp.token == self.reader.stamp(job.source) else None
         except (OSError, SegmentCorrupt):
             return None
 
     def _check(self, job: worker_messages.Check) -> None:
-        wrong, stamp = "", None
+        wrong, stamp = "", self.reader.stamp(job.source)
         try:
-            stamp = SourceStamp.of(os.stat(self._opened.at(job.path))).token
             if stamp != job.stamp:
-                wrong = "its source has changed"
+                wrong = "its source has changed" if stamp is not None else "its source cannot be looked at"
             elif job.segment:
                 with self.directory.opened(job.segment) as fd:
                     step("worker.check")
@@ -199,17 +241,11 @@ class _Worker:
                     verify_file(fd)
         except (OSError, SegmentCorrupt) as error:
             wrong = str(error)
-        self._send(worker_messages.Checked(job.number, self._opened.named(wrong)[:500], stamp))
+        self._send(worker_messages.Checked(job.number, self.reader.named(wrong)[:500], stamp))
 
     def _fail(self, job: worker_messages.Job, code: str, message: str, *, unread: bool = False) -> None:
-        stamp, place = None, self._opened.at(job.path)
-        with contextlib.suppress(OSError):
-            stamp = SourceStamp.of(os.stat(place)).token
-        if place != job.path and stamp is None and os.path.exists(job.path):
-            message = f"{job.path}: {REPLACED}"
-        self._send(
-            worker_messages.Failed(job.number, code, self._opened.named(message)[:4000], stamp, unread)
-        )
+        stamp, why = self.reader.stamp(job.source), self.reader.explain(job.source, message)
+        self._send(worker_messages.Failed(job.number, code, why[:4000], stamp, unread))
 
 
 def _test_hook(path: str) -> None:

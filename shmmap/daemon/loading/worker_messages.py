@@ -13,9 +13,11 @@ from typing import Final, TypeAlias
 import msgspec
 
 from shmmap.layers.derive import Neighbour
+from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
 
 __all__ = [
+    "Begun",
     "Check",
     "Checked",
     "Decision",
@@ -38,25 +40,27 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
     """Load one layer of one cell; ``granted`` bytes are reserved for it.
 
     ``points`` names the cell's ``points`` segment where that is in memory: a computed layer need not
-    read the file then.  ``neighbours`` are the cells around it, for a layer with a halo.
+    read the source then.  ``neighbours`` are the cells around it, for a layer with a halo; ``ready`` is the
+    version of a layer that the origin has ready made, 0 of one that is computed.
     """
 
     number: int
     cell_id: str
-    path: str
+    source: Source
     layer: str
     box: tuple[float, float, float, float]
     frame_id: str
     granted: int
     points: str = ""
     neighbours: tuple[Neighbour, ...] = ()
+    ready: int = 0
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
-    """Compare a file with ``stamp``, and a segment of an earlier life, if named, with its checksums."""
+    """Compare a source with ``stamp``, and a segment of an earlier life, if named, with its checksums."""
 
     number: int
-    path: str
+    source: Source
     segment: str
     stamp: Stamp
 
@@ -80,6 +84,15 @@ class Ready(msgspec.Struct, array_like=True, tag="ready"):
     """
 
     pid: int
+
+
+class Begun(msgspec.Struct, array_like=True, tag="begun"):
+    """What a job needs has been fetched, and the worker works on it from now on.
+
+    Only a worker that fetches for several jobs at once says so; any other works on its jobs as they came.
+    """
+
+    number: int
 
 
 class Need(msgspec.Struct, array_like=True, tag="need"):
@@ -114,9 +127,9 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
-    """File and segment are what they should be, or ``wrong`` says why not; the worker has closed both.
+    """Source and segment are what they should be, or ``wrong`` says why not; the worker has closed both.
 
-    ``stamp`` is the file's state, if it could be looked at.
+    ``stamp`` is the source's state, if it could be looked at.
     """
 
     number: int
@@ -145,7 +158,7 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
 
 
 ToWorker: TypeAlias = Job | Check | Root | Decision
-FromWorker: TypeAlias = Ready | Need | Done | Checked | Failed | Ended
+FromWorker: TypeAlias = Ready | Begun | Need | Done | Checked | Failed | Ended
 
 encode: Final = msgspec.msgpack.Encoder().encode
 decode_to_worker: Final = msgspec.msgpack.Decoder[ToWorker](ToWorker).decode

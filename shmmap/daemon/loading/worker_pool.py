@@ -53,12 +53,14 @@ def _has_ended(pidfd: int) -> bool:
 
 def is_computed(job: Work) -> bool:
     """Whether a job may take long; a look at a file or a segment does not."""
-    return isinstance(job, worker_messages.Job) and job.layer != LAYER
+    return isinstance(job, worker_messages.Job) and job.layer != LAYER and not job.ready
 
 
 @dataclass(eq=False, slots=True)
 class Worker:
-    """One worker process; ``queue`` holds its jobs, the first is the one it works on.
+    """One worker process; ``queue`` holds its jobs.
+
+    It works on the first of them, or, if it fetches, on the one that it said it has ``begun``.
 
     Attributes
     ----------
@@ -74,6 +76,10 @@ class Worker:
         Those of its jobs that nobody waited for when they were given out.
     opened
         Directory that it reads files through.
+    fetches
+        It fetches for several jobs at once, and says which it works on.
+    since_s
+        Since when it works on what it works on; or when it last said something, if it only fetches.
     """
 
     channel: socket.socket
@@ -84,8 +90,10 @@ class Worker:
     queue: OrderedDict[int, Work] = field(default_factory=OrderedDict)
     segments: dict[int, int] = field(default_factory=dict)
     prefetched: set[int] = field(default_factory=set)
-    head_since_s: float = 0.0
+    since_s: float = 0.0
     opened: Opened = NOT_OPENED
+    fetches: bool = False
+    begun: int = 0
 
     @property
     def fd(self) -> int:
@@ -101,6 +109,11 @@ class Worker:
     def ready(self) -> bool:
         """Whether it has begun: its death is its job's fault from then on."""
         return self.pid != 0
+
+    @property
+    def at_work(self) -> int:
+        """Number of the job that it works on; 0 for none."""
+        return self.begun if self.fetches else next(iter(self.queue), 0)
 
 
 @dataclass(eq=False, slots=True)
@@ -119,6 +132,8 @@ class WorkerPool:
         How long one load may take; then its worker is killed.
     watched
         Told of the workers' descriptors.
+    places
+        Jobs that a worker can do at once: more than one where what they need has to be fetched.
 
     Attributes
     ----------
@@ -133,6 +148,7 @@ class WorkerPool:
     parent: PreparedParent
     deadline_s: float
     watched: WatchedDescriptors
+    places: int = 1
     on_message: Callable[[Worker], None] = field(init=False)
     failed_starts: int = 0
     _workers: dict[int, Worker] = field(default_factory=dict)
@@ -153,18 +169,18 @@ class WorkerPool:
         return found or self._may_start or (not computed and self._may_start_one_for_points)
 
     @property
-    def idle(self) -> int:
+    def free_places(self) -> int:
         """How many jobs could be begun at once."""
-        waiting = sum(not worker.queue and not worker.for_points for worker in self._workers.values())
-        count = sum(not worker.for_points for worker in self._workers.values())
-        return waiting + max(0, self.limit - count - len(self._ending))
+        queues = [len(worker.queue) for worker in self._workers.values() if not worker.for_points]
+        free = sum(max(0, self.places - jobs) for jobs in queues)
+        return free + self.places * max(0, self.limit - len(queues) - len(self._ending))
 
     def _least_busy(self, *, computed: bool) -> Worker | None:
         """Who should have the next job of a kind; None if nobody has room for it."""
         able = [
             worker
             for worker in self._workers.values()
-            if len(worker.queue) <= JOBS_AHEAD
+            if len(worker.queue) < self.places + JOBS_AHEAD
             and worker.layers <= LAYERS_AHEAD
             and not (worker.for_points if computed else worker.layers)
         ]
@@ -195,7 +211,7 @@ class WorkerPool:
             ours.close()
             raise
         ours.setblocking(False)
-        worker = Worker(ours, for_points)
+        worker = Worker(ours, for_points, fetches=self.places > 1)
         self._workers[worker.fd] = worker
         self.watched.watch(worker.fd, lambda: self.on_message(worker), "loaders")
         return worker
@@ -219,7 +235,7 @@ class WorkerPool:
         worker, start = self._least_busy(computed=computed), self._may_start
         if worker is None and not (start or (not computed and self._may_start_one_for_points)):
             return False
-        if worker is None or (worker.queue and start):
+        if worker is None or (len(worker.queue) >= self.places and start):
             try:
                 worker = self.start_one(for_points=not start)
             except OSError as error:  # no more processes, memory or descriptors just now
@@ -239,7 +255,7 @@ class WorkerPool:
         if fd >= 0:
             worker.segments[job.number] = fd
         if not worker.queue:
-            worker.head_since_s = now_s
+            worker.since_s = now_s
         worker.queue[job.number] = job
         if prefetch:
             worker.prefetched.add(job.number)
@@ -306,24 +322,32 @@ class WorkerPool:
     def begun(self, worker: Worker, pid: int, pidfd: int, now_s: float) -> None:
         """The worker is ready; its pidfd is the pool's now."""
         worker.pid, worker.pidfd = pid, pidfd
-        worker.head_since_s = now_s
+        worker.since_s = now_s
         self.failed_starts = 0
 
+    def works_on(self, worker: Worker, number: int, now_s: float) -> None:
+        """A worker that fetches has what a job needs, and works on it from now on."""
+        worker.begun, worker.since_s = number, now_s
+
     def finished(self, worker: Worker, number: int, now_s: float) -> tuple[int, float]:
-        """The worker is done with a job; its next one begins now.
+        """The worker is done with a job; its next one begins now, unless it fetches.
 
         Returns
         -------
         fd
             The file that its segment is in, the caller's to close; -1 for none.
         spent_s
-            How long it took, seconds.
+            How long it worked on it, seconds.
         """
+        began_s, at_work = worker.since_s, worker.at_work == number
         job = worker.queue.pop(number, None)
         worker.prefetched.discard(number)
         worker.layers -= job is not None and is_computed(job)
-        began_s, worker.head_since_s = worker.head_since_s, now_s
-        return worker.segments.pop(number, -1), now_s - began_s
+        if at_work:
+            worker.begun = 0
+        if at_work or not worker.at_work:
+            worker.since_s = now_s
+        return worker.segments.pop(number, -1), (now_s - began_s) * at_work
 
     # --- their end ------------------------------------------------------------------------------
 
@@ -352,11 +376,11 @@ class WorkerPool:
         os.close(pidfd)
 
     def overdue(self, now_s: float) -> list[Worker]:
-        """Workers whose current load, or whose start, is past its deadline."""
+        """Workers whose current load, or whose start, is past its deadline; or that fetch and say nothing."""
         return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
 
     def _due_s(self, worker: Worker) -> float:
-        return worker.head_since_s + (self.deadline_s if worker.ready else START_DEADLINE_S)
+        return worker.since_s + (self.deadline_s if worker.ready else START_DEADLINE_S)
 
     def next_deadline_s(self) -> float:
         """When the next load becomes overdue; infinity when nothing loads."""

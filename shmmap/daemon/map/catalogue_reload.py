@@ -3,7 +3,8 @@
 
 Looking at every file of a large map takes seconds, so it happens in a thread; the loop is told
 through an event descriptor and then changes over in one step; what has changed is found out in the
-thread, too.  Requests for another reload while
+thread, too.  A state whose list of cells comes in pages may be held back until those have come that are
+needed; one that is loaded meanwhile takes its place.  Requests for another reload while
 one runs are answered by the next one, which sees everything that they could mean.
 """
 
@@ -18,7 +19,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
 from shmmap.daemon.map.old_tables import give_back_apart
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
-from shmmap.origin.catalogue_change import CatalogueChange, compare
+from shmmap.origin.catalogue_change import CatalogueChange
 
 __all__ = ["Reloader", "Reread"]
 
@@ -29,9 +30,12 @@ class Reread:
 
     catalogue: CatalogueView
     change: CatalogueChange
+    before: CatalogueView
 
 
 Answer = Callable[[Reread | ShmmapError], None]
+Apply = Callable[[Reread], Reread | None]
+"""Serves what was loaded, and returns what changed with that; None where it has to be held back."""
 
 
 class Reloader:
@@ -58,6 +62,13 @@ class Reloader:
         self._result: Reread | ShmmapError | None = None
         self._asked: list[Answer] = []
         self._next: list[Answer] = []
+        self._held: Reread | None = None
+        self._held_asked: list[Answer] = []
+
+    @property
+    def map_path(self) -> str:
+        """The map as a person would name it."""
+        return self._origin.path
 
     def ask(self, answer: Answer) -> None:
         """Have the catalogue loaded; ``answer`` is called from `collect`."""
@@ -81,7 +92,7 @@ class Reloader:
         try:
             catalogue = self._origin.load(fresh=True, before=before)
             _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # found here, not in the loop
-            self._result = Reread(catalogue, compare(before, catalogue))
+            self._result = Reread(catalogue, catalogue.changes_from(before), before)
         except ShmmapError as error:
             self._result = error
         except OSError as error:
@@ -91,7 +102,7 @@ class Reloader:
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
-    def collect(self, apply: Callable[[Reread], None], failed: Callable[[ShmmapError], None]) -> None:
+    def collect(self, apply: Apply, failed: Callable[[ShmmapError], None]) -> None:
         """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
         os.eventfd_read(self.fd)
         if self._thread is not None:
@@ -102,15 +113,24 @@ class Reloader:
         if isinstance(result, ShmmapError):
             log.error("reload failed", map=self._origin.path, message=result, served="the old state")
             failed(result)
-        elif result is not None:
-            apply(result)
-        if result is not None:
             for answer in asked:
                 answer(result)
-        if isinstance(result, Reread) and self._served() is result.catalogue:
-            give_back_apart(result.change.old, result.catalogue)
+        elif result is not None:
+            self._held, self._held_asked = result, [*self._held_asked, *asked]
+            self.apply_held(apply)
         if self._next and not self._asked:
             self._begin()
+
+    def apply_held(self, apply: Apply) -> None:
+        """Apply what was loaded last, unless it is still held back, and answer who asked for it."""
+        applied = apply(self._held) if self._held is not None else None
+        if applied is None:
+            return
+        asked, self._held_asked, self._held = self._held_asked, [], None
+        for answer in asked:
+            answer(applied)
+        if self._served() is applied.catalogue:
+            give_back_apart(applied.before.tables, applied.catalogue.tables)
 
     def close(self) -> None:
         """Forget a running load; its thread ends with the process."""

@@ -27,9 +27,9 @@ LARGE_BYTES: Final = 1 << 22
 """What is smaller is taken back in less than a millisecond by whoever drops it."""
 
 
-def give_back_apart(old: Tables, new: Tables) -> None:
+def give_back_apart(old: Tables | None, new: Tables | None) -> None:
     """Have a thread `give_back` what a new state of the map does not share with the old one."""
-    if old is new or old.stamps.nbytes < LARGE_BYTES:
+    if old is None or new is None or old is new or old.stamps.nbytes < LARGE_BYTES:
         return
     with contextlib.suppress(RuntimeError):  # as many threads as there may be: then it takes its time
         threading.Thread(target=give_back, args=(old, new), name="giving back", daemon=True).start()

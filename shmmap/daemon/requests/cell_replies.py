@@ -97,7 +97,7 @@ class CellReplies:
         if answer.short:
             yield from self._name_holders(wanted, answer)
         self.reply(
-            wanted.session, wanted.request, answer, wanted.layers, wanted.covered,
+            wanted.session, wanted.request, answer, wanted.layers, wanted.covered, reason=wanted.reason,
             removed=wanted.removed, removed_packed=wanted.removed_packed,
         )  # fmt: skip
         if wanted.began_s:
@@ -112,6 +112,7 @@ class CellReplies:
         layers: tuple[str, ...],
         covered: bool = True,
         *,
+        reason: str = "",
         removed: tuple[str, ...],
         removed_packed: bytes,
     ) -> None:
@@ -119,7 +120,7 @@ class CellReplies:
         cache = self.cache
         reply = encode_cells(
             request, cache.epoch, cache.catalogue.map_version, answer.handles, removed, removed_packed,
-            layers, covered, *answer.packed,
+            layers, covered, *answer.packed, reason=reason,
         )  # fmt: skip
         session.connection.reply(reply)
 
@@ -161,12 +162,14 @@ class CellReplies:
             answer.residents.append(resident)
         if refusal is not None:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
-            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,) if mine.bytes else ()))
+            box = cache.catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, *refusal, (mine,) if mine.bytes else (), box))
         elif not current and failure is not None and not promised:
             holders: tuple[Holder, ...] = ()
             if failure.code in SPACE_CODES:
                 holders, answer.short = UNNAMED, True
-            answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders))
+            box = cache.catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders, box))
         elif not current:
             if not promised:  # evicted, or no longer out of room: "pending" promises a load
                 self.scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)

@@ -8,7 +8,6 @@ a moving vehicle and is kept short; `difference` covers everything, a part a tur
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,10 +18,7 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.limits import MOST_CELLS, check_count, layers_named
-from shmmap.daemon.requests.pending_request import MapChanged, PendingRequest, parts
-from shmmap.daemon.transport.sessions import Session
-from shmmap.geometry import Area
+from shmmap.daemon.requests.pending_request import PendingRequest, parts
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
@@ -188,28 +184,20 @@ def difference(
 
 
 def lacking(
-    cache: CellCache, session: Session, message: Differential, area: Area, layers: tuple[str, ...]
-) -> Generator[None, None, PendingRequest]:
-    """Find what a client lacks of an area, a part a turn; anew if the map changes meanwhile.
+    cache: CellCache, message: Differential, found: NDArray[np.intp], layers: tuple[str, ...],
+    wanted: PendingRequest,
+) -> Generator[None, None, None]:  # fmt: skip
+    """Note in ``wanted`` what a client lacks of an area whose known cells are ``found``, a part a turn.
 
     Raises
     ------
-    BadRequest
-        The area has too many cells.
-    NoSession
-        The session has ended meanwhile.
+    MapChanged, NoSession
+        See `PendingRequest.pause`.
     """
-    while True:
-        found, covered = cache.catalogue.query(area, MOST_CELLS)
-        check_count(len(found) * len(layers))
-        wanted = PendingRequest(
-            session, message.request, [], cache.catalogue, layers_named(message), covered, area=area
-        )
-        with contextlib.suppress(MapChanged):
-            indices = cache.at_height(found.tolist(), area.z)
-            lacks = yield from difference(
-                cache, message, indices, layers, covered, partial(wanted.pause, cache)
-            )
-            wanted.cells, wanted.held_old = lacks.cells, lacks.old
-            wanted.removed, wanted.removed_packed = lacks.removed, lacks.removed_packed
-            return wanted
+    z = wanted.area.z if wanted.area is not None else None
+    indices = cache.at_height(found.tolist(), z)
+    lacks = yield from difference(
+        cache, message, indices, layers, wanted.covered, partial(wanted.pause, cache)
+    )
+    wanted.cells, wanted.held_old = lacks.cells, lacks.old
+    wanted.removed, wanted.removed_packed = lacks.removed, lacks.removed_packed

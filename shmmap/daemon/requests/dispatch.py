@@ -98,6 +98,8 @@ class Dispatch:
             return self.operators.handle(session, message, now_s)
         if isinstance(message, LIVE_REQUESTS):
             self.live.ask(session, message, body, now_s)
+        elif isinstance(message, messages.Metadata):
+            self.queries.metadata(session, message, now_s)
         elif isinstance(message, messages.Bye):
             self.handshake.leave(session)
         elif isinstance(message, messages.Stats):

@@ -192,7 +192,7 @@ class SessionQuota:
     ) -> Generator[None, None, tuple[list[Key], int, set[Key]]]:
         """What is too much, how many bytes all would add to what nobody else holds, and what all is."""
         session, cache = wanted.session, self.cache
-        boxes = cache.catalogue.boxes[np.array([index for index, _ in wanted.cells], dtype=np.intp)]
+        boxes = cache.catalogue.boxes_of(np.array([index for index, _ in wanted.cells], dtype=np.intp))
         counted: set[Key] = set()
         too_much: list[Key] = []
         added = 0

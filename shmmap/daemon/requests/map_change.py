@@ -13,6 +13,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
+from shmmap.daemon.requests.paging import Paging
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue_change import CatalogueChange
@@ -35,16 +36,23 @@ class MapChange:
     scheduler: Scheduler
     map_switch: MapSwitch
     event_log: EventLog
+    paging: Paging
 
     def collect(self) -> None:
         """A reload is over: serve what it found, and tell those who asked for it."""
         self.reloader.collect(self._apply, self._keep)
 
-    def _apply(self, reread: Reread) -> None:
-        """Serve another state of the map from now on."""
+    def _apply(self, reread: Reread) -> Reread | None:
+        """Serve another state of the map from now on; None if it does not know enough yet."""
         statistics, catalogue = self.cache.statistics, reread.catalogue
+        if not self.paging.is_ready(catalogue, self._try_again):
+            return None
+        if catalogue.pages is not None:  # more of both is known by now
+            before = self.cache.catalogue
+            reread = Reread(catalogue, catalogue.changes_from(before), before)
         self.map_switch.switch(catalogue, reread.change)
         self.scheduler.map_changed()
+        self.paging.follow()
         statistics.add("reloads")
         statistics.set("last_reload_unix_ns", time.time_ns())
         statistics.set("last_reload_failed", 0)
@@ -52,6 +60,11 @@ class MapChange:
         self._tell(reread.change)
         for problem in itertools.islice(catalogue.problems, PROBLEMS_TOLD):
             log.warning("problem in the map", what=problem)
+        return reread
+
+    def _try_again(self) -> None:
+        """More is known of the state of the map that was held back."""
+        self.reloader.apply_held(self._apply)
 
     def _tell(self, change: CatalogueChange) -> None:
         """Say what is new in the map."""

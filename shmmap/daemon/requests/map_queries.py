@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
+import math
 import os
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
@@ -19,16 +21,17 @@ from shmmap.daemon.cache.survey import Share, Usage
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.errors import BadRequest, UnknownCell
+from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
 from shmmap.layers.registry import kinds
 from shmmap.origin.spatial_index import touches
 from shmmap.protocol import messages
+from shmmap.protocol.codec import encode
 from shmmap.protocol.events import Recent
 
 __all__ = ["MapQueries"]
@@ -37,6 +40,18 @@ PAGE_ROWS: Final = 500
 """Longest metadata page: making one takes the serving loop about a millisecond."""
 LOOKED_AT: Final = 20_000
 """Cells that are tested for one page of an area's metadata, retired segments that are looked through."""
+METADATA_WAIT_S: Final = 0.25
+"""How long a request for the list waits for a page of the map; it is repeated until that has come."""
+MOST_WAITING: Final = 1024
+ROW_BITS: Final = 32
+
+
+class _Waiting(NamedTuple):
+    """A request for the list that waits for a page of the map."""
+
+    session: Session
+    message: messages.Metadata
+    deadline_s: float
 
 
 class _Changes(NamedTuple):
@@ -68,6 +83,7 @@ class MapQueries:
     event_log: EventLog
     events_path: str = ""
     _changes: _Changes | None = None
+    _waiting: list[_Waiting] = field(default_factory=list)
     _kinds: tuple[str, ...] = field(init=False, default_factory=lambda: tuple(k.describe() for k in kinds()))
 
     @property
@@ -89,40 +105,96 @@ class MapQueries:
 
     def answer(self, message: messages.Request) -> messages.Reply:
         """Answer one request."""
-        if isinstance(message, messages.Metadata):
-            return self._metadata(message)
         if isinstance(message, Recent):
             return self.event_log.page(message)
         if isinstance(message, messages.Show):
             return self._show(message)
         raise BadRequest(f"a {type(message).__name__} cannot be answered here")
 
-    def _metadata(self, message: messages.Metadata) -> messages.MetadataPage:
-        catalogue = self._catalogue
-        removed: tuple[str, ...] = ()
-        known = True
-        start, limit = max(0, message.start), max(1, min(message.limit, PAGE_ROWS))
-        area = messages.area_from_message(message.area) if message.area is not None else None
-        if message.since is None:
-            page, following = self._page(area, start, limit)
+    # --- the list of cells ------------------------------------------------------------------------
+
+    def metadata(self, session: Session, message: messages.Metadata, now_s: float) -> None:
+        """Answer with a page of the list; for a page of the map that is not here wait a moment.
+
+        Raises
+        ------
+        Offline
+            That cannot be had at present.
+        """
+        page = self.page(message)
+        if page is None and len(self._waiting) < MOST_WAITING:
+            self._waiting.append(_Waiting(session, message, now_s + METADATA_WAIT_S))
         else:
-            change = self._changes_since(message.since)
-            known = change is not None
-            if change is None:
-                page, following = self._page(area, start, limit)
+            session.connection.reply(encode(page or self._empty(message)))
+
+    def pages_settled(self, news: PageNews) -> None:
+        """Pages have come, or cannot be had: answer who waited for one."""
+        if self._waiting and (news.come or news.out_of_reach):
+            waiting, self._waiting = self._waiting, []
+            for one in waiting:
+                self._answer_waiting(one, over=False)
+
+    def next_deadline_s(self) -> float:
+        """When somebody has waited long enough; infinity if nobody waits."""
+        return min((one.deadline_s for one in self._waiting), default=math.inf)
+
+    def answer_overdue(self, now_s: float) -> None:
+        """Answer those who have waited long enough: they ask again."""
+        waiting, self._waiting = self._waiting, []
+        for one in waiting:
+            if now_s < one.deadline_s:
+                self._waiting.append(one)
             else:
-                touched = change.cells
-                if area is not None:
-                    touched = touched[touches(area, catalogue.boxes[touched])]
-                page = touched[start : start + limit].tolist()
-                following = start + limit if start + limit < len(touched) else None
-                removed = change.removed if start == 0 else ()
-        rows = tuple(map(self._row, page))
+                self._answer_waiting(one, over=True)
+
+    def _answer_waiting(self, one: _Waiting, *, over: bool) -> None:
+        connection = one.session.connection
+        if connection.session is not one.session:
+            return
+        try:
+            page = self.page(one.message)
+        except ShmmapError as error:
+            connection.refuse(one.message.request, error)
+            return
+        if page is None and not over:
+            self._waiting.append(one)
+        else:
+            connection.reply(encode(page or self._empty(one.message)))
+
+    def _empty(self, message: messages.Metadata) -> messages.MetadataPage:
+        """A page without rows: what comes next is not known yet."""
         return messages.MetadataPage(
-            message.request, self.cache.epoch, catalogue.map_version, rows, following, known, removed
+            message.request, self.cache.epoch, self._catalogue.map_version, (), max(0, message.start)
         )
 
-    def _page(self, area: Area | None, start: int, limit: int) -> tuple[Sequence[int], int | None]:
+    def page(self, message: messages.Metadata) -> messages.MetadataPage | None:
+        """A page of the list; None if a page of the map has to come first."""
+        catalogue = self._catalogue
+        removed: tuple[str, ...] = ()
+        start, limit = max(0, message.start), max(1, min(message.limit, PAGE_ROWS))
+        area = messages.area_from_message(message.area) if message.area is not None else None
+        change = self._changes_since(message.since) if message.since is not None else None
+        known = message.since is None or change is not None
+        found: tuple[Sequence[int], int | None] | None
+        if change is not None:
+            touched = change.cells
+            if area is not None:
+                touched = touched[touches(area, catalogue.boxes_of(touched))]
+            following = start + limit if start + limit < len(touched) else None
+            found = touched[start : start + limit].tolist(), following
+            removed = change.removed if start == 0 else ()
+        elif catalogue.pages is None:
+            found = self._rows(area, start, limit)
+        else:
+            found = self._rows_of_pages(catalogue.pages, area, start, limit)
+        if found is None:
+            return None
+        rows, next_start = tuple(map(self._row, found[0])), found[1]
+        return messages.MetadataPage(
+            message.request, self.cache.epoch, catalogue.map_version, rows, next_start, known, removed
+        )
+
+    def _rows(self, area: Area | None, start: int, limit: int) -> tuple[Sequence[int], int | None]:
         """Cells from a catalogue index on, and where the next page begins.
 
         In a large area only some cells are looked at: a page may have few rows or none, and not be the last.
@@ -138,10 +210,44 @@ class MapQueries:
             more = len(found) > limit
             return found[:limit].tolist(), int(found[limit]) if more else None
         end = min(start + LOOKED_AT, count)
-        found = np.flatnonzero(touches(area, catalogue.boxes[start:end])) + start
+        found = np.flatnonzero(touches(area, catalogue.boxes_of(np.arange(start, end)))) + start
         if len(found) > limit:
             return found[:limit].tolist(), int(found[limit])
         return found.tolist(), end if end < count else None
+
+    def _rows_of_pages(
+        self, pages: Pages, area: Area | None, start: int, limit: int
+    ) -> tuple[Sequence[int], int | None] | None:
+        """Cells of one page of the map, from a row on, and where the next ones begin; None: it has to come.
+
+        Where one begins is told as its page's number, shifted by 32 bits, and its row there.
+
+        Raises
+        ------
+        Offline
+            The page cannot be had at present.
+        """
+        listed = pages.of_area(area) if area is not None else range(len(pages))
+        number, row = start >> ROW_BITS, start & ((1 << ROW_BITS) - 1)
+        at = bisect.bisect_left(listed, number)
+        if at == len(listed):
+            return (), None
+        page = listed[at]
+        if not pages.is_here(page):
+            pages.want((page,), 0.0)
+            if pages.is_out_of_reach(page):
+                raise Offline(
+                    f"{self.config.map_path}: part of the list of cells cannot be reached at present"
+                )
+            return None
+        cells = pages.cells(page)
+        indices = np.arange(cells.start, cells.stop)
+        if area is not None:
+            indices = indices[touches(area, self._catalogue.boxes_of(indices))]
+        indices = indices[indices.searchsorted(cells.start + row * (page == number)) :]
+        if len(indices) > limit:
+            return indices[:limit].tolist(), page << ROW_BITS | int(indices[limit]) - cells.start
+        return indices.tolist(), listed[at + 1] << ROW_BITS if at + 1 < len(listed) else None
 
     def _changes_since(self, map_version: int) -> _Changes | None:
         """What changed, remembered for the pages that follow; None where that is not known."""
@@ -151,6 +257,8 @@ class MapQueries:
             if change is None:
                 return None
             touched = {i for cell in change[0] if (i := self.cache.index_of(cell)) is not None}
+            if len(touched) < len(change[0]) and not self._catalogue.complete:
+                return None  # pages have gone that some of them were in
             removed = tuple(map(self.cache.wire_id, change[1]))
             self._changes = _Changes(between, np.array(sorted(touched), dtype=np.intp), removed)
         return self._changes
@@ -186,9 +294,10 @@ class MapQueries:
         shown = tuple(map(self._segment, found))
         if index is None:
             if not found or not message.id:
-                raise UnknownCell(
-                    f"the map has no cell {message.id!r}", hint="`shmmap ls` lists what is in memory"
-                )
+                hint = "`shmmap ls` lists what is in memory"
+                if not catalogue.complete:
+                    hint = f"not all of the map is known yet: ask for the area where it lies; {hint}"
+                raise UnknownCell(f"the map has no cell {message.id!r}", hint=hint)
             return messages.ShownCell(message.request, found[0].key.cell_id, 0, *found[0].box, 0, shown)
         (cell_id,) = ids
         failures = [failure for key, failure in self.loads.failures.items() if key.cell_id == cell_id]

@@ -11,7 +11,7 @@ import heapq
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ __all__ = [
     "CELLS_A_STEP",
     "LOADS_A_STEP",
     "MOST_OF_A_SESSION",
+    "Finder",
     "MapChanged",
     "PendingRequest",
     "WaitingList",
@@ -50,6 +51,7 @@ KEYS_A_STEP: Final = 32
 """Cells of requests and sessions that are over, and requests that a load was for, that one turn sees to."""
 
 Item = TypeVar("Item")
+Awaited = TypeVar("Awaited")
 
 
 def parts(items: Sequence[Item], at_once: int = CELLS_A_STEP) -> Iterator[Sequence[Item]]:
@@ -61,55 +63,95 @@ class MapChanged(Exception):
     """Catalogue indices mean other cells now."""
 
 
+Finder: TypeAlias = Callable[["PendingRequest"], Iterator[None]]
+"""Finds what a request asks for in the map that is served now, a part a turn, and notes it there."""
+
+
 @dataclass(eq=False, slots=True)
 class PendingRequest:
     """What one request asks for, and what of it is still outstanding.
 
+    What it asks for is found (`find`) before it is answered, and found again when another state of the map is
+    served, or when a page has come that it waits for.
+
     Attributes
     ----------
+    layers
+        What it asks for of each cell, as the reply says it.
+    find
+        Finds ``cells`` and all that follows, from the request's message.
+    area
+        What was asked about; None for a request by ids.
+    message_cells
+        Memory that its message takes, as if it were so many cells.
     cells
         Catalogue index and layer of each handle to send, in reply order.
     catalogue
-        The state of the map whose indices they are.
-    layers
-        What it asks for of each cell, as the reply says it.
+        The state of the map whose indices they are; None before they are found.
     covered
         Whether all cells of what it asks about are known.
+    reason
+        Why that is not to be waited for, as the reply says it.
+    pages
+        Pages of the map that may have more of what it asks about.
     removed, removed_packed
         What the client should drop, as the reply says it.
     unknown
         Ids that the map does not have, with the layers asked for.
-    refused
-        What would exceed the session's quota, with code and message.
     held_old
         Layers of cells that the client holds in an older version.
-    area
-        What was asked about; None for a request by ids.
+    refused
+        What would exceed the session's quota, with code and message.
     keys, outstanding
         What it waits for in all, and the loads of it that have not ended.
     began_s, deadline_s
         When it began to wait and until when; 0 for a request that does not wait.
     due
         Whether it will be answered in its process's next turn.
+    outdated, is_new
+        Whether there is more to find than was found; whether what was found is still to be loaded.
     """
 
     session: Session
     request: int
-    cells: list[tuple[int, str]]
-    catalogue: CatalogueView
     layers: tuple[str, ...]
+    find: Finder
+    area: Area | None = None
+    message_cells: int = 0
+    cells: list[tuple[int, str]] = field(default_factory=list)
+    catalogue: CatalogueView | None = None
     covered: bool = True
+    reason: str = ""
+    pages: set[int] = field(default_factory=set)
     removed: tuple[str, ...] = ()
     removed_packed: bytes = b""
     unknown: list[tuple[str, str]] = field(default_factory=list)
-    refused: dict[Key, tuple[str, str]] = field(default_factory=dict)
     held_old: set[Key] = field(default_factory=set)
-    area: Area | None = None
+    refused: dict[Key, tuple[str, str]] = field(default_factory=dict)
     keys: dict[Key, None] = field(default_factory=dict)
     outstanding: set[Key] = field(default_factory=set)
     began_s: float = 0.0
     deadline_s: float = 0.0
     due: bool = False
+    outdated: bool = False
+    is_new: bool = False
+
+    def find_again(self, cache: CellCache) -> Iterator[None]:
+        """Find what it asks for in the map that is served now.
+
+        Raises
+        ------
+        MapChanged, NoSession
+            See `pause`.
+        BadRequest
+            It asks for too much.
+        """
+        self.catalogue, self.outdated = cache.catalogue, False
+        self.covered, self.reason = True, ""
+        self.removed, self.removed_packed = (), b""
+        self.cells, self.unknown, self.held_old, self.pages = [], [], set(), set()
+        yield from self.find(self)
+        self.is_new = True
 
     def pause(self, cache: CellCache) -> Iterator[None]:
         """Let others have a turn.
@@ -117,7 +159,7 @@ class PendingRequest:
         Raises
         ------
         MapChanged
-            Meanwhile another state of the map is served: `follow` it.
+            Meanwhile another state of the map is served: what is asked for has to be found again.
         NoSession
             Meanwhile the session has ended.
         """
@@ -127,24 +169,15 @@ class PendingRequest:
         if cache.catalogue is not self.catalogue:
             raise MapChanged
 
-    def follow(self, cache: CellCache) -> Iterator[None]:
-        """Find the cells in the map that is served now, a part a turn; those that left it are unknown."""
-        while (new := cache.catalogue) is not (old := self.catalogue):
-            cells, unknown = [], []
-            for number, part in enumerate(parts(self.cells)):
-                if number:
-                    yield
-                for index, layer in part:
-                    cell_id = old.id(index)
-                    now = new.find(cell_id)
-                    if now is not None:
-                        cells.append((now, layer))
-                    elif self.area is None:
-                        unknown.append((cell_id, layer))
-            self.cells, self.catalogue = cells, new
-            self.unknown += unknown
-            known = new.query(self.area, 0)[1] if self.area is not None else new.complete or not self.unknown
-            self.covered = self.covered and known
+    @property
+    def weight(self) -> int:
+        """Memory that it takes, in cells."""
+        return max(len(self.cells), self.message_cells)
+
+    @property
+    def waits(self) -> bool:
+        """Whether something it waits for has neither come nor failed."""
+        return bool(self.outstanding or self.pages)
 
     def distances_m(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far boxes, (N, 4), are from the client, as far as it said where it is.
@@ -160,7 +193,7 @@ class PendingRequest:
 
 
 class WaitingList:
-    """Requests that wait for loads, what they need, and in which order their patience ends.
+    """Requests that wait for loads or pages, what they need, and in which order their patience ends.
 
     Adding and removing one costs the same however many wait.  What is over, and whom a load concerns, is seen
     to in `tidy`, a bounded part at a time.
@@ -170,7 +203,7 @@ class WaitingList:
     ledger
         Told what is needed.
     due
-        Called with a request all of whose loads have ended.
+        Called with a request for which all has come, or a page has.
     dropped
         Called with segments that a session does not have any more.
     """
@@ -185,7 +218,8 @@ class WaitingList:
         self._due = due
         self._dropped = dropped
         self._waiting: dict[Key, dict[PendingRequest, None]] = {}
-        self._settled: deque[tuple[Key, Iterator[PendingRequest]]] = deque()
+        self._of_page: dict[int, dict[PendingRequest, None]] = {}
+        self._settled: deque[tuple[Callable[[PendingRequest], None], Iterator[PendingRequest]]] = deque()
         self._over: deque[PendingRequest] = deque()
         self._left: deque[tuple[Session, list[Resident]]] = deque()
         self._of: dict[Session, dict[PendingRequest, int]] = {}  # with the number of cells it began with
@@ -202,7 +236,7 @@ class WaitingList:
 
     def has_room(self, request: PendingRequest) -> bool:
         """Whether this one may wait, too."""
-        count, asker = len(request.cells), request.session.asker
+        count, asker = request.weight, request.session.asker
         return (
             self._count < MOST_REQUESTS
             and len(self._of.get(request.session, ())) < MOST_OF_A_SESSION
@@ -212,12 +246,19 @@ class WaitingList:
 
     def add(self, request: PendingRequest) -> None:
         """A request waits until its ``deadline_s``, which does not change any more."""
-        count = len(request.cells)
-        self._of.setdefault(request.session, {})[request] = count
-        self._cells[request.session.asker] += count
-        self._all_cells += count
+        self._of.setdefault(request.session, {})[request] = 0
         self._count += 1
+        self.recount(request)
         self.again(request)
+
+    def recount(self, request: PendingRequest) -> bool:
+        """One that waits asks for more cells or fewer now; whether all may go on waiting."""
+        asker, mine = request.session.asker, self._of[request.session]
+        more = request.weight - mine[request]
+        mine[request] += more
+        self._cells[asker] += more
+        self._all_cells += more
+        return self._cells[asker] <= MOST_CELLS_OF_A_PROCESS and self._all_cells <= MOST_CELLS
 
     def again(self, request: PendingRequest) -> None:
         """One that was due goes on waiting."""
@@ -273,6 +314,11 @@ class WaitingList:
         wanted.outstanding.add(key)
         self._waiting.setdefault(key, {})[wanted] = None
 
+    def wait_for_pages(self, wanted: PendingRequest) -> None:
+        """A request waits for its ``pages``."""
+        for page in wanted.pages:
+            self._of_page.setdefault(page, {})[wanted] = None
+
     def need(self, wanted: PendingRequest, key: Key) -> None:
         """Keep what is asked for from making room until the answer is out."""
         if key not in wanted.keys:
@@ -281,7 +327,7 @@ class WaitingList:
 
     def let_go(self, wanted: PendingRequest) -> None:
         """A request is over: what it needed may go."""
-        if wanted.keys or wanted.outstanding:
+        if wanted.keys or wanted.waits:
             self._over.append(wanted)
             self.tidy()
 
@@ -289,24 +335,22 @@ class WaitingList:
         """Tell those who wait of loads that ended, and forget what is over; a bounded part of it."""
         for _ in range(KEYS_A_STEP):
             if self._settled:
-                key, waiters = self._settled[0]
+                note, waiters = self._settled[0]
                 waiter = next(waiters, None)
                 if waiter is None:
                     self._settled.popleft()
                     continue
-                waiter.outstanding.discard(key)
-                if not waiter.outstanding and waiter in self:
+                note(waiter)
+                if (waiter.outdated or not waiter.waits) and waiter in self:
                     self._due(waiter)
             elif self._over:
                 wanted = self._over[0]
                 if wanted.keys:
                     self._ledger.need_no_more(wanted.keys.popitem()[0])
                 elif wanted.outstanding:
-                    key = wanted.outstanding.pop()
-                    left = self._waiting.get(key, {})
-                    left.pop(wanted, None)
-                    if not left:
-                        self._waiting.pop(key, None)
+                    _leave(self._waiting, wanted.outstanding.pop(), wanted)
+                elif wanted.pages:
+                    _leave(self._of_page, wanted.pages.pop(), wanted)
                 else:
                     self._over.popleft()
             elif self._left:
@@ -324,10 +368,42 @@ class WaitingList:
         """A load ended: answer the requests it was the last one for."""
         waiters = self._waiting.pop(key, None)
         if waiters:
-            self._settled.append((key, iter(waiters)))
+            self._settled.append((lambda waiter: waiter.outstanding.discard(key), iter(waiters)))
             self.tidy()
+
+    def page_settled(self, page: int, reason: str = "") -> None:
+        """A page has come, or cannot be had for this reason: tell the requests that wait for it."""
+
+        def note(waiter: PendingRequest) -> None:
+            if page in waiter.pages:
+                waiter.pages.discard(page)
+                waiter.outdated = waiter.outdated or not reason
+                waiter.reason = waiter.reason or reason
+
+        waiters = self._of_page.pop(page, None)
+        if waiters:
+            self._settled.append((note, iter(waiters)))
+            self.tidy()
+
+    def map_changed(self) -> None:
+        """Pages are others now: find again what waits for some."""
+
+        def note(waiter: PendingRequest) -> None:
+            waiter.outdated = True
+
+        waiting, self._of_page = self._of_page, {}
+        self._settled.extend((note, iter(waiters)) for waiters in waiting.values())
+        self.tidy()
 
     def left(self, session: Session) -> None:
         """A session is no more: what it held may be free now."""
         self._left.append((session, session.residents()))
         self.tidy()
+
+
+def _leave(waiting: dict[Awaited, dict[PendingRequest, None]], what: Awaited, wanted: PendingRequest) -> None:
+    """A request does not wait for something any more."""
+    left = waiting.get(what, {})
+    left.pop(wanted, None)
+    if not left:
+        waiting.pop(what, None)

@@ -110,6 +110,8 @@ class Sampler:
         set_value("budget_bytes", ledger.budget_bytes)
         set_value("evictions", cache.evictor.evicted_count)
         set_value("map_cells", len(cache.catalogue))
+        pages = cache.catalogue.pages
+        set_value("map_cells_known", len(cache.catalogue) if pages is None else pages.known_cells)
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:

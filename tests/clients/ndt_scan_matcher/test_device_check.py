@@ -133,16 +133,16 @@ def test_what_is_not_equal_is_named(
     packed: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     need_device()
-    assert main(["device-check", "--packed", str(packed.with_name("wrong.npz"))]) == 1
-    out = capsys.readouterr().out
-    assert "UNEQUAL: the original programs, wrong" in out
-    assert "iterations, not 999" in out
     source = program.kernel_source()
     term = "s[37] = ux * l02 + uy * l12 + uz * l22;"
     assert source.count(term) == 1
     monkeypatch.setattr(program, "kernel_source", lambda: source.replace(term, term.replace("+ uz", "- uz")))
-    assert main(["device-check", "--packed", str(packed), "--json", str(packed.with_name("out.json"))]) == 1
-    document = json.loads(packed.with_name("out.json").read_text())
+    report, wrong = packed.with_name("out.json"), packed.with_name("wrong.npz")
+    assert main(["device-check", "--packed", str(wrong), "--json", str(report)]) == 1
+    out = capsys.readouterr().out
+    assert "UNEQUAL: the original programs, wrong" in out
+    assert "iterations, not 999" in out
+    document = json.loads(report.read_text())
     assert document["equal"] is False
     failed = [
         check["what"] for entry in document["devices"] for check in entry["checks"] if check["failures"]

@@ -37,7 +37,6 @@ from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
 from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Selected
@@ -238,7 +237,7 @@ class InnerDaemon:
     def reload(self) -> Catalogue:
         """Read the map again and serve what it is now."""
         new = self.origin.load(fresh=True)
-        self.map_switch.switch(new, compare(self.cache.catalogue, new))
+        self.map_switch.switch(new, new.changes_from(self.cache.catalogue))
         self.scheduler.map_changed()
         self.cache.tell_all()
         return new

@@ -1,22 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of which part is not known yet: the whole daemon behind a view that comes in pages."""
+"""A map whose list of cells comes page by page: the whole daemon behind a partial catalogue."""
 
 from __future__ import annotations
 
+import math
+import random
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from shmmap import AutowareSquare, Box, HeldCell, MapWindow, Offline, connect
+from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.requests import limits, map_queries
+from shmmap.daemon.requests.operators import operator_requests
+from shmmap.daemon.requests.paging import Paging
+from shmmap.layers.versions import LayerVersions
 from shmmap.origin.map_directory import open_map
+from shmmap.protocol import events
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.paging_view import PagingOrigin
+from tests.unit.daemon.paging_view import MemoryPages, PagedOrigin, PagedView
 from tests.unit.daemon.whole_daemon import WholeDaemon
 
 WEST, EAST = 0, 1
@@ -24,6 +35,8 @@ PAGES = np.array([[-40.0, -40.0, 0.0, 40.0], [0.0, -40.0, 40.0, 40.0]])
 EVERYWHERE = m.BoxMessage(-35.0, -35.0, 35.0, 35.0)
 IN_THE_WEST = m.BoxMessage(-35.0, -35.0, -5.0, 35.0)
 IN_THE_EAST = m.BoxMessage(5.0, -35.0, 35.0, 35.0)
+LONG_S = 30.0
+HALO = "denoise"
 
 
 def names(cells: Any) -> list[str]:
@@ -35,8 +48,7 @@ def columns(*corners: int) -> list[str]:
     return sorted(f"{x}_{y}.pcd" for x in corners for y in (-40, -20, 0, 20))
 
 
-ALL = columns(-40, -20, 0, 20)
-KNOWN_IN_THE_WEST = columns(-40, -20, 0)  # borders are closed: the page ends where a column begins
+ALL, WESTERN, EASTERN = columns(-40, -20, 0, 20), columns(-40, -20), columns(0, 20)
 
 
 @dataclass
@@ -44,89 +56,215 @@ class Paged:
     """A daemon, and what its map comes from."""
 
     daemon: WholeDaemon
-    origin: PagingOrigin
+    origin: PagedOrigin
+    directory: DividedMap
+    cache_dir: str
     requests: int = 100
+
+    @property
+    def view(self) -> PagedView:
+        return cast("PagedView", self.daemon.memory.cache.catalogue)
+
+    @property
+    def pages(self) -> MemoryPages:
+        return self.view.pages
+
+    @property
+    def paging(self) -> Paging:
+        found = [chore for _, chore in self.daemon.service._loop.chores if isinstance(chore, Paging)]
+        return found[0]
+
+    def count(self, name: str) -> int:
+        return self.daemon.memory.statistics.values[name]
 
     def ask(self, request: Callable[[int], m.Request]) -> Any:
         self.requests += 1
         return self.daemon.ask(request(self.requests))
 
+    def begin(self, request: Callable[[int], m.Request]) -> None:
+        """Send a request that waits, and turn until it does."""
+        self.requests += 1
+        waiting = len(self.daemon.service._loop.cells)
+        self.daemon.send(request(self.requests))
+        self.daemon.turn_until(lambda: len(self.daemon.service._loop.cells) > waiting)
+
+    def answer(self) -> Any:
+        self.daemon.turn_until(self.daemon.answered)
+        return self.daemon.received()
+
     def know(self, *pages: int) -> None:
-        """The daemon learns, or in another life has yet to learn, which cells these pages have."""
-        self.origin.known = set(pages)
+        """Let the daemon know these pages, and forget all others, as if they had been given up."""
+        for page in set(self.pages.needed) - set(pages):
+            self.pages.drop(page)
+        self.pages.come(*(page for page in pages if not self.pages.is_here(page)))
+        self.daemon.turn_until(lambda: set(self.pages.needed) == set(pages))
+
+    def give_up(self, most: int) -> None:
+        """Let the daemon drop pages until so many are here, or more that are needed."""
+        self.pages.most, looked = most, 2 * len(self.pages.needed)
+        is_needed = self.paging.is_needed
+        while self.pages.spare() is not None and (looked := looked - 1):
+            self.paging.turn(math.inf)
+            self.paging._rests_until_s = -math.inf
+        assert len(self.pages.needed) <= most or any(map(is_needed, self.pages.needed))
+        self.pages.most = len(self.pages)
+
+    def read_again(self) -> None:
+        self.origin.whole = open_map(str(self.directory.root), cache_dir=self.cache_dir).load()
         assert isinstance(self.ask(m.Reload), m.Reloaded)
 
 
 @pytest.fixture
 def paged(whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path) -> Paged:
-    origin = PagingOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), PAGES, {WEST})
-    return Paged(whole(small_map.root, origin=origin), origin)
+    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), PAGES, {WEST})
+    return Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
 
 
-def test_what_is_known_comes_and_the_reply_says_that_more_may(paged: Paged) -> None:
-    reply = paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=30.0))
-    assert (names(reply.cells), reply.covered) == (columns(-40, -20), True)
-    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=30.0))
-    assert (names(reply.cells), reply.covered) == (KNOWN_IN_THE_WEST, False)
+# --- requests for cells ----------------------------------------------------------------------------
+
+
+def test_without_waiting_what_is_known_comes_and_the_reply_says_that_more_may(paged: Paged) -> None:
+    reply = paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S))
+    assert (names(reply.cells), reply.covered, reply.reason) == (WESTERN, True, "")
+    assert paged.pages.wanted == {}
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE))
+    assert paged.pages.wanted == {EAST: 0.0}
+    assert (names(reply.cells), reply.covered, reply.reason) == (WESTERN, False, "")
     paged.know(WEST, EAST)
-    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=30.0))
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
     assert (names(reply.cells), reply.covered) == (ALL, True)
     assert paged.ask(lambda n: m.Area(n, EVERYWHERE)).covered, "warm, too"
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "listed"),
-    [
-        pytest.param({WEST}, {WEST, EAST}, KNOWN_IN_THE_WEST, id="more is known"),
-        pytest.param({WEST, EAST}, {WEST}, KNOWN_IN_THE_WEST, id="less is known"),
-    ],
-)
-def test_what_is_known_changes_while_a_request_waits(
-    paged: Paged, monkeypatch: pytest.MonkeyPatch, before: set[int], after: set[int], listed: list[str]
+def test_a_waiting_request_waits_for_its_pages_and_known_cells_are_loaded_meanwhile(paged: Paged) -> None:
+    paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    assert paged.pages.wanted == {EAST: 0.0}
+    paged.daemon.turn_until(lambda: paged.count("loads_finished") == len(WESTERN))
+    assert not paged.daemon.answered()
+    paged.pages.come(EAST)
+    reply = paged.answer()
+    assert (names(reply.cells), reply.covered, reply.pending) == (ALL, True, ())
+
+
+def test_when_time_is_up_it_says_what_is_known_by_then(paged: Paged) -> None:
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=0.3))
+    assert (reply.covered, reply.reason) == (False, "")
+    assert set(names(reply.cells)) | {Path(cell.id).name for cell in reply.pending} == set(WESTERN)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_pages_out_of_reach_are_not_waited_for(paged: Paged, before: bool) -> None:
+    if before:
+        paged.pages.fail(EAST)
+        paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
+        reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    else:
+        paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+        paged.pages.fail(EAST)
+        reply = paged.answer()
+    assert (names(reply.cells), reply.covered, reply.reason) == (WESTERN, False, "offline")
+    paged.pages.come(EAST)  # by itself, when its origin is back
+    paged.daemon.turn_until(lambda: paged.pages.is_here(EAST))
+    assert paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).reason == ""
+
+
+def test_pages_come_one_after_the_other(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path
 ) -> None:
-    """Its reply has the cells that were known all the time, and says that more may be there."""
-    daemon, request = paged.daemon, m.Area(50, EVERYWHERE, wait=30.0)
-    paged.know(*before)
+    """Of four, in any order; the request is answered with the last one."""
+    quarters = np.array([[x, y, x + 40.0, y + 40.0] for x in (-40.0, 0.0) for y in (-40.0, 0.0)])
+    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), quarters, set())
+    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    one.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    for number, page in enumerate((2, 0, 3), 1):
+        one.pages.come(page)
+        one.daemon.turn_until(lambda n=number: one.count("loads_finished") == 4 * n)  # type: ignore[misc]
+        assert not one.daemon.answered()
+    one.pages.come(1)
+    reply = one.answer()
+    assert (names(reply.cells), reply.covered) == (ALL, True), "in id order, whatever the pages'"
+
+
+def test_a_page_that_comes_while_the_request_begins_is_not_missed(
+    paged: Paged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between its look at the pages and its waiting for them others have turns."""
+    cells = paged.daemon.service._loop.cells
+    have_loaded = cells._have_loaded
+
+    def and_it_comes(wanted: Any, *, note: bool) -> Any:
+        paged.pages.come(EAST)
+        paged.paging.collect()
+        return have_loaded(wanted, note=note)
+
     with monkeypatch.context() as patch:
-        patch.setattr(type(daemon.memory.scheduler.pool), "submit", lambda *_, **__: False)
-        daemon.send(request)
-        daemon.turn_until(lambda: len(daemon.service._loop.cells))
-        version, paged.origin.known = daemon.memory.cache.catalogue.map_version, after
-        daemon.service._reload()
-        daemon.turn_until(lambda: daemon.memory.cache.catalogue.map_version != version)
-    daemon.turn_until(daemon.answered)
-    reply = daemon.received()
-    assert (names(reply.cells), reply.covered) == (listed, False)
+        patch.setattr(cells, "_have_loaded", and_it_comes)
+        paged.daemon.send(m.Area(50, EVERYWHERE, wait=LONG_S))
+        paged.daemon.turn_until(lambda: paged.pages.is_here(EAST))
+    reply = paged.answer()
+    assert (names(reply.cells), reply.covered) == (ALL, True)
+
+
+def test_another_state_of_the_map_while_a_request_waits_for_a_page(paged: Paged) -> None:
+    paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    paged.directory.remove_cell("20_20.pcd")
+    paged.directory.change("-40_0.pcd", 5)
+    paged.directory.write_metadata()
+    paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+    before = paged.view.map_version
+    paged.daemon.service._reload()
+    paged.daemon.turn_until(lambda: paged.view.map_version != before)
+    assert not paged.daemon.answered()
+    paged.pages.come(EAST)
+    reply = paged.answer()
+    assert names(reply.cells) == [name for name in ALL if name != "20_20.pcd"]
+    assert (reply.covered, reply.map_version) == (True, paged.view.map_version)
+
+
+def test_an_area_is_refused_by_the_pages_that_lie_wholly_in_it(
+    paged: Paged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before any of them has come."""
+    monkeypatch.setattr(limits, "MOST_CELLS", 12)
+    everything = m.BoxMessage(-100.0, -100.0, 100.0, 100.0)
+    reply = paged.ask(lambda n: m.Area(n, everything, wait=LONG_S))
+    assert isinstance(reply, m.ErrorReply)
+    assert reply.code == "bad_request"
+    assert paged.pages.wanted == {}
+    assert names(paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S)).cells) == WESTERN
 
 
 @pytest.mark.parametrize("by_name", [False, True])
 def test_nothing_that_may_lie_in_the_unknown_part_is_removed(paged: Paged, by_name: bool) -> None:
     paged.know(WEST, EAST)
-    held = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=30.0)).cells
+    held = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).cells
     version_of = {Path(cell.id).name: cell.version for cell in held}
     strange = 12345
 
-    def differential(n: int) -> m.Differential:
+    def differential(n: int, wait: float | None = None) -> m.Differential:
         named = tuple(HeldCell(name, version) for name, version in version_of.items())
         if by_name:
-            return m.Differential(n, IN_THE_EAST, held=(*named, HeldCell("nowhere.pcd", strange)))
-        return m.Differential(n, IN_THE_EAST, packed=pack_versions([*version_of.values(), strange]))
+            return m.Differential(n, IN_THE_EAST, held=(*named, HeldCell("nowhere.pcd", strange)), wait=wait)
+        return m.Differential(
+            n, IN_THE_EAST, packed=pack_versions([*version_of.values(), strange]), wait=wait
+        )
 
     def removed(reply: m.Cells) -> list[str]:
         name_of = {version: name for name, version in version_of.items()} | {strange: "nowhere.pcd"}
         return sorted([*reply.removed, *(name_of[v] for v in unpack_versions(reply.removed_packed))])
 
-    paged.know(WEST)  # as after a restart of the daemon
+    for resident in list(paged.daemon.memory.cache.ledger.residents()):
+        paged.daemon.memory.cache.reclaimer.retire(resident, 0.0)
+    paged.know(WEST)
     reply = paged.ask(differential)
     assert not reply.covered
-    assert removed(reply) == columns(-40, -20), "known, and outside of the area"
-    assert reply.cells == ()
-    paged.know(WEST, EAST)
-    reply = paged.ask(differential)
+    assert removed(reply) == WESTERN, "known, and outside of the area"
+    paged.begin(lambda n: differential(n, LONG_S))
+    paged.pages.come(EAST)
+    reply = paged.answer()
     assert reply.covered
-    assert removed(reply) == sorted([*columns(-40, -20), "nowhere.pcd"])
-    again = {*names(reply.cells)}
-    assert again == set(), "who kept the cells lacks nothing"
+    assert removed(reply) == sorted([*WESTERN, "nowhere.pcd"])
+    assert names(reply.cells) == [], "who kept the cells lacks nothing"
 
 
 def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
@@ -134,67 +272,444 @@ def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
         (("-40_-40.pcd",), True, []),
         (("-40_-40.pcd", "20_20.pcd"), False, ["20_20.pcd"]),
     ):
-        reply = paged.ask(lambda n, ids=ids: m.Selected(n, ids, wait=30.0))  # type: ignore[misc]
+        reply = paged.ask(lambda n, ids=ids: m.Selected(n, ids, wait=LONG_S))  # type: ignore[misc]
         assert (reply.covered, [one.id for one in reply.failed]) == (covered, failed)
         assert {one.code for one in reply.failed} <= {"unknown_cell"}
+    shown = paged.ask(lambda n: m.Show(n, "20_20.pcd"))
+    assert (shown.code, "not all of the map is known" in shown.hint) == ("unknown_cell", True)
+    assert paged.ask(lambda n: m.Pin(n, ("-40_-40.pcd", "20_20.pcd"))).unknown == ("20_20.pcd",)
     paged.know(WEST, EAST)
-    reply = paged.ask(lambda n: m.Selected(n, ("20_20.pcd", "nowhere.pcd"), wait=30.0))
+    reply = paged.ask(lambda n: m.Selected(n, ("20_20.pcd", "nowhere.pcd"), wait=LONG_S))
     assert (reply.covered, [one.id for one in reply.failed]) == (True, ["nowhere.pcd"])
 
 
-def test_what_became_known_since_a_map_version(paged: Paged) -> None:
-    """The list of cells is that of a map version: what is known by then."""
-    before = paged.ask(m.Metadata)
-    assert names(before.rows) == KNOWN_IN_THE_WEST
+def _all_ids(one: Paged) -> list[str]:
+    whole = one.origin.whole
+    return [whole.id(index) for index in range(len(whole))]
+
+
+def _version(one: Paged, name: str) -> int:
+    index = one.origin.whole.find(name)
+    assert index is not None
+    return one.origin.whole.version(index)
+
+
+def _touches(area: m.CircleMessage, box: tuple[float, float, float, float]) -> bool:
+    dx = max(box[0] - area.x, area.x - box[2], 0.0)
+    dy = max(box[1] - area.y, area.y - box[3], 0.0)
+    return dx * dx + dy * dy <= area.radius * area.radius
+
+
+def _absent(one: Paged, area: m.CircleMessage) -> list[int]:
+    around = m.area_from_message(area)
+    return [page for page in one.pages.of_area(around) if not one.pages.is_here(page)]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, seed: int
+) -> None:
+    """While pages come, fail and are given up, and the map changes; what is held is packed or named."""
+    chance = random.Random(seed)
+    corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
+    strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
+    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), strips, set())
+    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    held: dict[str, int] = {}
+    covered = 0
+    for step in range(100):
+        action = chance.random()
+        if action < 0.4:
+            one.pages.come(chance.randrange(8))
+        elif action < 0.45:
+            one.pages.fail(*(page for page in [chance.randrange(8)] if not one.pages.is_here(page)))
+        elif action < 0.5:
+            held = {name: version for name, version in held.items() if chance.random() < 0.5}
+            one.ask(m.Evict)
+            one.give_up(chance.randrange(4))
+        elif action < 0.54:
+            small_map.change(chance.choice(ALL), step)
+            one.read_again()
+        one.daemon.turn_until(lambda: one.pages.settled)
+        area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
+        while True:
+            by_name = chance.random() < 0.5
+            named = tuple(HeldCell(name, version) for name, version in held.items()) if by_name else ()
+            packed = b"" if by_name else pack_versions(held.values())
+            known = [one.view.id(i) for page in one.pages.needed for i in one.pages.cells(page)]
+            reply = one.ask(partial(m.Differential, area=area, held=named, packed=packed))
+            of_version = {version: name for name, version in held.items()}
+            removed = {*reply.removed, *(of_version[v] for v in unpack_versions(reply.removed_packed))}
+            box_of = {Path(cell).name: one.origin.whole.box(i) for i, cell in enumerate(_all_ids(one))}
+            inside = {name for name in ALL if _touches(area, box_of[name])}
+            now_known = {Path(cell).name for cell in known}
+            assert reply.covered is (not _absent(one, area))
+            assert removed == {
+                name for name in held if name not in inside and (name in now_known or reply.covered)
+            }
+            fresh = {cell.id: cell.version for cell in reply.cells if not cell.stale}
+            want = {name for name in inside & now_known if held.get(name) != _version(one, name)}
+            assert set(fresh) | {cell.id for cell in reply.pending} == want
+            assert all(version == _version(one, name) for name, version in fresh.items())
+            held = {name: version for name, version in held.items() if name not in removed} | fresh
+            if not reply.pending:
+                break
+        covered += reply.covered
+        if reply.covered:
+            assert held == {name: _version(one, name) for name in inside}
+    assert 10 < covered < 95, "else nothing was tried"
+
+
+# --- within one version ----------------------------------------------------------------------------
+
+
+def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
+    reply = paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S))
+    cache, statistics = paged.daemon.memory.cache, paged.daemon.memory.statistics
+    warm, before = cache.warm, {name: statistics.values[name] for name in ("reloads", "evictions")}
+    told = paged.ask(lambda n: events.Recent(n, after=0)).next
+    version, segments = paged.view.map_version, {cell.segment for cell in reply.cells}
+    welcome = paged.ask(lambda n: m.Hello(n, *m.PROTOCOL_VERSION, "again"))
+    assert (welcome.cells, welcome.bounds) == (16, (-40.0, -40.0, 40.0, 40.0)), "those of the whole map"
     paged.know(WEST, EAST)
-    more = paged.ask(lambda n: m.Metadata(n, since=before.map_version))
-    assert more.map_version != before.map_version
-    assert (names(more.rows), more.since_known, more.removed) == (columns(20), True, ())
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    assert segments < {cell.segment for cell in reply.cells}
+    assert (cache.warm is warm, paged.view.map_version) == (True, version)
+    assert {name: statistics.values[name] for name in before} == before
+    recent = paged.ask(lambda n: events.Recent(n, after=told - 1)).events
+    assert {type(events.decode_event(one)) for one in recent} <= {events.Loaded, events.Late}
+    since = paged.ask(lambda n: m.Metadata(n, since=version))
+    assert (since.rows, since.since_known, since.map_version) == ((), True, version)
+
+
+def test_how_many_cells_are_known_is_counted(paged: Paged) -> None:
+    def known() -> tuple[int, int]:
+        counters = paged.ask(m.Stats).counters
+        return counters["map_cells"], counters["map_cells_known"]
+
+    assert known() == (16, 8)
+    paged.know(WEST, EAST)
+    assert known() == (16, 16)
+
+
+def test_a_page_goes_when_nothing_needs_it_and_no_sooner(paged: Paged) -> None:
+    paged.know(WEST, EAST)
+    daemon, cache = paged.daemon, paged.daemon.memory.cache
+    paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S))
+    paged.ask(lambda n: m.Selected(n, ("20_20.pcd",), wait=LONG_S))
+    paged.pages.most = 1
+    assert paged.paging.is_needed(WEST), "a session's area"
+    assert paged.paging.is_needed(EAST), "a segment"
+    assert isinstance(paged.ask(lambda n: m.Evict(n, ("20_20.pcd",))), m.Evicted)
+    daemon.turn_until(lambda: not cache.ledger.retired)
+    assert isinstance(paged.ask(lambda n: m.Pin(n, ("20_0.pcd",))), m.Pinned)
+    assert paged.paging.is_needed(EAST), "a pin"
+    paged.ask(m.Unpin)
+    daemon.turn_until(lambda: not daemon.memory.scheduler.loads.by_key)
+    paged.ask(lambda n: m.Evict(n, ("20_0.pcd",)))
+    daemon.turn_until(lambda: not paged.pages.is_here(EAST))
+    assert paged.pages.is_here(WEST)
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE))
+    assert (names(reply.cells), reply.covered) == (WESTERN, False)
+
+
+def test_a_waiting_request_keeps_its_pages(paged: Paged, monkeypatch: pytest.MonkeyPatch) -> None:
+    paged.know(WEST, EAST)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(paged.daemon.memory.scheduler.pool), "submit", lambda *_, **__: False)
+        paged.begin(lambda n: m.Selected(n, ("20_20.pcd",), wait=LONG_S))
+        paged.pages.most = 1
+        assert paged.paging.is_needed(EAST)
+        assert not paged.paging.is_needed(WEST)
+        paged.daemon.turn_until(lambda: not paged.pages.is_here(WEST))
+    assert names(paged.answer().cells) == ["20_20.pcd"]
+
+
+@pytest.mark.parametrize("compared", [True, False])
+def test_what_changed_since_is_known_if_it_was_known_in_both(paged: Paged, compared: bool) -> None:
+    """Else the whole list is answered."""
+    if compared:
+        paged.know(WEST, EAST)
+    before = paged.view.map_version
+    paged.directory.change("20_20.pcd", 5)
+    paged.read_again()
+    assert paged.view.map_version != before
+    paged.know(WEST, EAST)
+    page = paged.ask(lambda n: m.Metadata(n, since=before))
+    assert page.since_known is compared
+    assert (names(page.rows) == ["20_20.pcd"]) is compared
+
+
+def test_another_version_is_served_when_it_knows_what_is_known_of_this_one(paged: Paged) -> None:
+    """Until then this one is, whole; a link that is lost meanwhile changes nothing."""
+    paged.know(WEST, EAST)
+    before = {cell.id: cell.version for cell in paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).cells}
+    served = paged.view
+    paged.directory.change("20_20.pcd", 5)
+    paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+    paged.origin.sharing = {WEST}
+    paged.requests += 1
+    paged.daemon.send(m.Reload(paged.requests))
+    paged.daemon.turn_until(lambda: paged.origin.last is not None and paged.origin.last.pages.wanted)
+    coming = paged.origin.last
+    assert coming is not None
+    assert (paged.view is served, coming.pages.wanted) == (True, {EAST: 0.0})
+    coming.pages.fail(EAST)
+    paged.daemon.turn_until(lambda: coming.pages.is_out_of_reach(EAST))
+    assert (paged.view is served, paged.daemon.answered()) == (True, False)
+    coming.pages.come(EAST)
+    reloaded = paged.answer()
+    assert (type(reloaded), reloaded.changed, paged.view is coming) == (m.Reloaded, 1, True)
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    assert [cell.id for cell in reply.cells if cell.version != before[cell.id]] == ["20_20.pcd"]
+    since = paged.ask(lambda n: m.Metadata(n, since=served.map_version))
+    assert (names(since.rows), since.since_known) == (["20_20.pcd"], True)
+
+
+def test_a_version_that_is_held_back_gives_way_to_a_later_one(paged: Paged) -> None:
+    paged.know(WEST, EAST)
+    paged.origin.sharing = {WEST}
+    for _ in range(2):
+        paged.requests += 1
+        paged.daemon.send(m.Reload(paged.requests))
+    first: list[PagedView] = []
+
+    def second() -> bool:
+        last = paged.origin.last
+        if last is not None and last.pages.wanted and last not in first:
+            first.append(last)
+        return len(first) == 2
+
+    paged.daemon.turn_until(second)
+    first[0].pages.come(EAST)
+    first[1].pages.come(EAST)
+    assert [type(paged.answer()), type(paged.answer())] == [m.Reloaded] * 2
+    assert paged.view is first[1]
+
+
+# --- the list of cells -----------------------------------------------------------------------------
+
+
+def test_the_list_goes_page_by_page_and_waits_for_each(paged: Paged) -> None:
+    first = paged.ask(m.Metadata)
+    assert (sorted(names(first.rows)), first.next) == (WESTERN, EAST << 32)
+    started = paged.ask(lambda n: m.Metadata(n, start=first.next))
+    assert (started.rows, started.next) == ((), EAST << 32), "nothing yet: ask again"
+    assert paged.pages.wanted == {EAST: 0.0}
+    paged.requests += 1
+    paged.daemon.send(m.Metadata(paged.requests, start=first.next))
+    paged.daemon.turn_until(lambda: paged.paging.queries._waiting)
+    paged.pages.come(EAST)
+    second = paged.answer()
+    assert (sorted(names(second.rows)), second.next) == (EASTERN, None)
+    assert second.map_version == first.map_version
+
+
+def test_rows_of_a_page_come_some_at_a_time(paged: Paged) -> None:
+    paged.know(WEST, EAST)
+    found: list[str] = []
+    start: int | None = 0
+    while start is not None:
+        page = paged.ask(lambda n, start=start: m.Metadata(n, start=start, limit=3))  # type: ignore[misc]
+        assert len(page.rows) <= 3
+        found, start = found + names(page.rows), page.next
+    assert (sorted(found), len(found)) == (ALL, 16)
+
+
+def test_the_list_of_an_area_asks_for_no_other_page(paged: Paged) -> None:
+    inside = m.BoxMessage(-35.0, -35.0, -25.0, 35.0)
+    page = paged.ask(lambda n: m.Metadata(n, inside))
+    assert (sorted(names(page.rows)), page.next) == (columns(-40), None)
+    assert paged.pages.wanted == {}
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_list_that_cannot_be_had_is_an_error(
+    paged: Paged, monkeypatch: pytest.MonkeyPatch, before: bool
+) -> None:
+    monkeypatch.setattr(map_queries, "METADATA_WAIT_S", LONG_S)
+    if before:
+        paged.pages.fail(EAST)
+        paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
+        reply = paged.ask(lambda n: m.Metadata(n, start=EAST << 32))
+    else:
+        paged.requests += 1
+        paged.daemon.send(m.Metadata(paged.requests, start=EAST << 32))
+        paged.daemon.turn_until(lambda: paged.paging.queries._waiting)
+        paged.pages.fail(EAST)
+        reply = paged.answer()
+    assert isinstance(reply, m.ErrorReply)
+    assert reply.code == "offline"
+
+
+# --- layers that look around -----------------------------------------------------------------------
+
+
+def test_a_layer_that_looks_around_waits_for_the_pages_of_what_it_looks_into(paged: Paged) -> None:
+    beside = m.BoxMessage(-15.0, -35.0, -5.0, -25.0)  # one cell, on the border of the unknown page
+    reply = paged.ask(lambda n: m.Area(n, m.BoxMessage(-35.0, -35.0, -25.0, -25.0), (HALO,), wait=LONG_S))
+    assert (names(reply.cells), reply.covered) == (["-40_-40.pcd"], True)
+    reply = paged.ask(lambda n: m.Area(n, beside, (HALO,), wait=0.3))
+    assert (names(reply.cells), reply.covered) == ([], True), "it is known which cells touch the area"
+    assert [(cell.id, cell.layer) for cell in reply.pending] == [("-20_-40.pcd", HALO)]
+    assert paged.pages.wanted.keys() == {EAST}
+    assert paged.daemon.memory.scheduler._for_pages, "no loader has it"
+    assert not any(worker.queue for worker in paged.daemon.memory.scheduler.pool)
+    paged.begin(lambda n: m.Area(n, beside, (HALO,), wait=LONG_S))
+    paged.pages.come(EAST)
+    (cell,) = paged.answer().cells
+    index = paged.origin.whole.find("-20_-40.pcd")
+    assert index is not None
+    assert cell.version == LayerVersions(lambda: paged.origin.whole).version(index, HALO)
+
+
+def test_a_layer_that_looks_into_what_is_out_of_reach_is_offline(paged: Paged) -> None:
+    paged.pages.fail(EAST)
+    paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
+    reply = paged.ask(lambda n: m.Selected(n, ("-20_-40.pcd",), (HALO,), wait=LONG_S))
+    assert [(one.code, one.box) for one in reply.failed] == [("offline", (-20.0, -40.0, 0.0, -20.0))]
+    paged.pages.come(EAST)
+    paged.daemon.turn_until(lambda: paged.pages.is_here(EAST))
+    reply = paged.ask(lambda n: m.Selected(n, ("-20_-40.pcd",), (HALO,), wait=LONG_S))
+    assert (names(reply.cells), reply.failed) == (["-20_-40.pcd"], ()), "at once, not when its time has come"
+
+
+# --- a restart -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", [False, True])
+def test_segments_of_what_is_not_known_yet_are_set_aside(
+    paged: Paged, whole: Callable[..., WholeDaemon], change: bool
+) -> None:
+    """They are judged when their page comes."""
+    paged.know(WEST, EAST)
+    before = {cell.id: cell for cell in paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).cells}
+    paged.daemon.close(keep=True)
+    if change:
+        paged.directory.change("20_20.pcd", 5)
+        paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+    paged.origin.known = {WEST}
+    paged.daemon = whole(paged.directory.root, origin=paged.origin)
+    ledger, loaded = paged.daemon.memory.cache.ledger, paged.count("loads_finished")
+    assert (paged.count("adopted"), ledger.resident_count) == (8, 8)
+    assert ledger.aside_bytes == sum(before[name].bytes for name in before if Path(name).name in EASTERN)
+    assert EAST in paged.pages.wanted
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=0.3))
+    assert not reply.covered
+    paged.know(WEST, EAST)
+    assert paged.count("adopted") == 16 - change
+    assert ledger.aside_bytes == 0
+    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    assert names(reply.cells) == ALL
+    others = [Path(cell.id).name for cell in reply.cells if cell.segment != before[cell.id].segment]
+    assert others == ["20_20.pcd"] * change
+    assert paged.count("loads_finished") - loaded == int(change)
+
+
+def test_what_is_set_aside_goes_with_the_daemon(paged: Paged, whole: Callable[..., WholeDaemon]) -> None:
+    paged.know(WEST, EAST)
+    paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    paged.daemon.close(keep=True)
+    paged.origin.known = set()
+    paged.daemon = whole(paged.directory.root, origin=paged.origin)
+    directory = Path(paged.daemon.memory.directory.path)
+    assert paged.count("adopted") == 0
+    assert len(list(directory.iterdir())) == 16 + 1
+    paged.daemon.close()
+    assert list(directory.iterdir()) == []
+
+
+# --- fetching ahead --------------------------------------------------------------------------------
+
+
+def test_pages_along_the_path_are_fetched(paged: Paged) -> None:
+    intent = m.Intent(-30.0, 0.0, vx=10.0, route=((-30.0, 0.0), (35.0, 0.0)))
+    around = m.CircleMessage(-30.0, 0.0, 5.0)
+    paged.ask(lambda n: m.Area(n, around, wait=LONG_S, intent=intent))
+    paged.daemon.turn_until(lambda: EAST in paged.pages.wanted)
+    assert PREFETCH < paged.pages.wanted[EAST] < PREFETCH + 60.0
+    paged.know(WEST, EAST)
+    cache = paged.daemon.memory.cache
+    ahead = cache.catalogue.find("20_0.pcd")
+    assert ahead is not None
+    paged.daemon.turn_until(lambda: cache.warm.get(ahead, "points"))
+
+
+# --- clients ---------------------------------------------------------------------------------------
 
 
 def test_the_client_library_says_so(paged: Paged) -> None:
     with paged.daemon.turning(), connect(paged.daemon.endpoint) as client:
-        found = client.area(
-            Box(-35.0, -35.0, 35.0, 35.0), ["voxel( 1 )", "points", "voxel(leaf=1.0)"], wait=60.0
-        )
-        assert (found.covered, found.complete) == (False, False)
+        layers = ["voxel( 1 )", "points", "voxel(leaf=1.0)"]
+        found = client.area(Box(-35.0, -35.0, 35.0, 35.0), layers, wait=2.0, strict=None)
+        assert (found.covered, found.complete, found.reason) == (False, False, "")
         assert found.layers == ("voxel(leaf=1.0)", "points", "voxel(leaf=1.0)")
-        assert (len(found), found.failed, found.pending) == (24, (), ())
+        paged.pages.fail(EAST)
+        found = client.area(Box(-35.0, -35.0, 35.0, 35.0), wait=60.0, strict=None)
+        assert (len(found), found.failed, found.pending) == (8, (), ())
+        assert (found.covered, found.reason) == (False, "offline")
+        assert "offline" in repr(found)
         found = client.area(Box(-35.0, -35.0, -5.0, 35.0), wait=60.0)
         assert (found.covered, found.complete, found.layers) == (True, True, ("points",))
+        with pytest.raises(Offline):
+            client.metadata()
+        paged.pages.come(EAST)
+        while client.stats().counters["map_cells_known"] < 16:
+            pass
+        assert len(client.metadata()) == 16
 
 
 @pytest.mark.parametrize("background", [True, False])
-def test_a_window_keeps_what_may_be_in_the_unknown_part(paged: Paged, background: bool) -> None:
-    with (
-        paged.daemon.turning(),
-        connect(paged.daemon.endpoint) as operator,
-        MapWindow(
-            paged.daemon.endpoint, 38.0, shape="square", update_distance=0.5, background=background
-        ) as window,
-    ):
-
-        def know(*pages: int) -> None:
-            paged.origin.known = set(pages)
-            operator.reload()
-
-        know(WEST, EAST)
-        window.move_to(0.0, 0.0, wait=30.0)
-        assert window.wait_until_current(30.0)
+def test_a_window_keeps_what_may_be_in_the_unknown_part(
+    paged: Paged, whole: Callable[..., WholeDaemon], background: bool
+) -> None:
+    """As after a restart of the daemon."""
+    options: dict[str, Any] = {"shape": "square", "update_distance": 0.5, "background": background}
+    with paged.daemon.turning():
+        window = MapWindow(paged.daemon.endpoint, 38.0, **options)
+        paged.pages.come(EAST)
+        window.move_to(0.0, 0.0, wait=LONG_S)
+        assert window.wait_until_current(LONG_S)
         assert (names(window.cells), window.complete) == (ALL, True)
         assert window.covers(0.0, 0.0, 30.0)
-        know(WEST)
-        update = window.move_to(1.0, 0.0, wait=1.0)  # far enough to be asked again
+    paged.daemon.close(keep=True)
+    paged.daemon = whole(paged.directory.root, origin=paged.origin)
+    with paged.daemon.turning(), window:
+        update = window.move_to(1.0, 0.0, wait=0.5)
+        end_s = time.monotonic() + LONG_S
+        while window.error is not None or not update.current:
+            assert time.monotonic() < end_s
+            update = window.move_to(1.0, 0.0, wait=1.0)
         assert (update.removed, update.covered, update.complete) == ((), False, False)
         assert (names(window.cells), window.complete) == (ALL, False)
         assert not window.covers(1.0, 0.0, 1.0), "nobody knows where the unknown cells lie"
         assert not window.points_around(1.0, 0.0, 1.0).covered
         assert not window.wait_until_current(0.05)
-        know(WEST, EAST)
-        update = window.move_to(1.0, 0.0, wait=30.0)
-        assert window.wait_until_current(30.0)
+        paged.pages.come(EAST)
+        update = window.move_to(1.0, 0.0, wait=LONG_S)
+        assert window.wait_until_current(LONG_S)
         assert (names(window.cells), window.complete) == (ALL, True)
         assert not update.removed
+
+
+def test_a_reload_that_takes_long_is_offline_and_goes_on(
+    paged: Paged, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operator_requests, "RELOAD_S", 0.05)
+    go_on, load = threading.Event(), paged.origin.load
+
+    def slow(**options: Any) -> Any:
+        assert go_on.wait(LONG_S)
+        return load(**options)
+
+    monkeypatch.setattr(paged.origin, "load", slow)
+    before, reloads = paged.view, paged.count("reloads")
+    reply = paged.ask(m.Reload)
+    assert isinstance(reply, m.ErrorReply)
+    assert (reply.code, paged.view is before) == ("offline", True)
+    go_on.set()
+    paged.daemon.turn_until(lambda: paged.count("reloads") > reloads)
+    assert paged.view is not before
 
 
 def test_an_origin_out_of_reach_does_not_change_the_map(paged: Paged) -> None:
@@ -203,4 +718,4 @@ def test_an_origin_out_of_reach_does_not_change_the_map(paged: Paged) -> None:
         with pytest.raises(Offline, match="does not answer") as refused:
             client.reload()
         assert refused.value.exit_code == 75
-        assert len(client.area(AutowareSquare(0.0, 0.0, 38.0))) == len(KNOWN_IN_THE_WEST)
+        assert len(client.area(AutowareSquare(-30.0, 0.0, 20.0))) == len(WESTERN)

@@ -14,7 +14,6 @@ import pytest
 
 import shmmap
 from shmmap.client.route import MOST_PLACES, thinned
-from shmmap.client.window import nothing_new
 from shmmap.daemon.requests import dispatch, limits
 from shmmap.protocol.messages import Intent
 from tests.support.cpp_client import CppWindow
@@ -111,28 +110,6 @@ def test_a_route_that_is_told_once_is_heard(
         window.move_to(0, 0, route=STRAIGHT, wait=PATIENCE_S)
         window.move_to(0, 0, route=LEFT)
         tell_until(told, lambda: time.sleep(0.01), lambda i: i.route == LEFT)
-
-
-def test_a_request_that_would_bring_no_cells_is_sent_for_the_sake_of_a_route(
-    whole: Callable[..., WholeDaemon],
-    small_map: DividedMap,
-    told: list[Intent],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """It asks at each call, unless it is certain that nothing would come."""
-    monkeypatch.setattr(nothing_new, "TELL_S", NEVER)
-    with (
-        serving(whole, small_map) as one,
-        shmmap.MapWindow(
-            one.endpoint, 15.0, background=False, update_distance=0, refresh_interval=1e-9
-        ) as window,
-    ):
-        window.move_to(0, 0, route=STRAIGHT, wait=PATIENCE_S)
-        before = len(told)
-        window.move_to(0, 0, route=STRAIGHT)
-        assert len(told) == before
-        window.move_to(0, 0, route=LEFT)
-        assert [intent.route for intent in told[before:]] == [LEFT]
 
 
 def test_long_routes_are_thinned(

@@ -54,7 +54,7 @@ class WholeDaemon:
         prepare_process()
         self.endpoint = path = scratch + "/walk.sock"
         shm_dir = scratch + "/shm"
-        Path(shm_dir).mkdir()
+        Path(shm_dir).mkdir(exist_ok=True)
         config = DaemonConfig(map_path=str(map_path), instance="walk", shm_dir=shm_dir, workers=1, **settings)
         directory = ShmDirectory(shm_dir)
         origin = origin or open_map(str(map_path), cache_dir=scratch)
@@ -112,9 +112,12 @@ class WholeDaemon:
         """Return the reply that has come."""
         return decode_reply(self._client.recv())
 
-    def close(self) -> None:
+    def close(self, *, keep: bool = False) -> None:
+        """End it once; ``keep`` leaves the segments to the next life."""
+        if self._client.closed:
+            return
         self._client.close()
         self._context.term()
         self.service._end()
-        self.memory.close(keep=False)
+        self.memory.close(keep=keep)
         take_slices(0)  # the loop's short turns are not for the tests that follow

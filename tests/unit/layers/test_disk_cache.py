@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from shmmap.formats.causes import refusal
-from shmmap.layers import sources
+from shmmap.layers import source_reader, sources
 from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob, Neighbour
@@ -22,6 +22,7 @@ from shmmap.layers.making import Made, cache_key, make_layer
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.layout import SourceStamp
+from shmmap.segment.source import Source
 from tests.support.divided_map import random_points
 from tests.support.open3d_package import open3d_or_skip
 from tests.support.pcd_files import write_pcd
@@ -44,7 +45,7 @@ class Bench:
 
     @property
     def job(self) -> CellJob:
-        return CellJob(str(self.path), str(self.path), BOX)
+        return CellJob(str(self.path), Source(str(self.path)), BOX)
 
     def make(self, layer: str, job: CellJob | None = None) -> tuple[Made, bytes]:
         """One layer as a loader makes it, and its bytes."""
@@ -167,7 +168,7 @@ def test_a_copied_map_is_recognised_by_content(one: Bench) -> None:
     digest = one.make(LAYERS[1])[0].header.source_digest
     moved = one.directory / "moved.pcd"
     shutil.copy(one.path, moved)
-    job = CellJob(str(moved), str(moved), BOX)
+    job = CellJob(str(moved), Source(str(moved)), BOX)
     key = cache_key(parse_layer(LAYERS[1]), job)
     assert key is not None
     assert not one.cache.has(key)
@@ -206,7 +207,7 @@ def test_a_neighbour_that_changes_while_it_is_read_is_built_with_later(
     near = one.directory / "near.pcd"
     write_pcd(near, random_points(np.random.default_rng(1), (20, 0), 200))
     before = SourceStamp.of(os.stat(near))
-    job = replace(one.job, neighbours=(Neighbour(str(near), (20.0, 0.0, 40.0, 20.0)),))
+    job = replace(one.job, neighbours=(Neighbour(Source(str(near)), (20.0, 0.0, 40.0, 20.0)),))
     read_source = sources.read_source
 
     def rewritten_meanwhile(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
@@ -215,10 +216,10 @@ def test_a_neighbour_that_changes_while_it_is_read_is_built_with_later(
         write_pcd(near, random_points(np.random.default_rng(2), (20, 0), 201))
         raise refusal("changed", "the file changed while it was being read", path=path)
 
-    monkeypatch.setattr(sources, "read_source", rewritten_meanwhile)
+    monkeypatch.setattr(source_reader, "read_source", rewritten_meanwhile)
     made, without = one.make(layer, job)
     assert made.neighbours == (before,)  # what it knows nothing of is not the neighbour's new state
-    monkeypatch.setattr(sources, "read_source", read_source)
+    monkeypatch.setattr(source_reader, "read_source", read_source)
     made, data = one.make(layer, job)
     assert not made.cached
     assert made.neighbours == (SourceStamp.of(os.stat(near)),)

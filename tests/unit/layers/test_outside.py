@@ -13,6 +13,7 @@ from shmmap.formats.pcd.writer import write_pcd
 from shmmap.layers.derive import CellJob
 from shmmap.layers.making import make_layer
 from shmmap.layers.spec import layer_spec
+from shmmap.segment.source import Source
 
 BOX = (90_000.0, 40_000.0, 90_020.0, 40_020.0)
 
@@ -21,7 +22,7 @@ def outside(tmp_path: Path, xyz: np.ndarray, layer: str = "points") -> int:
     write_pcd(tmp_path / "a.pcd", {axis: xyz[:, i] for i, axis in enumerate("xyz")})
     fd = os.memfd_create("segment")
     try:
-        job = CellJob(str(tmp_path / "a.pcd"), str(tmp_path / "a.pcd"), BOX, "map", ())
+        job = CellJob(str(tmp_path / "a.pcd"), Source(str(tmp_path / "a.pcd")), BOX, "map", ())
         return make_layer(layer_spec(layer), job, fd).header.outside_points
     finally:
         os.close(fd)

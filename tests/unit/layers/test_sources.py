@@ -13,13 +13,16 @@ import pytest
 
 from shmmap.errors import MapDataError
 from shmmap.formats.pcd.reader import PcdReader
-from shmmap.layers import sources
+from shmmap.layers import source_reader, sources
 from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob, derive
-from shmmap.layers.sources import CellSource, read_halo, read_segment, read_source
+from shmmap.layers.halo import read_halo
+from shmmap.layers.source_reader import FILES
+from shmmap.layers.sources import CellSource, read_segment, read_source
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.publish_block import PublishBlock, pack_publish_block
+from shmmap.segment.source import Source
 from tests.support.divided_map import random_points
 from tests.support.pcd_files import write_pcd
 
@@ -64,7 +67,7 @@ def test_so_is_its_segment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     directory = ShmDirectory("/dev/shm")
     fd = directory.create()
     with open(fd, "r+b"):
-        made = derive(parse_layer("crop(z_min=-1000)"), CellJob("cell", str(path), BOX), fd)
+        made = derive(parse_layer("crop(z_min=-1000)"), CellJob("cell", Source(str(path)), BOX), fd)
         os.pwrite(fd, pack_publish_block(PublishBlock(1, 2)), made.header.header_bytes - 64)
         assert len(read_segment(fd, BOX, None).points) == 100
         monkeypatch.setattr(sources, "MOST_SOURCE_BYTES", 100 * 16 - 1)
@@ -78,9 +81,9 @@ def test_a_neighbour_that_claims_too_much_is_left_out_and_named(tmp_path: Path) 
     good = tmp_path / "good.pcd"
     write_pcd(good, random_points(np.random.default_rng(1), (20, 0), 100))
     paths = [str(bomb(tmp_path / "bomb.pcd")), str(good)]
-    halo = read_halo(paths, BOX, 20.0, XYZ)
+    halo = read_halo(FILES, [Source(path) for path in paths], BOX, 20.0, XYZ)
     assert halo.xyz.shape == (100, 3)
-    assert [digest == bytes(16) for _, digest in halo.files] == [True, False]
+    assert [digest == bytes(16) for _, digest in halo.seen] == [True, False]
     (warning,) = halo.warnings
     assert warning.startswith(f"made without a neighbour: {paths[0]}: ")
 
@@ -93,7 +96,7 @@ def test_without_memory_for_a_neighbour_the_neighbour_is_named(
     def full(*_: Any) -> CellSource:
         raise MemoryError
 
-    monkeypatch.setattr(sources, "read_source", full)
+    monkeypatch.setattr(source_reader, "read_source", full)
     with pytest.raises(MapDataError, match=r"neighbour\.pcd: this neighbour takes more memory") as caught:
-        read_halo([str(tmp_path / "neighbour.pcd")], BOX, 5.0, XYZ)
+        read_halo(FILES, [Source(str(tmp_path / "neighbour.pcd"))], BOX, 5.0, XYZ)
     assert "smaller cells" in caught.value.hint

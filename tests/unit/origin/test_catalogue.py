@@ -43,7 +43,7 @@ def test_order_is_that_of_a_cpp_string_map() -> None:
     assert [cells.id(i) for i in range(len(cells))] == expected
     assert cells.ids(np.arange(len(cells))) == expected
     assert cells.id_prefix == "/m/"
-    assert [cells.path(i) for i in range(len(cells))] == expected
+    assert [cells.source(i).name for i in range(len(cells))] == expected
     assert cells.frame_id == "map"
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 import pytest
@@ -43,6 +44,7 @@ def tested(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
+@cache
 def town(corner: float = 0.0) -> NDArray[np.float64]:
     """Boxes of a square town of cells of 20 m, shuffled."""
     lower = np.array([(x, y) for x in range(SIDE) for y in range(SIDE)]) * 20.0 + corner
@@ -59,7 +61,7 @@ boxes = st.builds(lambda x, y, width, height: Box(x, y, x + width, y + height), 
 
 @example(Circle(0.0, -1.1125369292536007e-308, 0.0), 0.0)  # the square of the distance is 0
 @given(circles | squares | boxes, st.sampled_from([0.0, -600.0, 89_000.0, 1e7, -1e9]))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 def test_the_same_cells_as_one_by_one(area: Area, corner: float) -> None:
     cells = town(corner)
     moved: Area
@@ -71,7 +73,7 @@ def test_the_same_cells_as_one_by_one(area: Area, corner: float) -> None:
 
 
 @given(circles, st.integers(0, 40))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_more_than_enough_are_some_of_them(area: Circle, most: int) -> None:
     cells = town()
     right = set(np.flatnonzero(area.overlaps(cells)).tolist())
@@ -85,7 +87,7 @@ def test_more_than_enough_are_some_of_them(area: Circle, most: int) -> None:
 
 
 @given(st.floats(0.0, 2 * np.pi), st.integers(1, 9).map(lambda power: 10.0**power))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_a_circle_that_only_just_reaches_a_corner(direction: float, distance: float) -> None:
     """From far away its border is as good as straight, and float64 has few digits left for the town."""
     cells = town()

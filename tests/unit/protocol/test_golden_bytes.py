@@ -171,9 +171,20 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ("b.pcd",),
             bytes([2, 0, 0, 0, 0, 0, 0, 0]),
             (m.PendingCell("c", "points"),),
-            (m.FailedCell("d", "points", "over_budget", "no", (m.Holder(0, 0, 0, "unknown", 8, 1),)),),
+            (
+                m.FailedCell(
+                    "d",
+                    "points",
+                    "over_budget",
+                    "no",
+                    (m.Holder(0, 0, 0, "unknown", 8, 1),),
+                    (0.0, 0.0, 20.0, 20.0),
+                ),
+                m.FailedCell("e", "points", "unknown_cell", "no"),
+            ),
             ("points",),
             False,
+            "offline",
         ),
         [
             "cells",
@@ -184,15 +195,28 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             ["b.pcd"],
             b"\x02\x00\x00\x00\x00\x00\x00\x00",
             [["c", "points"]],
-            [["d", "points", "over_budget", "no", [[0, 0, 0, "unknown", 8, 1, ""]]]],
+            [
+                [
+                    "d",
+                    "points",
+                    "over_budget",
+                    "no",
+                    [[0, 0, 0, "unknown", 8, 1, ""]],
+                    [0.0, 0.0, 20.0, 20.0],
+                ],
+                ["e", "points", "unknown_cell", "no", [], None],
+            ],
             ["points"],
             False,
+            "offline",
         ],
         (
-            "9ba563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
+            "9ca563656c6c73040305919ca5612e70636401a6706f696e7473a2303000cd200009cb0000000000"
             "000000cb0000000000000000cb4034000000000000cb4034000000000000c291a5622e706364c408"
-            "02000000000000009192a163a6706f696e74739195a164a6706f696e7473ab6f7665725f62756467"
-            "6574a26e6f9197000000a7756e6b6e6f776e0801a091a6706f696e7473c2"
+            "02000000000000009192a163a6706f696e74739296a164a6706f696e7473ab6f7665725f62756467"
+            "6574a26e6f9197000000a7756e6b6e6f776e0801a094cb0000000000000000cb0000000000000000"
+            "cb4034000000000000cb403400000000000096a165a6706f696e7473ac756e6b6e6f776e5f63656c"
+            "6ca26e6f90c091a6706f696e7473c2a76f66666c696e65"
         ),
     ),
     (
@@ -370,26 +394,33 @@ def test_a_reply_put_together_from_packed_handles_is_the_same_bytes(count: int) 
     """At every size at which MessagePack changes the form of an array."""
     whole = m.Cells(
         4, U64, 5, (HANDLE,) * count, ("b.pcd",), bytes(8), (m.PendingCell("c", "points"),),
-        (m.FailedCell("d", "points", "x", "y"),), ("points", "voxel(leaf=1.0)"), False,
+        (m.FailedCell("d", "points", "x", "y"),), ("points", "voxel(leaf=1.0)"), False, "offline",
     )  # fmt: skip
     together = encode_cells(
         4, U64, 5, [encode_handle(HANDLE)] * count, whole.removed, whole.removed_packed,
         whole.layers, whole.covered, PackedArray(whole.pending), PackedArray(whole.failed),
+        reason=whole.reason,
     )  # fmt: skip
     assert together == encode(whole)
     assert encode_cells(4, 3, 5, [], (), b"", ()) == encode(m.Cells(4, 3, 5))
 
 
-def test_a_reply_of_a_daemon_older_than_1_3() -> None:
-    """It has neither layers nor covered: of what it answered it knew everything."""
+@pytest.mark.parametrize(("minor", "elements"), [(2, 9), (5, 11)])
+def test_a_reply_of_an_older_daemon(minor: int, elements: int) -> None:
+    """Before 1.3 it has neither layers nor covered: of what it answered it knew everything."""
     (golden,) = [hexed for message, _, hexed in REPLIES if isinstance(message, m.Cells)]
-    elements = unpack(bytes.fromhex(golden))
-    reply = decode_reply(pack(elements[:9]))
+    older = unpack(bytes.fromhex(golden))[:elements]
+    older[8] = [failed[:5] for failed in older[8]]  # before 1.6 it does not say where a cell lies
+    reply = decode_reply(pack(older))
     assert isinstance(reply, m.Cells)
-    assert (reply.layers, reply.covered) == ((), True)
-    assert pack(elements[:9])[1:] == bytes.fromhex(golden)[1 : len(pack(elements[:9]))], (
-        "only grown at its end"
-    )
+    assert (reply.layers, reply.covered) == (((), True) if minor < 3 else (("points",), False))
+    assert (reply.reason, [failed.box for failed in reply.failed]) == ("", [None, None])
+
+
+def test_replies_with_cells_have_only_grown_at_their_end() -> None:
+    (golden,) = [hexed for message, _, hexed in REPLIES if isinstance(message, m.Cells)]
+    older = pack(unpack(bytes.fromhex(golden))[:8])
+    assert bytes.fromhex(golden)[1 : len(older)] == older[1:]
 
 
 def test_numbers_that_numpy_computed() -> None:

@@ -141,7 +141,7 @@ def test_written_maps_hold_every_point_in_20_m_cells(tmp_path: Path) -> None:
     assert len(catalogue) == 32
     total = 0
     for index in range(32):
-        points = read_pcd(Path(catalogue.path(index)))
+        points = read_pcd(Path(catalogue.source(index).name))
         min_x, min_y, max_x, max_y = catalogue.box(index)
         assert list(points) == ["x", "y", "z", "intensity"]
         assert min_x <= points["x"].min()

@@ -11,6 +11,7 @@
 #include <utility>
 #include <vector>
 
+#include <shmmap/areas.hpp>
 #include <shmmap/cell.hpp>
 
 namespace shmmap {
@@ -19,6 +20,7 @@ namespace shmmap {
 /// `no_space`, `offline`; take any other code for `load_failed`.
 struct Failure {
   std::string id, layer, code, message;
+  std::optional<Box> box = std::nullopt;  ///< where the cell lies, if that is known
 };
 
 /// What came of a request.
@@ -31,6 +33,7 @@ struct Answer {
   std::vector<std::string> layers;  ///< those asked for, in canonical form
   std::uint64_t epoch = 0, map_version = 0;
   bool covered = true;  ///< false: part of what was asked for is not known yet, ask again
+  std::string reason;   ///< then `offline` where that cannot be reached at present, else empty
 };
 
 /// What a client has: the cell's id and its version (none: the current one), of these layers; no layers means all

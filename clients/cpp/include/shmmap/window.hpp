@@ -211,13 +211,15 @@ class Window {
   [[nodiscard]] bool covers(double x, double y, double radius = 0.0, std::string_view layer = {}) const {
     detail::check_circle(x, y, radius);
     if (!area_ || !covered_ || !detail::contains_circle(*area_, x, y, radius)) return false;
-    const auto holds = [&](const std::string& id, const std::string& of) {  // nobody knows where else it may lie
-      if (cells_.count({id, of}) != 0 || (!layer.empty() && layer != of)) return true;
-      const auto box = failed_boxes_.find(id);
-      return box != failed_boxes_.end() && detail::distance_to(box->second, x, y) > radius;
+    const auto holds = [&](const std::string& id, const std::string& of) {
+      return cells_.count({id, of}) != 0 || (!layer.empty() && layer != of);
+    };
+    const auto lies_apart = [&](const std::optional<Box>& box) {
+      return box && detail::distance_to({box->min_x, box->min_y, box->max_x, box->max_y}, x, y) > radius;
     };
     return std::all_of(pending_.begin(), pending_.end(), [&](const auto& one) { return holds(one.first, one.second); }) &&
-           std::all_of(failed_.begin(), failed_.end(), [&](const auto& one) { return holds(one.id, one.layer); });
+           std::all_of(failed_.begin(), failed_.end(),
+                       [&](const auto& one) { return holds(one.id, one.layer) || lies_apart(one.box); });
   }
 
   /// The window's cells that touch a circle, where they lie in memory.  `layer`: as it was asked for, or as cells
@@ -254,7 +256,6 @@ class Window {
   Client& client() noexcept { return client_; }
 
  private:
-  using Box4 = detail::Sides;
   struct Kept {
     CellPtr cell;
     Clock::time_point since;
@@ -270,7 +271,7 @@ class Window {
     if (!is_finite) throw BadRequest("bad_request", "every number of a pose must be finite");
   }
 
-  static Box4 sides_of(const Cell& cell) { return {cell.min_x, cell.min_y, cell.max_x, cell.max_y}; }
+  static detail::Sides sides_of(const Cell& cell) { return {cell.min_x, cell.min_y, cell.max_x, cell.max_y}; }
 
   static double seconds(Clock::duration span) { return std::chrono::duration<double>(span).count(); }
 
@@ -310,9 +311,8 @@ class Window {
         client_.check_waiting();
         if (!is_under_way()) {
           const bool is_same_place = asked_ && !has_moved(*pose_);
-          if (wants_boxes()) ask_boxes();
-          else if (is_settled() && !is_due(pause_until)) return;
-          else if (pause_until < not_before_ && (is_same_place || error_)) pause_until = not_before_;
+          if (is_settled() && !is_due(pause_until)) return;
+          if (pause_until < not_before_ && (is_same_place || error_)) pause_until = not_before_;
           else ask(is_same_place && !is_settled() ? std::optional(pending_wait_s) : std::nullopt, false);
         }
         if (is_under_way()) {
@@ -320,7 +320,7 @@ class Window {
             if (error_ && error_->code() == "no_answer") throw client_.silent();
             return;
           }
-          if (is_under_way() || wants_boxes()) continue;
+          if (is_under_way()) continue;
           if (is_settled() && !has_moved(*pose_)) return;
           if (made_progress_ || !pending_.empty()) progressed = Clock::now();
         }
@@ -354,14 +354,12 @@ class Window {
                                by_name ? std::vector<std::uint64_t>{} : packed(), options_.layers, wait,
                                question_.pose);
     client_.begin(number, message.data(), "cells", wait.value_or(0.0));
-    asks_boxes_ = false;
   }
 
   /// Take over what has come; returns whether nothing more of it is to come.
   bool take_over(Clock::time_point until) {
     if (!arriving_) {
       std::string reply;
-      if (asks_boxes_) return take_boxes(reply, until);
       if (!client_.is_finished(reply, until)) return false;
       arriving_.emplace();
       arriving_->reply = client_.read_reply(reply);
@@ -477,44 +475,6 @@ class Window {
     return !answer.cells.empty() || !removed.empty();
   }
 
-  // --- where the cells lie that cannot be had: replies name them, only the map's list says where they are ---
-
-  [[nodiscard]] bool wants_boxes() const {
-    return std::any_of(failed_.begin(), failed_.end(), [this](const auto& one) {
-      return boxes_of_ != map_version_ || sought_.count(one.id) == 0;
-    });
-  }
-
-  void ask_boxes() {
-    if (boxes_of_ != map_version_) {
-      boxes_of_ = map_version_;
-      failed_boxes_.clear();
-      sought_.clear();
-    }
-    for (const auto& one : failed_) sought_.insert(one.id);
-    ask_boxes_from(0);
-  }
-
-  void ask_boxes_from(std::uint64_t start) {
-    const auto number = client_.next_request();
-    client_.begin(number, Client::page_request(number, area_, start), "metadata_page", 0.0);
-    asks_boxes_ = true;
-  }
-
-  bool take_boxes(std::string& reply, Clock::time_point until) {
-    try {
-      if (!client_.is_finished(reply, until)) return false;
-      MapListing listing;
-      const auto next = client_.read_listing(reply, listing);
-      for (const auto& cell : listing.cells)
-        if (sought_.count(cell.id) != 0)
-          failed_boxes_[cell.id] = {cell.min_x, cell.min_y, cell.max_x, cell.max_y};
-      if (next && listing.map_version == boxes_of_) ask_boxes_from(*next);
-    } catch (const Refused&) {  // not where they lie, then: they are taken to be near
-    }
-    return true;
-  }
-
   void retain(Clock::time_point now) {
     if (retained_.empty()) return;
     std::vector<Departed> departed;
@@ -562,7 +522,6 @@ class Window {
   WindowOptions options_;
   std::optional<detail::Arriving> arriving_;
   detail::Question question_;
-  bool asks_boxes_ = false;      // what is under way are these, not cells
   bool made_progress_ = false;   // with the last reply
   bool were_gone_ = false;       // segments of the last reply
   std::vector<CellPtr> earlier_;  // of a reply that is asked for again
@@ -572,15 +531,13 @@ class Window {
   std::vector<std::pair<std::string, std::string>> pending_;
   std::vector<Failure> failed_;
   std::vector<std::string> canonical_;
-  std::map<std::string, Box4> failed_boxes_;
-  std::set<std::string> sought_;
   std::optional<Intent> pose_, asked_;
   std::optional<Area> area_;
   std::optional<Error> error_;
   std::optional<Clock::time_point> stale_since_;
   Clock::time_point asked_at_{}, not_before_{};  // when it was asked for the last time; when it may be again
   double pause_s_ = 0.0;
-  std::uint64_t epoch_ = 0, map_version_ = 0, boxes_of_ = 0;
+  std::uint64_t epoch_ = 0, map_version_ = 0;
   bool covered_ = true;
 };
 

@@ -118,6 +118,10 @@ class Prefetch:
         self.more = True
         return None
 
+    def look_again(self) -> None:
+        """Begin all ways again: what lies on them is known better now."""
+        self._catalogue = None
+
     def _compare_some(self, now_s: float) -> bool:
         """Look at some ways: which is known least far, which has the first wish; True after the last."""
         if not self._left:

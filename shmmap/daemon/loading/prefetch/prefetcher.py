@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Carries out what `Prefetch` wishes for, with loaders and memory that nobody asks for just now.
 
-A wish becomes a load like any other when nothing else is queued: so there is never more than one, none is out
-of date, and what somebody asks for comes first.  One loader is kept free, so that a demand need not wait for
-a wish, unless the wish is nearly one itself.  Memory: a wish takes the place of what will be needed later
-than itself, never of what will be needed sooner or is in use, and what was fetched ahead and not asked for
-yet takes its share of the budget at most.
+A wish becomes a load like any other when nothing else is queued and a loader has a free place: so one at most
+waits, none is out of date, and what somebody asks for comes first.  Some places are kept free, so that a
+demand need not wait for a wish, unless the wish is nearly one itself.  Memory: a wish takes the place of what
+will be needed later than itself, never of what will be needed sooner or is in use, and what was fetched ahead
+and not asked for yet takes its share of the budget at most.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ MOST_ENDED: Final = 1024
 FOLLOW_S: Final = 0.005
 """So long moves of a few clients may wait, and ended loads while nobody is on a way: of many that follow one
 another all are looked at once."""
+KEPT: Final = 4
+"""A part of one loader's places is kept free for demands: one in so many, one at least."""
 FULL_S: Final = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 
@@ -70,6 +72,11 @@ class Prefetcher:
         self._next_s = -math.inf
         self._full_until_s = self._followed_s = -math.inf
         self._running: dict[Load, int] = {}
+
+    def look_again(self) -> None:
+        """More of the map is known, or less: look over all ways again."""
+        self.prefetch.look_again()
+        self._next_s = -math.inf
 
     # --- clients ----------------------------------------------------------------------------------
 
@@ -124,8 +131,14 @@ class Prefetcher:
             self._wish(now_s)
 
     def _may_begin(self) -> bool:
-        """Whether a loader has nothing to do."""
-        return not len(self._loads) and self._pool.idle > 0
+        """Whether a loader could begin one more."""
+        return not len(self._loads) and self._pool.free_places > 0
+
+    @property
+    def _kept(self) -> int:
+        """How many places are kept free; not the only one."""
+        pool = self._pool
+        return min(max(1, pool.places // KEPT), pool.limit * pool.places - 1)
 
     def _wish(self, now_s: float) -> None:
         cache, prefetch = self._cache, self.prefetch
@@ -133,8 +146,8 @@ class Prefetcher:
         if wish is None:
             self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
             return
-        if wish.needed_in_s > URGENT_S and self._pool.idle == 1 < self._pool.limit:
-            # the last one waits for demands, until a load ends or a client comes nearer
+        if wish.needed_in_s > URGENT_S and self._pool.free_places <= self._kept:
+            # the last ones wait for demands, until a load ends or a client comes nearer
             self._next_s = now_s + wish.needed_in_s - URGENT_S
             return
         key, nbytes = Key(cache.catalogue.id(wish.cell), wish.layer), cache.estimate(wish.cell, wish.layer)
@@ -142,7 +155,8 @@ class Prefetcher:
         if taken + nbytes > self.share * cache.ledger.budget_bytes:
             self._next_s = math.inf  # until somebody asks for what was fetched
         else:
-            self._loads.prefetch(key, nbytes, wish.needed_in_s)
+            computed = cache.layers.is_computed(wish.cell, wish.layer)
+            self._loads.prefetch(key, nbytes, wish.needed_in_s, computed=computed)
             self._next_s = now_s
 
     def _is_absent(self, index: int, layer: str) -> bool:

@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.daemon.loading.loads import PREFETCH
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Area
@@ -135,7 +136,7 @@ class WayAhead:
             self.over = True
             return
         if self._inside is None:
-            self._inside, _ = catalogue.query(self.area, MOST_CELLS)
+            self._inside = self._known(catalogue, self.area, 0.0)
         if len(self._inside) > MOST_CELLS:
             self.over = True
             return
@@ -147,6 +148,13 @@ class WayAhead:
         metres, cells = self._entered
         self._entered = metres + self.ahead_m - here_m, cells + len(new)
         self._inside = inside
+
+    def _known(self, catalogue: CatalogueView, area: Area, needed_in_s: float) -> NDArray[np.intp]:
+        """Cells of an area; pages that may have others are fetched, too."""
+        found, known = catalogue.query(area, MOST_CELLS)
+        if not known and (pages := catalogue.pages) is not None:
+            pages.want(pages.of_area(area), PREFETCH + needed_in_s)
+        return found
 
     def looks_s(self, ahead: LookAhead) -> float:
         """How many seconds ahead is looked."""
@@ -189,5 +197,5 @@ class WayAhead:
             self.area.around(x + far_m * math.cos(angle), y + far_m * math.sin(angle), self._wider_m)
             for angle, far_m in ways
         ]
-        found = [catalogue.query(area, MOST_CELLS)[0] for area in areas]
+        found = [self._known(catalogue, area, ahead_m * self.pace_s) for area in areas]
         return found[0] if len(found) == 1 else np.unique(np.concatenate(found))

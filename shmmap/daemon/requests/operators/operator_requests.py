@@ -12,7 +12,7 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.sessions import Session
-from shmmap.errors import ShmmapError
+from shmmap.errors import Offline, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
@@ -22,6 +22,8 @@ __all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
 OPERATOR_REQUESTS: Final = (messages.Reload, messages.Evict, messages.Pin, messages.Unpin, messages.Shutdown)
 EVICTED_AT_ONCE: Final = 16
 """Segments retired in one turn: each is renamed, and the kernel asked who uses it."""
+RELOAD_S: Final = 4.0
+"""How long a reload of a map that is elsewhere may take before its answer is that it cannot be reached."""
 FAREWELL_S: Final = 1.0
 """How long a stop waits for the one who asked for it: its libzmq drops a reply that was not read when the
 connection ends (ZMQ_IMMEDIATE)."""
@@ -42,12 +44,12 @@ class OperatorRequests:
     reloader: Reloader
     stop_by_s: float = math.inf
     _asked_to_stop: Session | None = None
-    _reloading: set[tuple[int, int]] = field(default_factory=set)
+    _reloading: dict[tuple[int, int], tuple[Session, float]] = field(default_factory=dict)
 
     def handle(self, session: Session, message: messages.Request, now_s: float) -> Iterator[None]:
         """Carry out one request and answer it, a reload when it is over."""
         if isinstance(message, messages.Reload):
-            self._reload(session, message)
+            self._reload(session, message, now_s)
         elif isinstance(message, messages.Evict):
             evicted = yield from self._evict(message, now_s)
             session.connection.reply(encode(evicted))
@@ -67,14 +69,24 @@ class OperatorRequests:
         if session is self._asked_to_stop:
             self.stop_by_s = -math.inf
 
-    def _reload(self, session: Session, message: messages.Reload) -> None:
+    def answer_overdue(self, now_s: float) -> None:
+        """Refuse reloads that take too long; they go on."""
+        for asked, (session, until_s) in list(self._reloading.items()):
+            if now_s >= until_s:
+                del self._reloading[asked]
+                why = f"{self.reloader.map_path}: it was not read again within {RELOAD_S:g} s; that goes on"
+                session.connection.refuse(asked[1], Offline(why))
+
+    def _reload(self, session: Session, message: messages.Reload, now_s: float) -> None:
         asked = session.slot, message.request
         if asked in self._reloading:
             return  # the client repeats what it has no answer to yet
-        self._reloading.add(asked)
+        until_s = math.inf if self.cache.catalogue.pages is None else now_s + RELOAD_S
+        self._reloading[asked] = session, until_s
 
         def answer(result: Reread | ShmmapError) -> None:
-            self._reloading.discard(asked)
+            if self._reloading.pop(asked, None) is None:
+                return  # it was refused
             if isinstance(result, ShmmapError):
                 session.connection.refuse(message.request, result)
                 return

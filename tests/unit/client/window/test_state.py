@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -121,8 +120,8 @@ def test_a_missing_cell_may_lie_anywhere(make_cell: Callable[..., Cell]) -> None
 
 
 def test_a_failed_cell_is_missing_where_it_lies() -> None:
-    failure = LoadFailed("broken", cell_id="/b", layer="points")
-    state = msgspec.structs.replace(build(failed=(failure,)), failed_boxes={"/b": (20.0, 0.0, 40.0, 20.0)})
+    failure = LoadFailed("broken", cell_id="/b", layer="points", box=(20.0, 0.0, 40.0, 20.0))
+    state = build(failed=(failure,))
     assert state.covers(0.0, 0.0, 19.0)
     assert not state.covers(0.0, 0.0, 20.0)
     assert not state.covers(30.0, 10.0, 0.0)

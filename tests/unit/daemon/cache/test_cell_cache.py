@@ -24,6 +24,7 @@ from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.processes.start_child import channel
 from shmmap.protocol.messages import Area, CircleMessage, Selected
 from shmmap.segment.layout import SourceStamp
+from shmmap.segment.source import Source
 from tests.support.daemon_process import wait_readable
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon
@@ -130,8 +131,8 @@ class Puppet:
         """What to say of a job, whose file is filled."""
         if job.number in self.worker.segments:
             os.posix_fallocate(self.worker.segments[job.number], 0, 4096)
-        state = SourceStamp.of(os.stat(job.path))
-        version = CellJob(job.cell_id, job.path, job.box).version(layer_spec(job.layer), state, ())
+        state = SourceStamp.of(os.stat(job.source.name))
+        version = CellJob(job.cell_id, job.source, job.box).version(layer_spec(job.layer), state, ())
         return worker_messages.Done(job.number, 4096, 1, 0, 0.0, 1.0, version, state.token, 1)
 
 
@@ -160,7 +161,7 @@ def test_a_loader_that_sends_nonsense_is_ended(puppet: Puppet, nonsense: bytes) 
     reply = one.cells_of(1)
     assert puppet.process.wait() == -signal.SIGKILL
     assert [failure.code for failure in reply.failed] == ["load_failed"]
-    assert first.path in reply.failed[0].message
+    assert first.source.name in reply.failed[0].message
     assert len(reply.cells) == 3
     assert one.ledger.reserved_bytes == 0
     puppet.channel.close()
@@ -177,7 +178,7 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     puppet.channel.close()
     reply = one.cells_of(1)
     (failure,) = reply.failed
-    assert second.path in failure.message, "the second is what it died of"
+    assert second.source.name in failure.message, "the second is what it died of"
     assert one.cache.wire_id(first.cell_id) in [cell.id for cell in reply.cells]
     assert len(reply.cells) == 3
 
@@ -228,13 +229,13 @@ def test_the_longest_job_there_is(puppet: Puppet) -> None:
     job = worker_messages.Job(
         1,
         path,
-        path,
+        Source(path),
         "denoise",
         (0.0,) * 4,
         "map",
         1 << 20,
         "",
-        (Neighbour(path, (0.1,) * 4),) * (MAX_NEIGHBOURS + 1),
+        (Neighbour(Source(path), (0.1,) * 4),) * (MAX_NEIGHBOURS + 1),
     )
     assert puppet.one.pool.submit(job, 0.0)
     assert worker_messages.decode_to_worker(puppet.channel.recv(MAX_PACKET_BYTES)) == job
@@ -263,7 +264,7 @@ def test_a_loader_that_is_killed(puppet: Puppet, monkeypatch: pytest.MonkeyPatch
     assert failed.code == "load_failed"
     allowed = "out of memory: the kernel killed the loader (the control group allows 300 MiB)"
     told = allowed if kills else "the loader was killed (signal SIGKILL): by a person or a program"
-    assert failed.message == f"{job.path}: {told}"
+    assert failed.message == f"{job.source.name}: {told}"
     (failure,) = one.scheduler.loads.failures.values()
     assert (failure.stamp is None) is bool(kills)
     puppet.channel.close()

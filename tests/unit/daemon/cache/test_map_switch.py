@@ -122,7 +122,7 @@ def test_very_many_changes_are_not_remembered(
     second = one.cache.catalogue.map_version
     made.change(some[3], 3)
     one.reload()
-    told = one.queries.answer(Metadata(1, since=first))
+    told = one.queries.page(Metadata(1, since=first))
     assert [row.id for row in told.rows] == some[:4]  # type: ignore[union-attr]
     for name in some[4:]:
         made.change(name, 4)
@@ -133,7 +133,7 @@ def test_very_many_changes_are_not_remembered(
         made.change(name, 5)
     one.reload()
     assert one.map_switch.changes_since(second) is None
-    everything = one.queries.answer(Metadata(2, since=first))
+    everything = one.queries.page(Metadata(2, since=first))
     assert (len(everything.rows), everything.since_known) == (CELLS, False)  # type: ignore[union-attr]
 
 

@@ -90,13 +90,15 @@ def finish(shm: Path, disk: Path, lines: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("label", "times"),
+    ("label", "times", "memory"),
     [
-        ("live.copied", 60), ("live.odd", 61), ("live.applied", 1), ("live.applied", 90), ("live.even", 97),
-        ("live.map", 1), ("live.written", 9), ("live.synced", 1), ("live.renamed", 12), ("live.flushed", 1),
+        ("live.copied", 60, LITTLE), ("live.odd", 61, LITTLE), ("live.applied", 1, LITTLE),
+        ("live.applied", 90, LITTLE), ("live.even", 97, LITTLE), ("live.map", 1, LITTLE),
+        ("live.written", 9, LITTLE), ("live.synced", 1, LITTLE), ("live.renamed", 12, LITTLE),
+        ("live.flushed", 1, LITTLE), ("live.odd", 61, PLENTY), ("live.applied", 90, PLENTY),
+        ("live.written", 9, PLENTY),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("memory", [LITTLE, PLENTY])
 def test_a_writer_that_is_killed_at_any_step_loses_nothing(
     shm: Path, tmp_path: Path, reference: dict[Voxel, int], label: str, times: int, memory: tuple[str, str]
 ) -> None:
@@ -107,12 +109,11 @@ def test_a_writer_that_is_killed_at_any_step_loses_nothing(
     assert_equal_to(reference, shm, tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(3))
 def test_a_writer_that_is_killed_at_any_time_loses_nothing(
-    shm: Path, tmp_path: Path, reference: dict[Voxel, int], seed: int
+    shm: Path, tmp_path: Path, reference: dict[Voxel, int]
 ) -> None:
     """Several times in a row, each after it has said something at random."""
-    rng = random.Random(seed)
+    rng = random.Random(0)
     lines = ""
     for _ in range(4):
         applied = said(lines, "applied")

@@ -24,6 +24,7 @@ from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import in_use, prepare_process
 from shmmap.segment.publish_block import PublishBlock
+from shmmap.segment.source import Source
 from shmmap.segment.version import cell_version
 from tests.support.daemon_process import wait_ended, wait_readable
 from tests.support.divided_map import random_points
@@ -114,7 +115,7 @@ class Loader:
         return message, fds[0] if fds else -1
 
     def load(self, number: int, path: Path, granted: int = 1 << 30) -> None:
-        self.send(worker_messages.Job(number, str(path), str(path), "points", BOX, "map", granted))
+        self.send(worker_messages.Job(number, str(path), Source(str(path)), "points", BOX, "map", granted))
 
     def peak_bytes(self) -> int:
         for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
@@ -507,7 +508,9 @@ def test_a_layer_is_made_of_points_in_memory_while_they_are_of_the_file_s_state(
 
     def voxels(number: int) -> int:
         loader.send(
-            worker_messages.Job(number, str(path), str(path), "voxel(leaf=1.0)", BOX, "map", 1 << 30, segment)
+            worker_messages.Job(
+                number, str(path), Source(str(path)), "voxel(leaf=1.0)", BOX, "map", 1 << 30, segment
+            )
         )
         made, made_fd = loader.receive()
         assert isinstance(made, worker_messages.Done)

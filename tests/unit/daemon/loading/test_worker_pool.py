@@ -18,6 +18,7 @@ from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Wo
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.protocol.messages import Selected
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.source import Source
 from tests.support.daemon_process import stop, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, names
@@ -49,9 +50,9 @@ class Jobs:
 
     def give(self, layer: str) -> bool:
         self.number += 1
-        job: Work = Job(self.number, "cell", "/cell.pcd", layer, (0.0,) * 4, "map", 0)
+        job: Work = Job(self.number, "cell", Source("/cell.pcd"), layer, (0.0,) * 4, "map", 0)
         if layer == "check":
-            job = Check(self.number, "/cell.pcd", "", b"")
+            job = Check(self.number, Source("/cell.pcd"), "", b"")
         if not self.pool.has_room(computed=layer == "ndt"):
             return False
         return self.pool.submit(job, 0.0)

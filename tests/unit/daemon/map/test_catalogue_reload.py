@@ -12,7 +12,6 @@ import pytest
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.errors import ShmmapError
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import Tables
 
 Result = Reread | ShmmapError
 
@@ -22,7 +21,7 @@ class Origin:
 
     path = "/maps/town"
 
-    def load(self, *, fresh: bool = False, before: Tables | None = None) -> Catalogue:
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
         assert fresh
         assert before is not None
         return Catalogue.from_cells([])
@@ -38,7 +37,7 @@ def reloader() -> Iterator[Reloader]:
 def collect(reloader: Reloader) -> None:
     """Do what the loop does when the descriptor is readable."""
     assert select.select([reloader.fd], [], [], 30.0)[0]
-    reloader.collect(lambda _: None, lambda _: None)
+    reloader.collect(lambda found: found, lambda _: None)
 
 
 def test_who_asks_meanwhile_gets_the_next_one(reloader: Reloader) -> None:

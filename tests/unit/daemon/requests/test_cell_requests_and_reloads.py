@@ -12,7 +12,6 @@ import pytest
 
 from shmmap.daemon.requests.pending_request import CELLS_A_STEP
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_change import compare
 from shmmap.protocol.messages import (
     Area,
     Cells,
@@ -71,7 +70,7 @@ def test_a_file_replaced_before_the_loader_comes_to_it(inner: Inner, small_map: 
     reply = one.cells_of(1)
     assert [cell.points for cell in reply.cells] == [33]
     assert reply.map_version != before
-    page = one.queries.answer(Metadata(2, since=before))
+    page = one.queries.page(Metadata(2, since=before))
     assert [Path(row.id).name for row in page.rows] == ["0_0.pcd"]  # type: ignore[union-attr]
     assert reply.cells[0].version == page.rows[0].version  # type: ignore[union-attr]
     one.reload()
@@ -92,7 +91,7 @@ def test_what_changed_since_a_state_of_the_map_is_found_once_for_all_pages(
     one.reload()
     for area, expected in ((None, changed), (CircleMessage(20, 20, 15), changed[1:])):
         for number, name in enumerate(expected):
-            page = one.queries.answer(Metadata(1, area, before, number, 1))
+            page = one.queries.page(Metadata(1, area, before, number, 1))
             assert isinstance(page, MetadataPage)
             assert [Path(row.id).name for row in page.rows] == [name]
             assert page.next == (number + 1 if name != expected[-1] else None)
@@ -100,7 +99,7 @@ def test_what_changed_since_a_state_of_the_map_is_found_once_for_all_pages(
     sought.assert_called_once_with(before)
     rewrite(small_map, "20_0.pcd", 33)
     one.reload()
-    page = one.queries.answer(Metadata(2, since=before))
+    page = one.queries.page(Metadata(2, since=before))
     assert [Path(row.id).name for row in page.rows] == sorted([*changed, "20_0.pcd"])  # type: ignore[union-attr]
 
 
@@ -209,7 +208,7 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     before = one.everything()
     empty = Catalogue.from_cells([])
-    one.map_switch.switch(empty, compare(one.cache.catalogue, empty))
+    one.map_switch.switch(empty, empty.changes_from(one.cache.catalogue))
     one.scheduler.map_changed()
     assert one.everything(2) == Cells(2, 77, empty.map_version, layers=("points",))
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)

@@ -53,7 +53,7 @@ def all_pages(area: Area, limit: int) -> list[MetadataPage]:
     start: int | None = 0
     pages = []
     while start is not None:
-        pages.append(queries.answer(Metadata(1, area_to_message(area), None, start, limit)))
+        pages.append(queries.page(Metadata(1, area_to_message(area), None, start, limit)))
         start = pages[-1].next
         assert len(pages) < 1000
     return pages
@@ -85,9 +85,9 @@ def test_an_area_s_changes(inner: Inner, small_map: DividedMap) -> None:
     for name in ("0_0.pcd", "20_20.pcd"):
         small_map.change(name, 7)
     one.reload()
-    everywhere = one.queries.answer(Metadata(1, EVERYWHERE, before))
+    everywhere = one.queries.page(Metadata(1, EVERYWHERE, before))
     assert [row.id for row in cast("MetadataPage", everywhere).rows] == ["0_0.pcd", "20_20.pcd"]
     near = area_to_message(Circle(1, 1, 2))
-    assert [row.id for row in cast("MetadataPage", one.queries.answer(Metadata(1, near, before))).rows] == [
+    assert [row.id for row in cast("MetadataPage", one.queries.page(Metadata(1, near, before))).rows] == [
         "0_0.pcd"
     ]

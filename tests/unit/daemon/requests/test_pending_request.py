@@ -16,14 +16,13 @@ from shmmap.daemon.requests.pending_request import (
     WaitingList,
 )
 from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.origin.catalogue import Catalogue
 from tests.support import connections
-
-NOWHERE = Catalogue.from_cells([])
 
 
 def waiting_request(session: Session, deadline_s: float, cells: int = 0) -> PendingRequest:
-    return PendingRequest(session, 0, [(0, "points")] * cells, NOWHERE, (), deadline_s=deadline_s)
+    return PendingRequest(
+        session, 0, (), lambda _wanted: iter(()), cells=[(0, "points")] * cells, deadline_s=deadline_s
+    )  # fmt: skip
 
 
 def waiting_list() -> WaitingList:

@@ -145,12 +145,20 @@ inline Cells read_cells(Reader& reader, Row& row) {
     Row one(reader);
     Failure failure;
     for (std::string* text : {&failure.id, &failure.layer, &failure.code, &failure.message}) *text = one.get().text();
+    if (one.next()) reader.skip(1);  // who holds the memory
+    if (one.next() && !reader.nil()) {
+      Row sides(reader);
+      auto& box = failure.box.emplace();
+      for (double* side : {&box.min_x, &box.min_y, &box.max_x, &box.max_y}) *side = sides.get().real();
+      sides.end();
+    }
     one.end();
     answer.failed.push_back(std::move(failure));
   }
   if (row.next())
     for (auto left = reader.array(); left > 0; --left) answer.layers.emplace_back(reader.text());
   if (row.next()) answer.covered = reader.boolean();
+  if (row.next()) answer.reason = reader.text();
   row.end();
   return found;
 }

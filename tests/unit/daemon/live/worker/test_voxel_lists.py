@@ -116,14 +116,13 @@ AREAS: list[LiveArea] = [
 @pytest.mark.parametrize("area", AREAS)
 def test_a_chunk_is_looked_into_if_any_of_its_voxels_lies_in_the_area(area: LiveArea) -> None:
     check_area(area)
+    steps = (np.arange(64) + 0.5) * RESOLUTION
+    centres = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     for x in range(-3, 4):
         for y in range(-3, 4):
             for z in (-1, 0, 1):
                 key = ChunkKey(x, y, z)
-                steps = (np.arange(64) + 0.5) * RESOLUTION
-                low = np.array(key.box(RESOLUTION)[:3])
-                grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3) + low
-                if inside(area, grid).any():
+                if inside(area, centres + key.box(RESOLUTION)[:3]).any():
                     assert touches(area, key, RESOLUTION), key
                     low_key, high_key = key_range(area, RESOLUTION)
                     assert all(a <= b <= c for a, b, c in zip(low_key, key, high_key, strict=True)), key

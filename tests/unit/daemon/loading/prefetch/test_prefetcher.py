@@ -13,7 +13,7 @@ import pytest
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import PREFETCH
 from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
-from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, MOST_WAYS
+from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, KEPT, MOST_WAYS
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
 from tests.support.daemon_process import stop
@@ -175,6 +175,31 @@ def test_what_is_nearly_a_demand_takes_the_last_loader_too(
         needed_in_s = [load.priority - PREFETCH for load in one.loads.by_key.values()]
         assert len(needed_in_s) == (2 if soon else 1)
         assert (max(needed_in_s) <= URGENT_S) == soon
+    one.run_until(lambda: idle(one))
+
+
+def test_as_many_are_under_way_as_there_are_free_places(prefetching: Callable[..., InnerDaemon]) -> None:
+    """Some are kept, and a demand has one at once."""
+    one = prefetching()
+    one.pool.places = 8
+    one.everything()
+    while len(one.pool) < one.pool.limit:
+        one.pool.start_one()
+    with one.loaders_standing_still():
+        drive = Drive(one)
+        for resident in list(one.ledger.residents()):
+            if resident.box[0] > -290.0:
+                one.reclaimer.retire(resident, one.now_s(), "request")
+                one.reclaimer.never_revive(resident.key)
+        one.run_until(lambda: len(one.scheduler._jobs) == 2 * 8 - 8 // KEPT)
+        for _ in range(10):
+            drive.ask(-350.0, wait=0.0)
+            one.turn()
+        assert len(one.scheduler._jobs) == 2 * 8 - 8 // KEPT
+        assert all(load.prefetch for load in one.scheduler._jobs.values())
+        one.ask(one.session(), Selected(50, ("380_0.pcd",), wait=30.0))
+        one.run_until(lambda: any(not load.prefetch for load in one.scheduler._jobs.values()))
+    assert names(one.cells_of(50)) == ["380_0.pcd"]
     one.run_until(lambda: idle(one))
 
 

@@ -26,9 +26,13 @@ def test_a_repeated_request_is_one(inner: Callable[..., InnerDaemon], small_map:
     for number in (7, 7, 7, 8):
         finish(operators.handle(session, Reload(number), 0.0))
 
+    def apply(found: Reread) -> Reread:
+        read.append(found)
+        return found
+
     def collect() -> None:
         assert select.select([reloader.fd], [], [], 30.0)[0]
-        reloader.collect(read.append, failed.append)
+        reloader.collect(apply, failed.append)
 
     collect()
     assert [(type(reply), reply.request) for _, reply in one.replies] == [(Reloaded, 7)]

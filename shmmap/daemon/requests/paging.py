@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map whose list of cells comes in pages: who hears of those that have come, and which may go again."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.map_switch import MapSwitch
+from shmmap.daemon.loading.adoption import Adoption
+from shmmap.daemon.loading.loads import BACKGROUND
+from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.map.catalogue_view import CatalogueView, Pages
+from shmmap.daemon.requests.cell_requests import CellRequests
+from shmmap.daemon.requests.map_queries import MapQueries
+from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+
+__all__ = ["Paging"]
+
+KEPT_S: Final = 0.02
+"""After a page that has to stay the next one is looked at so much later: that takes about a millisecond."""
+MOST_RETIRED: Final = 20_000
+"""Retired segments that are looked through; of more, no page is given up."""
+
+
+@dataclass(eq=False, slots=True)
+class Paging:
+    """Tells of pages that have come, or cannot be had, and drops those that nothing needs.
+
+    A page is needed while there is a segment of one of its cells, a load, a pin, a request that is not
+    answered yet, or a session whose area may have cells of it.  It is a chore of the serving loop.
+    """
+
+    cache: CellCache
+    scheduler: Scheduler
+    map_switch: MapSwitch
+    cells: CellRequests
+    queries: MapQueries
+    adoption: Adoption
+    sessions: Sessions
+    watched: WatchedDescriptors
+    _fd: int = -1
+    _coming_fd: int = -1
+    _was_out_of_reach: bool = False
+    _rests_until_s: float = -math.inf
+
+    @property
+    def _pages(self) -> Pages | None:
+        return self.cache.catalogue.pages
+
+    def follow(self) -> None:
+        """Hear of the pages of the map that is served from now on."""
+        self._stop_following_the_next()
+        if self._fd >= 0:
+            self.watched.unwatch(self._fd)
+            self.cells.map_changed()
+        pages = self._pages
+        self._fd = pages.fd if pages is not None else -1
+        if self._fd >= 0:
+            self.watched.watch(self._fd, self.collect, "map")
+
+    def is_ready(self, new: CatalogueView, try_again: Callable[[], None]) -> bool:
+        """Whether another state of the map knows all that is known of the one that is served.
+
+        Else its pages are fetched, and ``try_again`` is called when some have come.
+        """
+        self._stop_following_the_next()
+        pages, served = new.pages, self._pages
+        lacking = pages.lacking(served) if pages is not None and served is not None else ()
+        if pages is None or not lacking:
+            return True
+
+        def come() -> None:
+            if pages.collect().come:
+                try_again()
+
+        self._coming_fd = pages.fd
+        self.watched.watch(self._coming_fd, come, "map")
+        pages.want(lacking, 0.0)
+        return False
+
+    def _stop_following_the_next(self) -> None:
+        if self._coming_fd >= 0:
+            self.watched.unwatch(self._coming_fd)
+        self._coming_fd = -1
+
+    def collect(self) -> None:
+        """Pages have settled: begin what waited for them."""
+        pages = self._pages
+        if pages is None:
+            return
+        news = pages.collect()
+        if news.come and self._was_out_of_reach:  # what has failed for that may be had again
+            self.scheduler.loads.forget_failures()
+        self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
+        if news.come:
+            self.adoption.pages_came(time.monotonic())
+            if self.cache.layers.halo_m(self.cache.ledger.layers()):
+                self.map_switch.look_again()
+        self.cells.pages_settled(news)
+        self.scheduler.pages_settled()
+        self.queries.pages_settled(news)
+
+    # --- a chore of the loop ----------------------------------------------------------------------
+
+    @property
+    def next_s(self) -> float:
+        """When a page may have to go, or a request for the list has waited long enough."""
+        pages = self._pages
+        if pages is None:
+            return math.inf
+        drop_s = self._rests_until_s if pages.spare() is not None else math.inf
+        return min(drop_s, self.queries.next_deadline_s())
+
+    def turn(self, now_s: float) -> None:
+        """Drop a page, if they are too many and nothing needs it."""
+        self.queries.answer_overdue(now_s)
+        pages = self._pages
+        page = pages.spare() if pages is not None and now_s >= self._rests_until_s else None
+        if pages is None or page is None:
+            return
+        if self.is_needed(page):
+            pages.want((page,), BACKGROUND)  # it is another one's turn
+            self._rests_until_s = now_s + KEPT_S
+        else:
+            pages.drop(page)
+            self.scheduler.prefetcher.look_again()
+
+    def is_needed(self, page: int) -> bool:
+        """Whether a page has to stay."""
+        cache, pages = self.cache, self._pages
+        if pages is None or len(cache.ledger.retired) > MOST_RETIRED or self.cells.uses(page):
+            return True
+        for session in self.sessions:
+            if (area := session.area) is not None:
+                halo_m = cache.layers.halo_m(session.layers)
+                if page in pages.of_area(area.around(*area.center, halo_m)):
+                    return True
+        ids = set(map(cache.catalogue.id, pages.cells(page)))
+        in_memory = (one.resident.key.cell_id for one in cache.ledger.retired.values())
+        return (
+            any(key.cell_id in ids for key in self.scheduler.loads.by_key)
+            or any(key.cell_id in ids for key in cache.ledger.needed())
+            or not ids.isdisjoint(in_memory)
+            or any(map(cache.ledger.of_cell, ids))
+        )
