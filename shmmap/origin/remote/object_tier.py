@@ -118,9 +118,9 @@ class ObjectTier:
             os.makedirs(self._cache_dir, mode=0o755, exist_ok=True)
             if not self._budget.has_room(nbytes):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            if not os.path.lexists(self.directory) and not self._not_our_cache():
-                with contextlib.suppress(FileExistsError):
-                    os.mkdir(self.directory, 0o700)
+            self._require_our_cache()
+            with contextlib.suppress(FileExistsError):
+                os.mkdir(self.directory, 0o700)
             with self._opened() as place:
                 _write(place, _path(digest, is_index), memoryview(data), durable=is_index)
         except OSError as error:
@@ -145,28 +145,22 @@ class ObjectTier:
         OSError
             It is not there, or not this account's alone (`_NotPrivate`).
         """
+        self._require_our_cache()
+        if why := why_not_private(os.lstat(self.directory), os.geteuid()):
+            raise _NotPrivate(f"{self.directory} {why}")
+        place = os.open(self.directory, _FOLDER_FLAGS)
         try:
-            place = os.open(self.directory, _FOLDER_FLAGS)
-        except OSError as error:
-            if error.errno in _ABSENT and not self._not_our_cache():
-                raise
-            why = self._not_our_cache() or self._why_not(os.lstat(self.directory)) or self._reason(error)
-            raise _NotPrivate(why) from None
-        try:
-            if why := self._why_not(os.fstat(place)):
-                raise _NotPrivate(why)
+            if why := why_not_private(os.fstat(place), os.geteuid()):
+                raise _NotPrivate(f"{self.directory} {why}")
             yield place
         finally:
             os.close(place)
 
-    def _why_not(self, status: os.stat_result) -> str:
-        why = why_not_private(status, os.geteuid())
-        return f"{self.directory} {why}" if why else self._not_our_cache()
-
-    def _not_our_cache(self) -> str:
-        """Why nothing is made in the cache directory: what root made there, its service could not use."""
+    def _require_our_cache(self) -> None:
+        """Refuse a cache of another user: what root made in it, its service could not use."""
         uid, owner = os.geteuid(), os.stat(self._cache_dir).st_uid
-        return "" if owner in (0, uid) else f"{self._cache_dir} belongs to user {owner}, not to user {uid}"
+        if owner not in (0, uid):
+            raise _NotPrivate(f"{self._cache_dir} belongs to user {owner}, not to user {uid}")
 
     def _reason(self, error: OSError) -> str:
         return str(error) if isinstance(error, _NotPrivate) else f"{self.directory}: {error.strerror}"

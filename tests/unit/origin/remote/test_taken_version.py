@@ -139,9 +139,7 @@ def test_a_directory_that_cannot_be_made(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("step", "now"), [("taken.head", 7), ("taken.written", 7), ("taken.named", 8)])
-def test_killed_anywhere_the_one_before_or_the_new_one_is_there(
-    tmp_path: Path, step: str, now: int
-) -> None:
+def test_killed_anywhere_the_one_before_or_the_new_one_is_there(tmp_path: Path, step: str, now: int) -> None:
     file(tmp_path).save(TAKEN)
     program = (
         "import sys; from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile as F\n"
