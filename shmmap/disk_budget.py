@@ -65,11 +65,14 @@ class DiskBudget:
         The cache directory.
     limit_bytes
         Most bytes of all files that are kept in it.
+    owner
+        Whose objects they are; None: this process's user.
     """
 
-    def __init__(self, directory: str, limit_bytes: int) -> None:
+    def __init__(self, directory: str, limit_bytes: int, *, owner: int | None = None) -> None:
         self.directory = directory
         self.limit_bytes = limit_bytes
+        self._owner = owner
         self._lock = threading.Lock()
         self._added_bytes = 0
         self._left_bytes = limit_bytes
@@ -139,7 +142,8 @@ class DiskBudget:
         layers, objects = (os.path.join(self.directory, name) for name in (LAYERS, OBJECTS))
         places = {layers: False}
         with contextlib.suppress(OSError):
-            if not why_not_private(os.lstat(objects), os.geteuid()):
+            owner = os.geteuid() if self._owner is None else self._owner
+            if not why_not_private(os.lstat(objects), owner):
                 places |= {os.path.join(objects, CELLS): False, os.path.join(objects, INDEX): True}
         for place, is_index in places.items():
             with contextlib.suppress(OSError):  # it, or a folder in it, is not there
