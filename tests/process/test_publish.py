@@ -543,6 +543,30 @@ def test_pruning_spares_what_is_young_and_what_is_being_published(
 # --- back into files ----------------------------------------------------------------------------------
 
 
+def test_what_a_daemon_keeps_on_the_disk_is_not_fetched(
+    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    """And nothing that is fetched is put there."""
+    from shmmap.origin.remote.object_tier import ObjectTier  # needs zstandard
+
+    tier = ObjectTier(str(tmp_path / "cache/shmmap"), limit_bytes=1 << 30)
+    shmmap("fetch", store, tmp_path / "one")
+    assert not (tmp_path / "cache/shmmap/objects").exists()
+    blobs = {path: path.read_bytes() for path in (store / "blobs/sha256").iterdir()}
+    for path, data in blobs.items():
+        for is_index in (False, True):
+            tier.put(bytes.fromhex(path.name), data, is_index=is_index)
+        path.unlink()
+    done = shmmap.json("fetch", store, tmp_path / "two")
+    assert (done["fetched_cells"], done["fetched_bytes"]) == (4, 0)
+    for name in ("one", "two"):
+        assert files_of(tmp_path / name / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+    for kept in (tmp_path / "cache/shmmap/objects/cells").glob("*/*"):
+        kept.write_bytes(b"damaged")
+    assert "is not there" in shmmap("fetch", store, tmp_path / "three", code=66)
+    shmmap("fetch", store, tmp_path / "three", "--cache-dir", tmp_path / "none", code=66)
+
+
 def test_fetched_files_have_every_field_bit_by_bit(
     shmmap: Shmmap, town: DividedMap, tmp_path: Path, web: tuple[str, Path]
 ) -> None:

@@ -22,7 +22,7 @@ from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.published_object import blob_path
-from shmmap.origin.remote.store import Store, Tag
+from shmmap.origin.remote.store import ObjectReader, Store, Tag
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = [
@@ -206,7 +206,7 @@ def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
             return
 
 
-def read_root(store: Store, current: Current) -> Root:
+def read_root(store: ObjectReader, current: Current) -> Root:
     """Return the root of a version, verified.
 
     Raises
@@ -222,7 +222,7 @@ def root_path(current: Current) -> str:
     return blob_path(bytes.fromhex(current.root))
 
 
-def read_root_object(store: Store, current: Current) -> bytes:
+def read_root_object(store: ObjectReader, current: Current) -> bytes:
     """Return the object of a version's root, its hash compared; errors are those of `read_root`."""
     path = root_path(current)
     data = bytes(store.get_exactly(path, current.bytes))
@@ -231,12 +231,12 @@ def read_root_object(store: Store, current: Current) -> bytes:
     return data
 
 
-def read_shard_object(store: Store, root: Root, number: int) -> memoryview:
+def read_shard_object(store: ObjectReader, root: Root, number: int) -> memoryview:
     """Return the object of a shard; `unpack_shard` compares its hash."""
     return store.get_exactly(blob_path(root.shard_sha256(number)), int(root.sizes[number]))
 
 
-def read_shards(store: Store, root: Root) -> Iterator[Shard]:
+def read_shards(store: ObjectReader, root: Root) -> Iterator[Shard]:
     """All shards of a root in order, several read at a time; errors are those of `read_root`."""
 
     def read(number: int) -> Shard:

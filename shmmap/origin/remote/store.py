@@ -22,6 +22,7 @@ __all__ = [
     "PROBE",
     "WEB_SCHEMES",
     "Listed",
+    "ObjectReader",
     "Patience",
     "Store",
     "StoreUrl",
@@ -47,16 +48,33 @@ class Listed(NamedTuple):
     modified_s: float
 
 
-class Store(Protocol):
+class ObjectReader(Protocol):
+    """Reads whole objects whose size is known; may be called in threads."""
+
+    @property
+    def url(self) -> str:
+        """Where it is, as a person would name it."""
+
+    def get_exactly(self, path: str, nbytes: int) -> memoryview:
+        """Return an object of so many bytes.
+
+        Raises
+        ------
+        Offline
+            Nothing answers in time, or the answer is a refusal.
+        MapMissing
+            There is none.
+        MapDataError
+            It has more or fewer bytes.
+        """
+
+
+class Store(ObjectReader, Protocol):
     """Objects below one URL.  All methods may be called in threads.
 
     Every method raises `Offline` where nothing answers in time or the answer is a refusal, and `CannotWrite`
     where a directory's disk is full or not writable.  No message holds a credential.
     """
-
-    @property
-    def url(self) -> str:
-        """Where it is, as a person would name it."""
 
     @property
     def read_only(self) -> str:
@@ -72,9 +90,6 @@ class Store(Protocol):
         MapDataError
             It has more than ``max_bytes``; it is not read.
         """
-
-    def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object of so many bytes; `MapDataError` if it has more or fewer."""
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
         """Return a whole object, and the tag of this state of it."""
