@@ -58,6 +58,7 @@ from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 
 if TYPE_CHECKING:
+    from shmmap.daemon.map.catalogue_view import CatalogueView
     from shmmap.daemon.map.origin_link import OriginLink
 
 __all__ = ["Elsewhere", "Service"]
@@ -74,6 +75,9 @@ class Elsewhere(Protocol):
     @property
     def link(self) -> OriginLink:
         """Says whether it is in reach, and has another version."""
+
+    def note_served(self, view: CatalogueView) -> None:
+        """Remember which version of the map is served now."""
 
     def try_again(self) -> None:
         """Have fetched again what of the list of cells could not be had."""
@@ -112,6 +116,7 @@ class Service:
         self._signals = signals
         self._activated = activated
         self._lock = lock
+        self._elsewhere = elsewhere
         self._file_watch: FileWatch | None = None
         authorization = Authorization(config.admin_group)
         take_slices(SERVING_SLICE_NS)
@@ -290,6 +295,8 @@ class Service:
         self._look_after_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
+        if self._elsewhere is not None:
+            self._elsewhere.note_served(memory.cache.catalogue)
         version = memory.cache.catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)

@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Final
 from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig, option_of
+from shmmap.daemon.config_live import state_directory
 from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.publisher import events_path
 from shmmap.daemon.host.instance_lock import InstanceLock
@@ -198,6 +199,10 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
 
         return PublishedOrigin(
             ServedFrom(path, config.insecure_http, config.instance_credentials),
+            instance=config.instance,
+            state_dir=state_directory(config.instance),
+            cache_dir=absolute_path(config.cache_dir or default_cache_directory()),
+            cache_bytes=config.cache_bytes,
             catalogue_bytes=config.catalogue_budget_bytes,
             poll_s=config.poll_s,
             accept_version=config.accept_version,

@@ -356,7 +356,7 @@ def test_a_version_never_goes_back(daemon: DaemonFactory, web: FaultyWeb, town: 
     with shmmap.connect(one.endpoint) as client:
         served = client.area(ALL, wait=60.0).map_version
         (web.folder / "CURRENT").write_bytes(first)
-        with pytest.raises(shmmap.ShmmapError, match="an older one: version 2 was taken") as refused:
+        with pytest.raises(shmmap.ShmmapError, match="offers version 1, older than version 2") as refused:
             client.reload()
         assert "--accept-version 1" in refused.value.hint
         assert client.area(ALL, wait=60.0).map_version == served
@@ -473,13 +473,78 @@ def test_segments_are_kept_over_a_restart(daemon: DaemonFactory, web: FaultyWeb)
     with shmmap.connect(one.endpoint) as client:
         assert client.area(ALL, layers=("points", NDT), wait=60.0).complete
         kept = set(one.segments())
+    until_remembered(one)
     one.leave()
     web.requests()
     one.start()
     with shmmap.connect(one.endpoint) as client:
         assert client.area(ALL, layers=("points", NDT), wait=60.0).complete
         assert set(one.segments()) == kept
-    assert len([path for path, _ in web.requests() if path.startswith("blobs/")]) == 5, "root and shards"
+    assert not [path for path, _ in web.requests() if path.startswith("blobs/")], "root and shards are here"
+
+
+def test_a_start_without_a_link_serves_what_was_taken(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    """Out of the disk, all of it: the list of cells, points, and published layers."""
+    one = daemon(web.url, "--poll", "1")
+    with shmmap.connect(one.endpoint) as client:
+        before = client.area(ALL, layers=PUBLISHED, wait=60.0)
+        assert before.complete
+        versions = {(cell.id, cell.layer, cell.version) for cell in before}
+        del before
+    until_remembered(one)
+    one.stop()
+    web.refuse()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        again = client.area(ALL, layers=PUBLISHED, wait=60.0)
+        assert again.complete
+        assert {(cell.id, cell.layer, cell.version) for cell in again} == versions
+        waiting = Patience()
+        while waiting(health(one)[0] != 1):
+            time.sleep(0.05)
+    town.change("0_0.pcd", seed=5)
+    publish(town.root, web.folder, "--layer", NDT)
+    web.listen()
+    with shmmap.connect(one.endpoint) as client:
+        while waiting({(c.id, c.layer, c.version) for c in client.area(ALL, layers=PUBLISHED)} == versions):
+            time.sleep(0.05)
+
+
+def test_an_older_offer_is_no_reason_not_to_start(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    first = (web.folder / "CURRENT").read_bytes()
+    town.change("0_0.pcd", seed=5)
+    publish(town.root, web.folder, "--layer", NDT)
+    one = daemon(web.url, "--poll", "1")
+    with shmmap.connect(one.endpoint) as client:
+        served = client.map_version
+    until_remembered(one)
+    one.stop()
+    (web.folder / "CURRENT").write_bytes(first)
+    one.start()
+    waiting = Patience()
+    with shmmap.connect(one.endpoint) as client:
+        assert client.map_version == served
+        while waiting("could not be read again" not in health(one)[1]):
+            time.sleep(0.05)
+        assert client.area(ALL, wait=60.0).map_version == served
+    one.stop()
+    one.arguments += ["--accept-version", "1"]
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        assert client.map_version != served
+        assert client.area(ALL, wait=60.0).complete
+        assert health(one)[0] == 0
+
+
+def until_remembered(one: DaemonProcess) -> None:
+    """Wait until the daemon has written down what it has taken."""
+    waiting = Patience()
+    while waiting(not list(one.state_dir.rglob("*.taken"))):
+        time.sleep(0.02)
 
 
 # --- what is refused, what is kept quiet --------------------------------------------------------------

@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from hashlib import sha256
 from typing import Any, Final
 
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
+from shmmap.origin.remote.object_tier import KeptObjects
 from shmmap.origin.remote.published_object import (
     CellIdentity,
     ObjectName,
@@ -28,8 +28,7 @@ from shmmap.origin.remote.published_object import (
     write_segment,
 )
 from shmmap.origin.remote.published_source import LayerSource, stamp_of, unpack_source
-from shmmap.origin.remote.serving_store import ServedFrom, open_for_serving
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.serving_store import ServedFrom, kept_objects, open_for_serving
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.source import Source
@@ -43,8 +42,6 @@ MOST_BYTES: Final = 8 << 20
 """Of larger ones fewer are fetched or held at once; always one."""
 _STACK_BYTES: Final = 512 << 10
 """Of a thread: what a loader may take of memory counts them whole."""
-_TRIES: Final = 2
-"""So often an object is fetched that comes damaged: it may have been on its way."""
 
 
 @dataclass(eq=False, slots=True)
@@ -57,7 +54,7 @@ class _Fetch:
     frame: memoryview | ShmmapError | None = None
 
 
-def _get(store: Store, name: ObjectName) -> memoryview:
+def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
     """Return the frame of an object, verified.
 
     Raises
@@ -65,12 +62,10 @@ def _get(store: Store, name: ObjectName) -> memoryview:
     MapDataError, MapMissing, Offline
         It is damaged, gone, or out of reach.
     """
-    for _ in range(_TRIES):
-        frame = store.get_exactly(name.path, name.size)
-        if sha256(frame).digest() == name.sha256:
-            return frame
-    path = f"{store.url}/{name.path}"
-    raise MapDataError("its SHA-256 is not its name", path=path, cause=DAMAGED)
+    try:
+        return objects.read(name.sha256, name.size)
+    except MapDataError:  # it may have been damaged on its way
+        return objects.read(name.sha256, name.size)
 
 
 class ObjectFetcher:
@@ -80,8 +75,8 @@ class ObjectFetcher:
     been begun: who waits for many would wait for one after the other.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, objects: KeptObjects) -> None:
+        self._objects = objects
         self._lock = threading.Lock()
         threading.stack_size(_STACK_BYTES)
         self._threads = ThreadPoolExecutor(AT_ONCE, "fetch")  # the loader's end waits for none of them
@@ -133,13 +128,13 @@ class ObjectFetcher:
             frame = fetch.frame if fetch is not None else None
         if isinstance(frame, ShmmapError):
             raise frame
-        return frame if frame is not None else _get(self._store, name)
+        return frame if frame is not None else _get(self._objects, name)
 
     def _fetch(self, fetch: _Fetch) -> None:
         """Fetch an object, in a thread."""
         frame: memoryview | ShmmapError
         try:
-            frame = _get(self._store, fetch.name)
+            frame = _get(self._objects, fetch.name)
         except ShmmapError as error:
             frame = error
         except Exception as error:  # noqa: BLE001  else the job would wait for ever
@@ -206,9 +201,10 @@ def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
 class PublishedReader:
     """Reads sources that are objects of a published map; see `shmmap.layers.source_reader.SourceReader`."""
 
-    def __init__(self, served: ServedFrom) -> None:
-        self._store = open_for_serving(served)
-        self.fetcher = ObjectFetcher(self._store)
+    def __init__(self, served: ServedFrom, cache_dir: str, cache_bytes: int) -> None:
+        store = open_for_serving(served)
+        self._url = store.url
+        self.fetcher = ObjectFetcher(kept_objects(store, cache_dir, cache_bytes, quiet=True))
 
     def stamp(self, source: Source) -> Stamp:
         """Return the state that its objects are of: they never change."""
@@ -286,4 +282,4 @@ class PublishedReader:
         return unpack_frame(self.fetcher.get(name), name.raw, name=self._path(name), exact=True)
 
     def _path(self, name: ObjectName) -> str:
-        return f"{self._store.url}/{name.path}"
+        return f"{self._url}/{name.path}"

@@ -286,7 +286,8 @@ def work(channel: socket.socket, settings: WorkerSettings) -> int:
         from shmmap.daemon.loading.published_reader import PublishedReader
         from shmmap.origin.remote.serving_store import ServedFrom
 
-        reader = PublishedReader(ServedFrom.from_words(*settings.origin))
+        served = ServedFrom.from_words(*settings.origin)
+        reader = PublishedReader(served, settings.cache_dir, settings.cache_bytes)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
         _Worker(channel, ShmDirectory(settings.shm_dir), cache, reader).run()
     return 0

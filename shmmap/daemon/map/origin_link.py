@@ -54,7 +54,7 @@ class OriginLink:
         self._condition = threading.Condition()
         self._is_out = False
         self._changed = self._back = False
-        self._closed = False
+        self._closed = self._now = False
         self._thread: threading.Thread | None = None
         if poll_s:
             self._start()
@@ -74,6 +74,13 @@ class OriginLink:
             if not self._closed:
                 self._start()
                 self._condition.notify()
+
+    def ask_now(self) -> None:
+        """Ask without waiting for the next time."""
+        with self._condition:
+            self._now = True
+            self._start()
+            self._condition.notify()
 
     def take(self) -> LinkNews:
         """Return what was found since the last time."""
@@ -99,11 +106,12 @@ class OriginLink:
                 while not self._closed:
                     due_s = asked_s + (PROBE_S if self._is_out else wait_s or math.inf)
                     now_s = time.monotonic()
-                    if now_s >= due_s:
+                    if now_s >= due_s or self._now:
                         break
                     self._condition.wait(min(due_s - now_s, threading.TIMEOUT_MAX))
                 if self._closed:
                     return
+                self._now = False
             asked_s = time.monotonic()
             self._look()
 

@@ -14,7 +14,7 @@ from shmmap.errors import Offline, ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.remote.map_versions import read_shard_object
 from shmmap.origin.remote.published_index import Root, Shard, unpack_shard
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.store import ObjectReader
 
 __all__ = ["ShardFetcher", "ShardSink"]
 
@@ -39,8 +39,8 @@ class ShardFetcher:
         Called, in a thread, when something could not be had.
     """
 
-    def __init__(self, store: Store, failed: Callable[[], None]) -> None:
-        self._store = store
+    def __init__(self, objects: ObjectReader, failed: Callable[[], None]) -> None:
+        self._objects = objects
         self._failed = failed
         self._condition = threading.Condition()
         self._wanted: list[tuple[float, int, weakref.ref[ShardSink], Root, int]] = []
@@ -99,7 +99,7 @@ class ShardFetcher:
     def _fetch(self, root: Root, number: int) -> Shard | None:
         name = f"shard {root.keys[number].tolist()}"
         try:
-            return unpack_shard(read_shard_object(self._store, root, number), root, number)
+            return unpack_shard(read_shard_object(self._objects, root, number), root, number)
         except Offline:
             pass  # `OriginLink` says so, once
         except ShmmapError as error:

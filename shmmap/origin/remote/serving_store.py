@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The store that a daemon and its loaders serve a published map from; the one place where they open it."""
+"""Where a daemon and its loaders have a published map from: the store, and what of it is on the disk."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.store import HASTY, Patience, Store
 
-__all__ = ["ServedFrom", "open_for_serving"]
+__all__ = ["ServedFrom", "kept_objects", "open_for_serving"]
 
 
 class ServedFrom(NamedTuple):
@@ -29,13 +30,26 @@ class ServedFrom(NamedTuple):
 
 
 def open_for_serving(served: ServedFrom, patience: Patience = HASTY) -> Store:
-    """Return the store: somebody waits for what it gives.
-
-    What is immutable is read by `Store.get_exactly` alone.  Errors are those of `open_store`.
-    """
+    """Return the store: somebody waits for what it gives.  Errors are those of `open_store`."""
     return open_store(
         served.url,
         patience=patience,
         insecure_http=served.insecure_http,
         instance_credentials=served.instance_credentials,
     )
+
+
+def kept_objects(
+    store: Store, cache_dir: str, cache_bytes: int, *, is_index: bool = False, quiet: bool = False
+) -> KeptObjects:
+    """Return what reads objects: from the disk where they are there, else from the store.
+
+    Parameters
+    ----------
+    cache_dir, cache_bytes
+        Where objects are kept, and how much of them, computed layers included; 0: none.
+    is_index, quiet
+        As `KeptObjects` and `ObjectTier` have them.
+    """
+    tier = ObjectTier(cache_dir, limit_bytes=cache_bytes, quiet=quiet) if cache_dir and cache_bytes else None
+    return KeptObjects(store, tier, is_index=is_index)
