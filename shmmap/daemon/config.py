@@ -42,7 +42,7 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
-    "catalogue_budget_bytes": (lambda value: 1 << 20 <= value <= LARGEST_BYTES, "at least 1M"),
+    "catalogue_budget_bytes": (lambda value: 1 << 16 <= value <= LARGEST_BYTES, "at least 64K"),
     "poll_s": (lambda value: value == 0 or 1 <= value <= 86400, "seconds, 1 to 86400; 0: never"),
     "accept_version": (lambda value: 0 <= value < 1 << 63, "the number that `shmmap versions URL` shows"),
     "log_level": (lambda value: value in ("debug", "info", "warning"), "debug, info or warning"),
