@@ -26,8 +26,8 @@ FEW_SHARDS: Final = 16
 """So many shards are all fetched at the start, and kept."""
 NAME_BYTES: Final = 150
 """What a cell's name takes in memory, and its entry in the table of names."""
-TAKEN_AT_ONCE: Final = 4
-"""Pages taken into the tables in one turn of the loop, a third of a millisecond each."""
+NAME_TABLES: Final = 64
+"""Names are shared out among many dicts: one of all would stop the loop whenever it grows."""
 BACKGROUND_AT_ONCE: Final = 8
 BACKGROUND: Final = 1e15
 """Priority of pages that nothing needs yet: behind all that something does."""
@@ -38,19 +38,47 @@ NAMED: Final = 3
 class Page:
     """A shard that is here; ``first`` is the index of its first cell, ``versions`` are 0 if not computed."""
 
+    number: int
     shard: Shard
     first: int
     versions: NDArray[np.uint64]
     nbytes: int
+    has_folders: bool
 
     @classmethod
-    def of(cls, shard: Shard, first: int) -> Page:
+    def of(cls, number: int, shard: Shard, first: int) -> Page:
         """Return the page of a shard."""
         arrays: list[NDArray[Any]] = [shard.boxes, shard.z, shard.points]
         for layer in shard.layers.values():
             arrays += [layer.sizes, layer.raws, layer.hashes, layer.contents]
         nbytes = sum(int(array.nbytes) for array in arrays) + (8 + NAME_BYTES) * len(shard)
-        return cls(shard, first, np.zeros(len(shard), np.uint64), nbytes)
+        has_folders = any(b"/" in name for name in shard.names)
+        return cls(number, shard, first, np.zeros(len(shard), np.uint64), nbytes, has_folders)
+
+
+class _News:
+    """A descriptor that is open as long as this is.
+
+    It is no part of the pages: these may still be found by a weak reference while they are being deleted.
+    """
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def __del__(self) -> None:
+        os.close(self.fd)
+
+    def tell(self) -> None:
+        """Make it readable."""
+        os.eventfd_write(self.fd, 1)
+
+
+def _shared_out(page: Page) -> list[dict[bytes, int]]:
+    """Indices of a page's cells by name, for each table of names."""
+    tables: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
+    for index, name in enumerate(page.shard.names, page.first):
+        tables[hash(name) % NAME_TABLES][name] = index
+    return tables
 
 
 class ShardPages:
@@ -77,9 +105,10 @@ class ShardPages:
         self._here: dict[int, Page] = {}  # least recently needed first
         self._wanted: dict[int, float] = {}
         self._lost: set[int] = set()
-        self._by_name: ShardedDict[bytes, int] = ShardedDict()
+        self._by_name: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
         self._by_base: ShardedDict[bytes, tuple[int, ...]] = ShardedDict()
-        self._arrived: deque[tuple[int, Shard | None]] = deque()
+        self._arrived: deque[tuple[int, Page | None, list[dict[bytes, int]]]] = deque()
+        self._nearest: Iterator[int] | None = None
         self.known_cells = 0
         low = root.keys[:, ::-1] * root.shard_m
         self._boxes = np.hstack([low, low + root.shard_m + np.array(root.largest_m)])
@@ -87,13 +116,16 @@ class ShardPages:
             0.5 * (root.bounds[0] + root.bounds[2]),
             0.5 * (root.bounds[1] + root.bounds[3]),
         )
-        # readable at once: pages that nothing needs are asked for in the first `collect`
-        self.fd = os.eventfd(1, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._news = _News()
+        self._news.tell()  # pages that nothing needs are asked for in the first `collect`
         for number, shard in known.items():
-            self._take(number, shard)
+            page = self._page(number, shard)
+            self._take(page, _shared_out(page))
 
-    def __del__(self) -> None:
-        os.close(self.fd)
+    @property
+    def fd(self) -> int:
+        """Readable when there are news."""
+        return self._news.fd
 
     def __len__(self) -> int:
         return len(self.root.keys)
@@ -157,7 +189,7 @@ class ShardPages:
 
     def find(self, name: bytes) -> int | None:
         """Index of a known cell by what follows the map's prefix in its id."""
-        return self._by_name.get(name)
+        return self._by_name[hash(name) % NAME_TABLES].get(name)
 
     def find_base(self, base: bytes) -> int | None:
         """Index of a known cell by its base name.
@@ -194,33 +226,34 @@ class ShardPages:
                 self._fetcher.want(self, self.root, number, priority)
         if absent:
             x, y = self._boxes[absent, :2].mean(axis=0).tolist()
-            self._around = x, y
+            self._around, self._nearest = (x, y), None
 
     def deliver(self, number: int, shard: Shard | None) -> None:
         """Take a shard; None: it cannot be had at present.  Called in a thread."""
-        self._arrived.append((number, shard))
-        os.eventfd_write(self.fd, 1)
+        page = self._page(number, shard) if shard is not None else None
+        self._arrived.append((number, page, _shared_out(page) if page is not None else []))
+        self._news.tell()
 
     def collect(self) -> PageNews:
-        """Take in what has come since the last time, a bounded part of it."""
+        """Take in what has come since the last time: one page, a tenth of a millisecond, and go on later."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         come: list[int] = []
         lost: list[int] = []
-        while self._arrived and len(come) < TAKEN_AT_ONCE:
-            number, shard = self._arrived.popleft()
+        while self._arrived and not come:
+            number, page, names = self._arrived.popleft()
             self._wanted.pop(number, None)
             if number in self._here:
                 continue
-            if shard is None:
+            if page is None:
                 self._lost.add(number)
                 lost.append(number)
             else:
                 self._lost.discard(number)
-                self._take(number, shard)
+                self._take(page, names)
                 come.append(number)
         if self._arrived:
-            os.eventfd_write(self.fd, 1)
+            self._news.tell()
         self._fill()
         return PageNews(come, lost)
 
@@ -253,47 +286,51 @@ class ShardPages:
         dropped = self._here.pop(page)
         self._bytes -= dropped.nbytes
         self.known_cells -= len(dropped.shard)
-        for row, name in enumerate(dropped.shard.names):
-            del self._by_name[name]
-            base = name.rpartition(b"/")[2]
-            if base != name:
-                left = tuple(one for one in self._by_base[base] if one != dropped.first + row)
+        for index, name in enumerate(dropped.shard.names, dropped.first):
+            del self._by_name[hash(name) % NAME_TABLES][name]
+            if dropped.has_folders and b"/" in name:
+                base = name.rpartition(b"/")[2]
+                left = tuple(one for one in self._by_base[base] if one != index)
                 if left:
                     self._by_base[base] = left
                 else:
                     del self._by_base[base]
 
-    def _take(self, number: int, shard: Shard) -> None:
-        page = Page.of(shard, int(self._first[number]))
-        self._here[number] = page
+    def _page(self, number: int, shard: Shard) -> Page:
+        return Page.of(number, shard, int(self._first[number]))
+
+    def _take(self, page: Page, names: list[dict[bytes, int]]) -> None:
+        self._here[page.number] = page
         self._bytes += page.nbytes
-        self.known_cells += len(shard)
-        for index, name in enumerate(shard.names, page.first):
-            self._by_name[name] = index
-            if b"/" in name:
-                base = name.rpartition(b"/")[2]
-                self._by_base[base] = (*self._by_base.get(base, ()), index)
+        self.known_cells += len(page.shard)
+        for table, some in zip(self._by_name, names, strict=True):
+            table.update(some)
+        if page.has_folders:
+            for index, name in enumerate(page.shard.names, page.first):
+                if b"/" in name:
+                    base = name.rpartition(b"/")[2]
+                    self._by_base[base] = (*self._by_base.get(base, ()), index)
 
     def _fill(self) -> None:
         """Have some more pages fetched that nothing needs yet, the nearest first, while there is room."""
         under_way = len(self._wanted)
         if self._lost or under_way > BACKGROUND_AT_ONCE // 2 or self.complete:
             return
-        for number in self._nearest_absent(BACKGROUND_AT_ONCE - under_way):
-            self._wanted[number] = BACKGROUND
-            self._fetcher.want(self, self.root, number, BACKGROUND)
-
-    def _nearest_absent(self, count: int) -> Iterator[int]:
-        cell_bytes = self._bytes / self.known_cells if self.known_cells else 2.0 * NAME_BYTES
         counts = self.root.counts
+        cell_bytes = self._bytes / self.known_cells if self.known_cells else 2.0 * NAME_BYTES
         room = self._most_bytes - self._bytes if len(self) > FEW_SHARDS else np.inf
         room -= cell_bytes * sum(int(counts[number]) for number in self._wanted)
-        order = np.argsort(distance_to_boxes(*self._around, self._boxes), kind="stable")
-        for number in order.tolist():
+        if self._nearest is None:
+            order = np.argsort(distance_to_boxes(*self._around, self._boxes), kind="stable")
+            self._nearest = iter(order.tolist())
+        for number in self._nearest:
             if number in self._here or number in self._wanted:
                 continue
             room -= cell_bytes * int(counts[number])
-            if room < 0 or not count:
+            if room < 0:
+                self._nearest = iter((number,))  # there is no room, until an area needs other pages
                 return
-            count -= 1
-            yield number
+            self._wanted[number] = BACKGROUND
+            self._fetcher.want(self, self.root, number, BACKGROUND)
+            if len(self._wanted) >= BACKGROUND_AT_ONCE:
+                return
