@@ -328,7 +328,7 @@ def test_what_is_out_of_reach_is_tried_when_that_is_asked_for(served: Served) ->
     root = publish(served.store, some_cells(np.random.default_rng(7), 30, width=100.0))
     served.store.is_out = True
     view = served.view(root)
-    view.pages.want([0], 0.0)
+    view.pages.want(range(len(view.pages)), 0.0)
     lost: list[int] = []
     while len(lost) < len(view.pages):
         lost += collect(view.pages)[1]
