@@ -46,10 +46,11 @@ def test_settings_are_settings(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("layer_kernels")
 def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path) -> None:
     pytest.importorskip("zstandard", reason="zstandard is not installed")
-    made = make_map(tmp_path / "town", columns=2, rows=2, points=300)
-    publish(made.root, buckets.url("town"))
+    made = make_map(tmp_path / "town", columns=2, rows=2, points=4000)
+    publish(made.root, buckets.url("vehicle/town"))
     (serve,) = PAGE.commands("serve")
     assert serve == f"shmmap serve {buckets.url('town')}"
+    serve = serve.replace("maps/", "maps/vehicle/")  # the bucket has what other tests have published
     exports = [line.removeprefix("export ").split("=", 1) for line in PAGE.commands("credentials")]
     environment = {**dict(exports), "AWS_ENDPOINT_URL": buckets.endpoint}
     one = daemon(serve.split()[2], environment=environment)

@@ -92,8 +92,8 @@ def url(request: pytest.FixtureRequest, _published: Path) -> tuple[str, dict[str
     """Where the town is published, and the environment that it needs."""
     if request.param == "bucket":
         buckets: BucketServer = request.getfixturevalue("buckets")
-        publish(_published / "town", buckets.url("town"), "--layer", NDT, "--id-prefix", "/town/")
-        return buckets.url("town"), buckets.environment
+        publish(_published / "town", buckets.url("served/town"), "--layer", NDT, "--id-prefix", "/town/")
+        return buckets.url("served/town"), buckets.environment
     if request.param == "web":
         return request.getfixturevalue("web").url, {}
     return ("" if request.param == "directory" else "file://") + str(_published / "www"), {}
