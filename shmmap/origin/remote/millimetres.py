@@ -60,20 +60,22 @@ def to_millimetres(xyz: NDArray[Any]) -> MillimetrePoints | None:
     """
     if xyz.dtype != np.float32 or xyz.ndim != 2 or xyz.shape[1] != 3 or not len(xyz):
         return None
-    points = xyz.astype(np.float64)
-    low, high = points.min(axis=0), points.max(axis=0)
+    axes = np.ascontiguousarray(xyz.T).astype(np.float64)
+    low, high = axes.min(axis=1), axes.max(axis=1)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return None
     origin = np.floor(low * 1000.0) / 1000.0
-    points -= origin
-    points *= 1000.0
-    if np.rint(points.max(axis=0)).max() > MAX_COUNT:
+    axes -= origin[:, None]
+    axes *= 1000.0
+    np.rint(axes, out=axes)
+    if axes.max() > MAX_COUNT:
         return None
-    counts = np.maximum(np.rint(points, out=points), 0.0).astype(np.uint16)
-    spread = _spread()
-    key = spread[counts[:, 0]] | spread[counts[:, 1]] << np.uint64(1) | spread[counts[:, 2]] << np.uint64(2)
+    numbers = np.maximum(axes, 0.0, out=axes).astype(np.uint16)
+    key = np.zeros(len(xyz), np.uint64)
+    for axis, spread in zip(numbers, _spread(), strict=True):
+        key |= spread[axis]
     order = np.argsort(key, kind="stable")
-    return MillimetrePoints(origin, counts[order], order)
+    return MillimetrePoints(origin, np.ascontiguousarray(numbers[:, order].T), order)
 
 
 def from_millimetres(counts: NDArray[np.uint16], origin: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -85,9 +87,9 @@ def from_millimetres(counts: NDArray[np.uint16], origin: NDArray[np.float64]) ->
 
 
 @cache
-def _spread() -> NDArray[np.uint64]:
-    """Each number of 16 bits, with two zero bits between one bit and the next."""
+def _spread() -> tuple[NDArray[np.uint64], ...]:
+    """For each axis, the bits of each number of 16 bits where the key has them: every third bit."""
     spread = np.arange(MAX_COUNT + 1, dtype=np.uint64)
     for shift, mask in ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249)):
         spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    return spread
+    return tuple(spread << np.uint64(axis) for axis in range(3))
