@@ -64,7 +64,6 @@ _FLAGS: Final = struct.Struct("<I")
 _MM_ORIGIN: Final = struct.Struct("<3d")
 _COUNTS: Final = np.dtype("<u2")
 _XYZ: Final = np.dtype("<f4")
-_STAMP: Final = struct.Struct("<Qqq")
 _BLOCK_ROWS: Final = 1 << 14  # at a time: what is read and written stays in the cache
 
 
@@ -308,7 +307,7 @@ def write_segment(
         cell_id=identity.cell_id,
         frame_id=identity.frame_id,
         box=identity.box,
-        source=SourceStamp(*_STAMP.unpack(identity.stamp)),
+        source=SourceStamp.from_token(identity.stamp),
         source_digest=identity.stamp[:16],
     )
     mm_origin = _mm_origin(unpacked)
