@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.process.test_publish import Shmmap
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.open3d_package import open3d_or_skip
 from tests.support.published_map_reader import PublishedMapReader
+from tests.support.publishing_verbs import Shmmap
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 LAYERS = ("ndt(leaf=2.0,min_points=3)", "voxel(leaf=0.5)", "elevation(resolution=1.0)")
 
