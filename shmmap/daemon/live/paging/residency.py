@@ -34,13 +34,11 @@ __all__ = ["REVIEW_S", "Residency"]
 RETRY_S: Final = 1.0
 """How long after a file could not be read or written, or a scan needed the room, it is tried again."""
 REVIEW_S: Final = 0.1
-"""How often, at most, chunks are gone over for what may be given up."""
-REVIEWED_AT_ONCE: Final = 4096
-"""How many of them at a time, in turn: they take 4 ms."""
+"""How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
 IN_VAIN_S: Final = 1.0
-"""The same, where nothing was found among all the last time and no client has moved."""
+"""The same, where nothing was found the last time and no client has moved."""
 REVIEWED_OF_NEWS: Final = 32
-"""They are also reviewed when one chunk in this many came or changed since."""
+"""All are also reviewed when one chunk in this many came or changed since."""
 SAVED_AHEAD_OF: Final = 32
 """How many of the chunks changed longest ago are looked at for one that nothing wants."""
 FOUND_AT_ONCE: Final = 64, 16
@@ -132,7 +130,6 @@ class Residency:
         self._in_vain_s = dict.fromkeys(self._found, -math.inf)  # nor before that, unless a client moves
         self._reviewed = dict.fromkeys(self._found, _Short.NO)
         self._news = dict.fromkeys(self._found, 0)
-        self._next_reviewed = dict.fromkeys(self._found, 0)
         self._save_s = self._near_s = -math.inf  # not before: a file could not be written, or loaded
         self.durability = Durability()
 
@@ -373,7 +370,7 @@ class Residency:
             self._news[state] += 1
 
     def _is_review_due(self, now_s: float, state: State, short: _Short) -> bool:
-        """Whether chunks are gone over again: seldom, or for a scan when much has happened."""
+        """Whether all chunks are gone over again: seldom, or for a scan when much has happened."""
         if now_s >= max(self._review_s[state], self._in_vain_s[state]) or short > self._reviewed[state]:
             return True
         idle = not self.loading and not self.saving
@@ -381,19 +378,12 @@ class Residency:
         return much and short is _Short.SCANS and not self._found[state]
 
     def _review(self, now_s: float, state: State, short: _Short) -> None:
-        """Find what may be given up in the next part of the chunks: the unwanted first, then the furthest."""
+        """Find what may be given up: what is not wanted first, then the furthest."""
         self._news[state], self._reviewed[state] = 0, short
         every = self._dirty if state is State.DIRTY else self.chunks
-        found: list[Chunk] = []
-        for _ in range(0, len(every), REVIEWED_AT_ONCE):
-            begin = self._next_reviewed[state] if self._next_reviewed[state] < len(every) else 0
-            self._next_reviewed[state] = end = begin + REVIEWED_AT_ONCE
-            some = islice(every.values(), begin, end)
-            found += [one for one in some if one.state is state and self._may_go(one, now_s, short)]
-            if found or short is not _Short.SCANS:  # a scan does not wait for the next part's turn
-                break
+        found = [one for one in every.values() if one.state is state and self._may_go(one, now_s, short)]
         self._review_s[state] = now_s + REVIEW_S
-        self._in_vain_s[state] = -math.inf if found or len(every) > REVIEWED_AT_ONCE else now_s + IN_VAIN_S
+        self._in_vain_s[state] = -math.inf if found else now_s + IN_VAIN_S
         order = np.lexsort(
             (
                 np.array([-one.active for one in found]),

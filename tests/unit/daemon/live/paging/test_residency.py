@@ -11,7 +11,7 @@ import pytest
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.paging.durability import TOGETHER_S
 from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.paging.residency import RETRY_S, REVIEW_S, REVIEWED_AT_ONCE, Residency
+from shmmap.daemon.live.paging.residency import RETRY_S, REVIEW_S, Residency
 from shmmap.daemon.live.paging.windows import Windows
 
 HERE = ChunkKey(0, 0, 0)
@@ -540,41 +540,6 @@ def test_giving_up_is_not_a_search_each_time(monkeypatch: pytest.MonkeyPatch) ->
             gone += 1
     assert gone == 2000
     assert looked <= 20 * 2000
-
-
-@pytest.mark.parametrize("for_a_scan", [True, False])
-def test_of_many_chunks_a_part_is_reviewed_at_a_time(
-    monkeypatch: pytest.MonkeyPatch, *, for_a_scan: bool
-) -> None:
-    """One may go, the last of many: for a scan it is found at once, else when the turn comes to its part."""
-    parts = 5
-    many = parts * REVIEWED_AT_ONCE
-    one = Residency(Limits(10 * many, radius=0, loads=10**6), new_bytes=10)
-    for number in range(many):
-        chunk = one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)
-        chunk.changed_s = 1e9  # wanted
-    chunk.changed_s = -math.inf
-    looked: list[Chunk] = []
-    may_go = Residency._may_go
-
-    def counted(self: Residency, chunk: Chunk, *arguments: Any) -> bool:
-        looked.append(chunk)
-        return may_go(self, chunk, *arguments)
-
-    monkeypatch.setattr(Residency, "_may_go", counted)
-    if for_a_scan:
-        for other in one.chunks.values():
-            other.state = State.DIRTY
-        chunk.state = State.CLEAN
-        ask_for_room(one)
-        assert one.next_eviction(1.0) is chunk
-    else:
-        one.move("a", (0.5, 9.5, 0.5))
-        for turn in range(1, parts):
-            looked.clear()
-            assert one.next_eviction(turn * REVIEW_S * 1.01) is None
-            assert len(looked) == REVIEWED_AT_ONCE
-        assert one.next_eviction(parts * REVIEW_S * 1.01) is chunk
 
 
 @pytest.mark.parametrize("clients", [1, 20])
