@@ -123,6 +123,23 @@ def test_every_column_is_that_of_the_files(
         assert {cell.id for cell in client.area(ALL)} == {f"/town/{name}" for name in town.corners}
 
 
+def test_points_in_millimetres_are_those_that_fetch_writes(
+    daemon: DaemonFactory, town: DividedMap, tmp_path: Path
+) -> None:
+    publish(town.root, tmp_path / "mm", "--encoding", "mm", "--id-prefix", "/town/")
+    fetch = [sys.executable, "-m", "shmmap.cli", "fetch", str(tmp_path / "mm"), str(tmp_path / "back")]
+    subprocess.run(fetch, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True)
+    found = []
+    for path in (tmp_path / "back", tmp_path / "mm"):
+        with shmmap.connect(daemon(path).endpoint) as client:
+            cells = client.area(ALL, layers=("points", COMPUTED[0]), wait=120.0)
+            assert cells.complete, cells.failed
+            found.append(columns_of(cells))
+            for cell in cells:
+                cell.verify()
+    assert found[0] == found[1]
+
+
 def test_a_client_in_cpp_maps_the_same_bytes(
     daemon: DaemonFactory, town: DividedMap, web: FaultyWeb, cpp_program: Path
 ) -> None:
