@@ -208,14 +208,19 @@ def test_one_loader_fetches_many_objects_at_once(daemon: DaemonFactory, web: Fau
 # --- out of reach -------------------------------------------------------------------------------------
 
 
-def health(one: DaemonProcess) -> tuple[int, str]:
-    """Exit code of ``shmmap health --strict``, and what it says."""
+def verb(one: DaemonProcess, *words: str) -> tuple[int, str]:
+    """Exit code of a verb that reads a daemon's statistics, and what it prints."""
     done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", "health", "--strict", "--instance", one.instance,
+        [sys.executable, "-m", "shmmap.cli", *words, "--instance", one.instance,
          "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir],
         env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
     )  # fmt: skip
     return done.returncode, done.stdout
+
+
+def health(one: DaemonProcess) -> tuple[int, str]:
+    """Exit code of ``shmmap health --strict``, and what it says."""
+    return verb(one, "health", "--strict")
 
 
 def offline_codes(cells: Any) -> set[str]:
@@ -244,6 +249,12 @@ def test_an_origin_out_of_reach_costs_only_what_is_not_here(
         while waiting((said := health(one))[0] != 1):
             time.sleep(0.05)
         assert "out of reach" in said[1]
+        assert "out of reach for" in verb(one, "status")[1]
+        logged = one.log.count("load failed")
+        until = Patience()
+        while until(offline_codes(client.area(ALL, wait=30.0)) != {"offline"}):
+            pass
+        assert one.log.count("load failed") == logged, "it is said once"
         if how == "refuse":
             web.listen()
         web.heal()
@@ -527,6 +538,22 @@ def test_a_start_without_a_link_serves_what_was_taken(
     with shmmap.connect(one.endpoint) as client:
         while waiting({(c.id, c.layer, c.version) for c in client.area(ALL, layers=PUBLISHED)} == versions):
             time.sleep(0.05)
+
+
+def test_a_start_with_nothing_on_the_disk_and_without_a_link(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    until_remembered(one)
+    one.stop()
+    shutil.rmtree(one.cache_dir)
+    web.refuse()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        nothing = client.area(ALL, wait=30.0)
+        assert (len(nothing), nothing.covered) == (0, False)
+        web.listen()
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=5.0).complete):
+            time.sleep(0.02)
 
 
 def test_an_older_offer_is_no_reason_not_to_start(
