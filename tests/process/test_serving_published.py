@@ -641,6 +641,25 @@ def test_a_daemon_of_files_loads_nothing_of_this(daemon: DaemonFactory, town: Di
         assert not re.search("obstore|zstandard", loaded(pid))
 
 
+def test_no_other_address_is_asked(
+    buckets: BucketServer, daemon: DaemonFactory, town: DividedMap, tmp_path: Path
+) -> None:
+    """Nor the cloud's metadata address where there are no credentials: the store is asked without any."""
+    publish(town.root, buckets.url("private"))
+    shim, seen = tmp_path / "connects.so", tmp_path / "connects"
+    source = ROOT / "tests/support/connects.c"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(shim), str(source), "-ldl"], check=True)
+    watched = {"HOME": str(tmp_path), "LD_PRELOAD": str(shim), "CONNECTS_SEEN": str(seen)}
+    keyless = {**dict.fromkeys(buckets.environment, ""), "AWS_ENDPOINT_URL": buckets.endpoint, **watched}
+    assert daemon(buckets.url("private"), environment=keyless, start=False).run_to_end() == 75
+    assert set(seen.read_text().split()) == {"127.0.0.1"}
+    one = daemon(buckets.url("private"), "--poll", "1", environment={**buckets.environment, **watched})
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, wait=60.0).complete
+        client.reload()
+    assert set(seen.read_text().split()) == {"127.0.0.1"}
+
+
 def test_secrets_are_shown_nowhere(buckets: BucketServer, daemon: DaemonFactory, town: DividedMap) -> None:
     publish(town.root, buckets.url("quiet"))
     one = daemon(buckets.url("quiet"), environment=buckets.environment)
