@@ -49,7 +49,6 @@ PLANES: Final = 1
 MILLIMETRES: Final = 2  # reserved: not written yet, and refused
 MAX_PLANED_COMPONENTS: Final = 8
 _FLAGS: Final = struct.Struct("<I")
-_STAMP: Final = struct.Struct("<Qqq")
 _BLOCK_ROWS: Final = 1 << 14  # at a time: what is read and written stays in the cache
 
 
@@ -228,7 +227,7 @@ def write_segment(
         cell_id=identity.cell_id,
         frame_id=identity.frame_id,
         box=identity.box,
-        source=SourceStamp(*_STAMP.unpack(identity.stamp)),
+        source=SourceStamp.from_token(identity.stamp),
         source_digest=identity.stamp[:16],
     )
     page = pack_header(header)
