@@ -69,6 +69,13 @@ ORIGIN_STEPS: Final = (
     "fetch.cell",
     "fetch.whole",
     "fetch.renamed",
+    "tier.made",
+    "tier.written",
+    "tier.named",
+    "trim.file",
+    "taken.head",
+    "taken.written",
+    "taken.named",
 )
 CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.map")
 

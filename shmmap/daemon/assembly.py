@@ -13,7 +13,7 @@ import socket
 import time
 from collections import deque
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
@@ -57,12 +57,30 @@ from shmmap.logfmt import log
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
 
-__all__ = ["Service"]
+if TYPE_CHECKING:
+    from shmmap.daemon.map.catalogue_view import CatalogueView
+    from shmmap.daemon.map.origin_link import OriginLink
+
+__all__ = ["Elsewhere", "Service"]
 
 LOOK_S: Final = 1.0
 """How often it is looked whether sockets have their files."""
 LAST_WORDS_S: Final = 0.2
 """How long the end may take to deliver what was sent last."""
+
+
+class Elsewhere(Protocol):
+    """An origin that is not on this machine."""
+
+    @property
+    def link(self) -> OriginLink:
+        """Says whether it is in reach, and has another version."""
+
+    def note_served(self, view: CatalogueView) -> None:
+        """Remember which version of the map is served now."""
+
+    def try_again(self) -> None:
+        """Have fetched again what of the list of cells could not be had."""
 
 
 class Service:
@@ -86,6 +104,7 @@ class Service:
         signals: StartSignals,
         activated: ActivatedSocket | None,
         lock: InstanceLock | None = None,
+        elsewhere: Elsewhere | None = None,
     ) -> None:
         self._config = config
         self._memory = memory
@@ -97,6 +116,7 @@ class Service:
         self._signals = signals
         self._activated = activated
         self._lock = lock
+        self._elsewhere = elsewhere
         self._file_watch: FileWatch | None = None
         authorization = Authorization(config.admin_group)
         take_slices(SERVING_SLICE_NS)
@@ -128,6 +148,14 @@ class Service:
         paging.follow()
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, change.collect, "map")
+        origin_watch: Chore | None = None
+        if elsewhere is not None:
+            from shmmap.daemon.loading.origin_watch import OriginWatch
+
+            origin_watch = one = OriginWatch(
+                elsewhere.link, scheduler, elsewhere.try_again, self._take_another
+            )
+            watched.watch(elsewhere.link.fd, one.collect, "map")
         defects = Defects(statistics)
         dispatch = Dispatch(
             handshake,
@@ -145,6 +173,8 @@ class Service:
         chores += [("usage", cache.survey), ("map", memory.map_switch), ("map", paging)]
         chores += [("memory", scheduler.prefetcher)]
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
+        if origin_watch is not None:
+            chores.append(("map", origin_watch))
         self._handshake = handshake
         self._loop = ServingLoop(
             watched,
@@ -265,6 +295,8 @@ class Service:
         self._look_after_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
+        if self._elsewhere is not None:
+            self._elsewhere.note_served(memory.cache.catalogue)
         version = memory.cache.catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
@@ -289,6 +321,10 @@ class Service:
 
     def _directories(self, id_prefix: str) -> set[str]:
         return directories_of(self._config.map_path, self._config.metadata, id_prefix)
+
+    def _take_another(self) -> None:
+        """Take another version of the map: it is there."""
+        self._reloader.ask(lambda _result: None)
 
     def _reload(self) -> None:
         """Read the map again because of a signal or a change; the service manager waits for the end."""

@@ -42,6 +42,9 @@ _RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
     "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
     "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
+    "catalogue_budget_bytes": (lambda value: 1 << 16 <= value <= LARGEST_BYTES, "at least 64K"),
+    "poll_s": (lambda value: value == 0 or 1 <= value <= 86400, "seconds, 1 to 86400; 0: never"),
+    "accept_version": (lambda value: 0 <= value < 1 << 63, "the number that `shmmap versions URL` shows"),
     "log_level": (lambda value: value in ("debug", "info", "warning"), "debug, info or warning"),
     "unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
     "vertical_unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
@@ -57,6 +60,7 @@ COMMAND_LINE: Final = "command line"
 _NOT_SETTINGS: Final = "SHMMAP_TEST_"
 FILE_NAMES: Final = {
     "budget_bytes": "budget", "cache_bytes": "cache_size", "live_budget_bytes": "live_budget",
+    "catalogue_budget_bytes": "catalogue_budget",
 }  # fmt: skip
 """What files, variables and options call a setting, where that is not the attribute's name."""
 
@@ -68,7 +72,7 @@ class DaemonConfig:
     Attributes
     ----------
     map_path
-        Directory of a divided map, or one PCD file.
+        Directory of a divided map, one PCD file, or the URL or directory of a published map.
     metadata
         Metadata YAML, where it lies neither beside nor in the map; empty: look there.
     instance
@@ -104,6 +108,17 @@ class DaemonConfig:
         cache directory.
     cache_bytes
         Most disk space of computed and prepared layers; 0: none are kept.
+    poll_s
+        How often it is asked whether a published map has another version; 0: only when a reload is asked for.
+    catalogue_budget_bytes
+        What the list of cells of a large published map may take of memory; beyond, what was needed least
+        recently is fetched again when it is needed.
+    accept_version
+        A version of a published map that is taken although a later one was taken before; 0: none.
+    insecure_http
+        Take a published map from plain ``http://`` beyond this machine.
+    instance_credentials
+        Ask the cloud's metadata address for credentials if none are given.
     eviction
         ``time``: what will be needed last goes first; ``distance`` or ``lru``.
     ride_out_s
@@ -142,6 +157,11 @@ class DaemonConfig:
     watch: bool = False
     cache_dir: str = ""
     cache_bytes: int = 8 << 30
+    poll_s: float = 60.0
+    catalogue_budget_bytes: int = 256 << 20
+    accept_version: int = 0
+    insecure_http: bool = False
+    instance_credentials: bool = False
     eviction: str = "time"
     ride_out_s: float = 10.0
     prefetch_share: float = 0.5
@@ -204,7 +224,7 @@ def _convert(name: str, value: Any, origin: str) -> Any:
     called = option_of(name) if origin == COMMAND_LINE else FILE_NAMES.get(name, name)
     is_possible, hint = _RANGES.get(name, (lambda _value: True, ""))
     try:
-        if name in ("budget_bytes", "cache_bytes", "live_budget_bytes"):
+        if name in FILE_NAMES:  # those are sizes
             value = parse_bytes(value) if isinstance(value, str) else value
         if name == "session_quota" and isinstance(value, str) and not value.replace(".", "").isdigit():
             value = float(parse_bytes(value))

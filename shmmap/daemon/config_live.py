@@ -17,7 +17,7 @@ from shmmap.chunks.occupancy import Occupancy
 from shmmap.daemon.config_file import KINDS
 from shmmap.errors import ConfigError
 
-__all__ = ["SERVICE_STATE", "LiveSettings", "live_directory", "live_settings"]
+__all__ = ["SERVICE_STATE", "LiveSettings", "live_directory", "live_settings", "state_directory"]
 
 SERVICE_STATE: Final = "/var/lib/shmmap/state"
 """Where each instance of the installed service has its state directory (StateDirectory= of the units)."""
@@ -186,23 +186,36 @@ def _checked(key: str, value: Any, default: Any, where: str, origin: str) -> Any
 def live_directory(instance: str, name: str, environ: Mapping[str, str] = os.environ) -> str:
     """Return where a live map is kept whose directory nobody named.
 
-    ``$STATE_DIRECTORY/live/NAME`` (a service), else ``$XDG_STATE_HOME/shmmap/INSTANCE/live/NAME``.
+    It is ``live/NAME`` in the state directory.
 
     Raises
     ------
     ConfigError
-        There is neither, nor a home directory.
+        There is none.
+    """
+    state = state_directory(instance, environ)
+    if not state:
+        raise ConfigError(
+            f"there is no state directory for live map {name}",
+            key="live",
+            hint=f"name one: --live {name}=DIR",
+        )
+    return os.path.join(state, "live", name)
+
+
+def state_directory(instance: str, environ: Mapping[str, str] = os.environ) -> str:
+    """Return where an instance keeps what must not be lost.
+
+    ``$STATE_DIRECTORY`` (a service), else ``$XDG_STATE_HOME/shmmap/INSTANCE``, by default in the home
+    directory; empty where there is none.
     """
     service = environ.get("STATE_DIRECTORY", "").split(":")[0]
     if service:
-        return os.path.join(service, "live", name)
+        return service
     base = environ.get("XDG_STATE_HOME", "")
     if not base.startswith("/"):
         home = environ.get("HOME", "")
         if not home.startswith("/"):
-            raise ConfigError(
-                f"there is no state directory for live map {name}", key="live",
-                hint=f"name one: --live {name}=DIR",
-            )  # fmt: skip
+            return ""
         base = os.path.join(home, ".local", "state")
-    return os.path.join(base, "shmmap", instance, "live", name)
+    return os.path.join(base, "shmmap", instance)

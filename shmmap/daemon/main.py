@@ -22,6 +22,7 @@ Elsewhere: ``kill -USR1`` before starting anew, ``docker run --stop-signal USR1`
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import logging
@@ -30,11 +31,12 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from shmmap import __version__
 from shmmap.daemon.assembly import Service
-from shmmap.daemon.config import DaemonConfig
+from shmmap.daemon.config import DaemonConfig, option_of
+from shmmap.daemon.config_live import state_directory
 from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.publisher import events_path
 from shmmap.daemon.host.instance_lock import InstanceLock
@@ -46,7 +48,8 @@ from shmmap.daemon.live.place import place_live_maps
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.loading.prepared_parent import fork_early
 from shmmap.daemon.map.catalogue_reload import Reloader
-from shmmap.daemon.map_in_memory import MapInMemory
+from shmmap.daemon.map.catalogue_view import ViewOrigin
+from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory
 from shmmap.daemon.prerequisites import (
     access_of_segments,
     check_file_size_limit,
@@ -64,13 +67,16 @@ from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
+from shmmap.optional_packages import needed_packages
 from shmmap.origin.map_layout import absolute_path
-from shmmap.origin.map_origin import MapOrigin
 from shmmap.origin.no_map import NoMap
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.exclusive_name import refuse_second
+
+if TYPE_CHECKING:
+    from shmmap.daemon.map.published_origin import PublishedOrigin
 
 __all__ = ["run"]
 
@@ -102,6 +108,10 @@ def run(config: DaemonConfig) -> int:
             "no map is named", key="map_path",
             hint="give `shmmap serve MAP`, or set map_path; --live NAME for a live map alone",
         )  # fmt: skip
+    if "://" in config.map_path:
+        from shmmap.origin.remote.store import read_url
+
+        read_url(config.map_path)  # may refuse: one that may hold a secret is not logged
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     early = fork_early()
     prepare_process()
@@ -118,8 +128,12 @@ def run(config: DaemonConfig) -> int:
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
         pins = choose_pins(directory)
-        origin: MapOrigin = NoMap()
-        if config.map_path:
+        origin: ViewOrigin = NoMap()
+        elsewhere = _published(config)
+        if elsewhere is not None:
+            origin = elsewhere
+            stack.callback(_end_threads, elsewhere)
+        elif config.map_path:
             origin = find_origin(
                 config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
                 unit=config.unit, vertical_unit=config.vertical_unit, tell=notify,
@@ -142,7 +156,8 @@ def run(config: DaemonConfig) -> int:
         for problem in catalogue.problems:
             log.warning("problem in the map", what=problem)
         with signals.held():
-            memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early)
+            fetched = _fetched_from(elsewhere) if elsewhere is not None else None
+            memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early, fetched)
             stack.push(partial(_close, memory, signals))
         check_file_size_limit(memory.cache.ledger.budget_bytes)
         del catalogue  # a reload replaces it
@@ -160,10 +175,55 @@ def run(config: DaemonConfig) -> int:
             signals,
             activated,
             lock,
+            elsewhere,
         )
         service.run(started_s)
     log.info("stopped", instance=config.instance)
     return CannotWrite.exit_code if live.unsaved else 0
+
+
+def _published(config: DaemonConfig) -> PublishedOrigin | None:
+    """Open a published map, if it is one; a directory is by what is in it."""
+    path = config.map_path
+    if "://" not in path and not os.path.isfile(os.path.join(path, "CURRENT")):
+        return None
+    for name in ("metadata", "unit", "vertical_unit", "watch"):
+        if getattr(config, name):
+            raise ConfigError(
+                f"{option_of(name)} is not for a published map", key=name,
+                hint="a new version is taken by --poll" if name == "watch" else "",
+            )  # fmt: skip
+    with needed_packages("a published map"):
+        from shmmap.daemon.map.published_origin import PublishedOrigin
+        from shmmap.origin.remote.serving_store import ServedFrom
+
+        return PublishedOrigin(
+            ServedFrom(path, config.insecure_http, config.instance_credentials),
+            instance=config.instance,
+            state_dir=state_directory(config.instance),
+            cache_dir=absolute_path(config.cache_dir or default_cache_directory()),
+            cache_bytes=config.cache_bytes,
+            catalogue_bytes=config.catalogue_budget_bytes,
+            poll_s=config.poll_s,
+            accept_version=config.accept_version,
+        )
+
+
+def _fetched_from(origin: PublishedOrigin) -> FetchedFrom:
+    from shmmap.daemon.loading.published_reader import AT_ONCE
+
+    return FetchedFrom(origin.served.words(), AT_ONCE)
+
+
+def _end_threads(origin: PublishedOrigin) -> None:
+    """End threads that ask the origin; one that still waits for it must not meet the interpreter's end."""
+    if not origin.close():
+        atexit.register(_leave)
+
+
+def _leave() -> None:
+    logging.shutdown()
+    os._exit(0)
 
 
 def _refuse_taken(path: str, activated: ActivatedSocket | None) -> None:

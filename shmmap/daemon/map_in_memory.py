@@ -7,6 +7,7 @@ import contextlib
 import os
 import secrets
 import time
+from typing import NamedTuple
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -36,7 +37,14 @@ from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MapInMemory"]
+__all__ = ["FetchedFrom", "MapInMemory"]
+
+
+class FetchedFrom(NamedTuple):
+    """Where loaders fetch cells: the words that say it to them, and how many each fetches at once."""
+
+    words: tuple[str, ...]
+    places: int
 
 
 class MapInMemory:
@@ -64,6 +72,7 @@ class MapInMemory:
         mode: int,
         gid: int,
         early: Early | None = None,
+        origin: FetchedFrom | None = None,
     ) -> None:
         self.directory = directory
         epoch = secrets.randbits(63) | 1
@@ -115,12 +124,16 @@ class MapInMemory:
                 instance=config.instance, mode=mode, gid=gid,
             )  # fmt: skip
             self.watched = WatchedDescriptors()
-            cache = (config.cache_dir, str(config.cache_bytes)) if config.cache_dir else ()
-            parent = PreparedParent(
-                (directory.path, str(loader_bytes(group_limit)), *cache), self.watched, early
-            )
+            settings = (
+                directory.path, str(loader_bytes(group_limit)), config.cache_dir, str(config.cache_bytes),
+                *(origin.words if origin is not None else ()),
+            )  # fmt: skip
+            parent = PreparedParent(settings, self.watched, early)
             parent.start()  # it imports what loaders need while this process gets ready
-            pool = WorkerPool(config.loaders(), directory, parent, config.load_timeout_s, self.watched)
+            pool = WorkerPool(
+                config.loaders(), directory, parent, config.load_timeout_s, self.watched,
+                places=origin.places if origin is not None else 1,
+            )  # fmt: skip
             self.map_switch = MapSwitch(self.cache)
             self.scheduler = Scheduler(
                 self.cache,

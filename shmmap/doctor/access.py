@@ -22,7 +22,7 @@ from shmmap.errors import (
     SocketPermission,
 )
 from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
-from shmmap.quantities import counted
+from shmmap.quantities import counted, format_duration
 
 __all__ = [
     "account_name",
@@ -161,6 +161,13 @@ def check_map_access(patient: Patient) -> Finding:
     if not path:
         return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
     if patient.alive:
+        if patient.seen is not None and patient.seen.counters.get("origin_out", 0):
+            since = format_duration(patient.seen.counters.get("last_outage_ns", 0) * 1e-9)
+            return warn(
+                name,
+                f"{path} is being served from memory: where it comes from has not answered for {since}",
+                "`shmmap tail` says why loads fail",
+            )
         problems = patient.seen.counters.get("map_problems", 0) if patient.seen is not None else 0
         if problems:
             return warn(
@@ -176,6 +183,8 @@ def check_map_access(patient: Patient) -> Finding:
                 "moved without the metadata? the daemon's log names them, and so does `shmmap inspect`",
             )
         return ok(name, f"{path} is being served")
+    if "://" in path:
+        return ok(name, f"{path} is looked for when the daemon starts")
     if not os.path.exists(path):
         try:
             os.stat(path)

@@ -8,6 +8,7 @@ from typing import Final
 
 from shmmap.doctor.access import check_group, check_map_access, check_socket
 from shmmap.doctor.cells import check_cells
+from shmmap.doctor.disk_cache import check_disk_cache
 from shmmap.doctor.finding import Finding
 from shmmap.doctor.kernel import check_descriptors, check_pins
 from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
@@ -38,6 +39,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_memory_limit,
     check_container,
     check_huge_pages,
+    check_disk_cache,
     check_live_maps,
     check_live_disk,
     check_live_memory,

@@ -12,7 +12,7 @@ it its new version.  ::
 
 Entries appear whole, by renaming; nothing is synced, since every column is compared with its checksum
 when it is loaded, and an entry that does not match is removed and built anew.  Entries that others could
-have written are not used.  The least recently used go first when `trim` brings the cache under its limit.
+have written are not used.  How much is kept, and what goes first, is in `shmmap.disk_budget`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
 import xxhash
 
+from shmmap.disk_budget import INTERIM, LAYERS, DiskBudget, mark_used
 from shmmap.errors import CannotWrite, SegmentCorrupt
 from shmmap.layers.cache_key import CacheKey
 from shmmap.segment.header import pack_header, unpack_header
@@ -36,10 +36,6 @@ from shmmap.segment.writer import write_all
 __all__ = ["LayerCache"]
 
 _BLOCK_BYTES: Final = 1 << 18  # stays in the second-level cache while it is hashed and written
-_TOUCH_AGE_S: Final = 3600.0
-_STALE_INTERIM_S: Final = 3600.0
-_SPARE_SHARE: Final = 0.05
-"""Part of the file system that the cache leaves free."""
 
 
 class LayerCache:
@@ -50,20 +46,17 @@ class LayerCache:
     directory
         Made when the first entry is stored.
     limit_bytes
-        What `trim` keeps it under.
+        Most bytes of all that is kept there, objects of published maps included.
 
     Attributes
     ----------
-    stored_bytes
-        Bytes stored by this object since its last `trim`.
     writable
         Whether storing is worth another try; for its users to say.
     """
 
     def __init__(self, directory: str, *, limit_bytes: int) -> None:
-        self.directory = os.path.join(directory, "layers")
-        self.limit_bytes = limit_bytes
-        self.stored_bytes = 0
+        self.directory = os.path.join(directory, LAYERS)
+        self.budget = DiskBudget(directory, limit_bytes)
         self.writable = True
 
     def _version_path(self, name: str) -> str:
@@ -97,9 +90,7 @@ class LayerCache:
             if status.st_uid in (0, os.geteuid()) and not status.st_mode & 0o022:
                 header = _read_header(fd, status.st_size)
                 if _is_of(header, key):
-                    if time.time() - status.st_mtime > _TOUCH_AGE_S:
-                        with contextlib.suppress(OSError):
-                            os.utime(fd)
+                    mark_used(fd, status)
                     return fd, header
         except (OSError, SegmentCorrupt, UnicodeDecodeError):
             self._remove(path)
@@ -194,11 +185,9 @@ class LayerCache:
             If it cannot be written.
         """
         os.makedirs(self.directory, mode=0o755, exist_ok=True)
-        room = os.statvfs(self.directory)
-        spare = int(room.f_blocks * room.f_frsize * _SPARE_SHARE)
-        if header.total_bytes > min(self.limit_bytes, room.f_bavail * room.f_frsize - spare):
+        if not self.budget.has_room(header.total_bytes):
             return False
-        interim_fd, interim = tempfile.mkstemp(prefix=".new-", dir=self.directory)
+        interim_fd, interim = tempfile.mkstemp(prefix=INTERIM, dir=self.directory)
         try:
             try:
                 _copy_all(fd, interim_fd, header.total_bytes)
@@ -216,7 +205,7 @@ class LayerCache:
             with contextlib.suppress(OSError):
                 os.unlink(interim)
             raise
-        self.stored_bytes += header.total_bytes
+        self.budget.added(header.total_bytes)
         return True
 
     def _link(self, old: str, new: str) -> None:
@@ -227,39 +216,6 @@ class LayerCache:
     def _remove(self, path: str) -> None:
         with contextlib.suppress(OSError):
             os.unlink(path)
-
-    # --- bounds -----------------------------------------------------------------------------------
-
-    def _files(self) -> Iterator[tuple[str, os.stat_result]]:
-        for folder, _, names in os.walk(self.directory):
-            for name in names:
-                path = os.path.join(folder, name)
-                with contextlib.suppress(OSError):
-                    yield path, os.lstat(path)
-
-    def trim(self) -> int:
-        """Remove what was used least recently until the cache is under its limit; returns its bytes.
-
-        What a killed process left half written goes too, an hour later.
-        """
-        self.stored_bytes = 0
-        names: dict[int, list[str]] = {}
-        entries: dict[int, tuple[float, int]] = {}
-        for path, status in self._files():
-            if os.path.basename(path).startswith(".new-"):
-                if time.time() - status.st_mtime > _STALE_INTERIM_S:
-                    self._remove(path)
-                continue
-            names.setdefault(status.st_ino, []).append(path)
-            entries[status.st_ino] = (status.st_mtime, status.st_size)
-        total = sum(size for _, size in entries.values())
-        for inode, (_, size) in sorted(entries.items(), key=lambda item: item[1][0]):
-            if total <= self.limit_bytes:
-                break
-            for path in names[inode]:
-                self._remove(path)
-            total -= size
-        return total
 
 
 def _is_of(header: SegmentHeader, key: CacheKey) -> bool:

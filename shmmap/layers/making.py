@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -113,6 +112,3 @@ def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> N
     except OSError as error:  # the cache is a convenience: a full disk costs nobody a layer
         cache.writable = False
         log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
-    if cache.stored_bytes > cache.limit_bytes // 16:
-        with contextlib.suppress(OSError):
-            cache.trim()

@@ -58,12 +58,10 @@ class Prepared:
 
 
 class _Count:
-    """Adds up what workers report, and keeps the cache under its limit meanwhile."""
+    """Adds up what workers report."""
 
-    def __init__(self, total: int, cache: LayerCache, progress: PrepareProgress) -> None:
-        self._cache = cache
+    def __init__(self, total: int, progress: PrepareProgress) -> None:
         self._progress = progress
-        self._added_bytes = 0
         self.result = Prepared(total)
 
     def finished(self, task: work.CellWork, done: work.CellDone) -> None:
@@ -73,13 +71,8 @@ class _Count:
             result.recognised += layer.how == "recognised"
             result.built += layer.how == "built"
             result.bytes += layer.bytes
-            if layer.how == "built":
-                self._added_bytes += layer.bytes
-            elif layer.how == "failed":
+            if layer.how == "failed":
                 result.failures.append(Failure(task.cell_id, layer.layer, layer.message))
-        if self._added_bytes > self._cache.limit_bytes // 16:
-            self._added_bytes = 0
-            self._cache.trim()
         self._progress.advance(1)
 
     def died(self, task: work.CellWork, how: str) -> None:
@@ -138,17 +131,17 @@ def prepare_map(
             )
 
     progress.stage("prepare", len(catalogue))
-    count = _Count(len(catalogue), cache, progress)
+    count = _Count(len(catalogue), progress)
     TaskPool(
         "shmmap.prepare.worker",
-        [cache_dir, str(cache.limit_bytes)],
+        [cache_dir, str(cache_bytes)],
         workers=max(1, workers),
         decode=work.decode_done,
         finished=count.finished,
         died=count.died,
     ).run(tasks())
     count.result.failures += crowded
-    count.result.cache_bytes = cache.trim()
+    count.result.cache_bytes = cache.budget.trim()
     progress.done(len(catalogue))
     return count.result
 

@@ -22,7 +22,7 @@ from shmmap.layers.derive import CellJob, combined_digest
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import cache_key, make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES
+from shmmap.layers.source_reader import FILES, SourceReader
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
@@ -66,7 +66,10 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
 class CellPoints:
     """The cell's points, read when first asked for, with the columns that all layers need together."""
 
-    def __init__(self, source: Source, box: Box, specs: list[LayerSpec]) -> None:
+    def __init__(
+        self, source: Source, box: Box, specs: list[LayerSpec], reader: SourceReader = FILES
+    ) -> None:
+        self._reader = reader
         self._source = source
         self._box = box
         self._read: CellSource | None = None
@@ -78,7 +81,7 @@ class CellPoints:
     def points(self, spec: LayerSpec) -> CellSource:
         """The columns that one layer takes: exactly those, whatever the others need."""
         if self._read is None:
-            self._read = FILES.read(self._source, self._box, self._needs)
+            self._read = self._reader.read(self._source, self._box, self._needs)
         names = spec.source_columns
         table = self._read.points
         columns = {n: c for n, c in table.columns.items() if names is None or n in names}

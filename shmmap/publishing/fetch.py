@@ -25,6 +25,7 @@ from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_frame import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
 from shmmap.origin.remote.map_versions import read_entry, read_root, read_shards, require_current
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.published_index import POINTS, Root, Shard
 from shmmap.origin.remote.published_object import ObjectName, read_bare_header, rows_of, unpack_object
 from shmmap.origin.remote.store import Store
@@ -46,8 +47,10 @@ class FetchedMap:
         The map's directory.
     version, map_version
         Of the published map.
-    fetched_cells, fetched_bytes
-        What was fetched, without what a run that was stopped had; bytes of objects.
+    fetched_cells
+        Cells without those that a run that was stopped had.
+    fetched_bytes
+        Bytes of their objects that came from the store.
     """
 
     path: str
@@ -65,7 +68,13 @@ class _Cell(NamedTuple):
 
 
 def fetch_map(
-    store: Store, out: str, *, version: int | None = None, force: bool = False, progress: Progress
+    store: Store,
+    out: str,
+    *,
+    version: int | None = None,
+    force: bool = False,
+    tier: ObjectTier | None = None,
+    progress: Progress,
 ) -> FetchedMap:
     """Write a version of a published map as a divided map.
 
@@ -75,6 +84,8 @@ def fetch_map(
         The directory to make; must not exist, or be empty, unless ``force`` replaces it.
     version
         None: the current one.
+    tier
+        Objects that are there are not fetched; what is fetched is not kept in it.
 
     Raises
     ------
@@ -97,14 +108,16 @@ def fetch_map(
             current = read_entry(store, version).current
         except MapMissing:
             raise MapMissing(f"there is no version {version} at {store.url}") from None
-    root = read_root(store, current)
+    pages = KeptObjects(store, tier, is_index=True, keep=False)
+    objects = KeptObjects(store, tier, keep=False)
+    root = read_root(pages, current)
     with Workspace(out, "fetching", keep_failed=True) as workspace, writing_errors(out):
         begun = {"root": current.root}
         found = workspace.state()
         if found is None or found.get("root") != current.root:
             workspace.empty()
             workspace.save(begun)
-        fetched = _Fetch(store, root, workspace.directory("map")).run(progress)
+        fetched = _Fetch(pages, objects, root, workspace.directory("map")).run(progress)
         step("fetch.whole")
         workspace.publish(replace=force, durable=True)
         step("fetch.renamed")
@@ -124,8 +137,9 @@ class _Counts:
 class _Fetch:
     """Fetches the cells of a root into a directory."""
 
-    def __init__(self, store: Store, root: Root, directory: str) -> None:
-        self._store = store
+    def __init__(self, pages: KeptObjects, objects: KeptObjects, root: Root, directory: str) -> None:
+        self._pages = pages
+        self._objects = objects
         self._root = root
         self._directory = directory
         self._cells_dir = os.path.join(directory, _CELLS)
@@ -137,26 +151,26 @@ class _Fetch:
         progress.stage("fetch", self._root.cells)
         os.makedirs(self._cells_dir, exist_ok=True)
         with ThreadPoolExecutor(_FETCHED_AT_ONCE, "fetch") as pool:
-            for shard in read_shards(self._store, self._root):
+            for shard in read_shards(self._pages, self._root):
                 boxes.append(shard.boxes)
                 names += (name.decode() for name in shard.names)
                 counts.points += int(shard.points.sum(dtype=np.uint64))
-                for nbytes in pool.map(self._fetch, _cells_of(shard)):
-                    counts.cells += nbytes > 0
-                    counts.bytes += nbytes
+                for is_new in pool.map(self._fetch, _cells_of(shard)):
+                    counts.cells += is_new
                     progress.advance(1)
+        counts.bytes = self._objects.counts.fetched_bytes
         self._write_metadata(names, np.concatenate(boxes))
         self._write_report()
         return counts
 
-    def _fetch(self, cell: _Cell) -> int:
-        """Write a cell's file; returns how many bytes were fetched for it, 0 if it was there."""
+    def _fetch(self, cell: _Cell) -> bool:
+        """Write a cell's file; False if it was there."""
         path = os.path.join(self._cells_dir, cell.name)
         if os.path.exists(path):  # files have their names once they are whole
-            return 0
-        frame = self._store.get_exactly(cell.object.path, cell.object.size)
-        unpacked = unpack_object(frame, cell.object)
-        header = read_bare_header(unpacked, POINTS, name=f"{self._store.url}/{cell.object.path}")
+            return False
+        frame = self._objects.read(cell.object.sha256, cell.object.size)
+        unpacked = unpack_object(frame, cell.object, verified=True)
+        header = read_bare_header(unpacked, POINTS, name=f"{self._objects.url}/{cell.object.path}")
         if any(header.origin):
             raise MapDataError("its coordinates have an origin of their own", path=cell.object.path)
         columns: dict[str, NDArray[Any]] = {
@@ -168,7 +182,7 @@ class _Fetch:
             write_pcd(file, columns)
         step("fetch.cell")
         os.rename(interim, path)
-        return cell.object.size
+        return True
 
     def _write_metadata(self, names: list[str], boxes: NDArray[np.float64]) -> None:
         size_x, size_y = (_only_size(boxes[:, axis], boxes[:, axis + 2]) for axis in (0, 1))

@@ -35,6 +35,9 @@ class PublishSettings(msgspec.Struct, array_like=True):
         Nothing was ever sent there: no object is looked for.
     cache_dir
         Where prepared layers may lie; empty: nowhere.
+    encoding
+        One of `shmmap.origin.remote.published_index.ENCODINGS`; empty: that of the version before, at first
+        ``exact``.
     """
 
     url: str
@@ -43,6 +46,7 @@ class PublishSettings(msgspec.Struct, array_like=True):
     cache_dir: str = ""
     known: str = ""
     is_first: bool = False
+    encoding: str = ""
 
 
 class CellToSend(msgspec.Struct, array_like=True, tag="cell"):

@@ -83,6 +83,7 @@ class Published:
     cells: int
     layers: tuple[str, ...]
     id_prefix: str = ""
+    encoding: str = EXACT
     version: int | None = None
     current: int = 0
     map_version: int = 0
@@ -179,9 +180,10 @@ class _Run:
     def run(self, settings: PublishSettings, id_prefix: str, workers: int) -> Published:
         result, before, seen = self._result, self._before, self._seen
         result.id_prefix = self._prefix(id_prefix)
+        result.encoding = settings.encoding or (before.encoding if before is not None else EXACT)
         side = shard_side(self._catalogue, len(self._names), before.shard_m if before is not None else None)
         with tempfile.NamedTemporaryFile(prefix="shmmap-publish-") as known:
-            settings = msgspec.structs.replace(settings, is_first=not self._look)
+            settings = msgspec.structs.replace(settings, is_first=not self._look, encoding=result.encoding)
             if write_known_objects(known.name, self._known_layers()):
                 settings = msgspec.structs.replace(settings, known=known.name)
             objects = self._send_cells(settings, workers)
@@ -347,7 +349,7 @@ class _Run:
             crs=catalogue.frame.crs,
             origin=catalogue.frame.origin,
             unit_m=catalogue.frame.unit_m,
-            encoding=EXACT,
+            encoding=self._result.encoding,
             cells=len(catalogue),
             bounds=bounds,
             shard_m=side,

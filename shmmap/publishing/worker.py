@@ -18,14 +18,24 @@ from dataclasses import dataclass
 from hashlib import sha256
 from typing import Final
 
+import msgspec
+
 from shmmap.errors import InternalError, MapDataError, ShmmapError
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
 from shmmap.layers.points import LAYER
+from shmmap.layers.source_reader import FILES
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.published_object import MAX_OBJECT_BYTES, ObjectName, bare_object, pack_object
+from shmmap.origin.remote.published_index import MILLIMETRES
+from shmmap.origin.remote.published_object import (
+    MAX_OBJECT_BYTES,
+    ObjectName,
+    bare_object,
+    pack_object,
+    read_bare_header,
+)
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.work import Ready
 from shmmap.prepare.worker import CellPoints
@@ -41,6 +51,7 @@ from shmmap.publishing.messages import (
     decode_task,
     encode,
 )
+from shmmap.publishing.rounded_files import RoundedFiles
 from shmmap.publishing.sending import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
@@ -77,17 +88,19 @@ class LayerRefused(Exception):
 class CellMaker:
     """Makes the objects of cells, in one thread."""
 
-    def __init__(self, known: KnownObjects, cache: LayerCache | None) -> None:
+    def __init__(self, known: KnownObjects, cache: LayerCache | None, *, millimetres: bool = False) -> None:
         self._known = known
-        self._cache = cache
+        self._millimetres = millimetres
+        self._cache = cache if not millimetres else None  # which was made of exact points
+        self._reader = RoundedFiles() if millimetres else FILES
 
     def make(self, task: CellToSend) -> _Cell:
         """Make the objects of a cell's layers; `LayerRefused` where one cannot be made."""
         specs = [layer_spec(name) for name in task.layers]
-        source = CellPoints(task.source, task.box, specs)
+        source = CellPoints(task.source, task.box, specs, self._reader)
         layers, headers = [], []
         for spec, around in zip(specs, task.around, strict=True):
-            job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around)
+            job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around, self._reader)
             header, layer = self._layer(spec, job, source)
             headers.append(header)
             layers.append(layer)
@@ -113,7 +126,12 @@ class CellMaker:
                         cause="too_large",
                         hint="divide the map into smaller cells",
                     )
-                return header, self._object(_contents(fd, header.total_bytes))
+                rounded = self._millimetres and name == LAYER
+                unpacked = bare_object(_contents(fd, header.total_bytes), millimetres=rounded)
+                if rounded:
+                    bare = read_bare_header(unpacked, name)
+                    header = msgspec.structs.replace(header, z_min=bare.z_min, z_max=bare.z_max)
+                return header, self._object(unpacked)
             finally:
                 os.close(fd)
         except ShmmapError as error:
@@ -128,8 +146,7 @@ class CellMaker:
             message = f"{job.source.name}: building {name} failed: {error!r}"
             raise LayerRefused(name, InternalError.code, message) from None
 
-    def _object(self, segment: memoryview) -> _Layer:
-        unpacked = bare_object(segment)
+    def _object(self, unpacked: bytearray) -> _Layer:
         content = sha256(unpacked).digest()
         found = self._known.find(content)
         if found is not None:
@@ -192,7 +209,7 @@ def _work(channel: socket.socket, argument: str) -> None:
         instance_credentials=settings.instance_credentials,
     )
     cache = LayerCache(settings.cache_dir, limit_bytes=1 << 62) if settings.cache_dir else None
-    maker = CellMaker(KnownObjects(settings.known), cache)
+    maker = CellMaker(KnownObjects(settings.known), cache, millimetres=settings.encoding == MILLIMETRES)
 
     def send(message: CellSent | NotSent) -> None:
         channel.send(encode(message))

@@ -69,8 +69,8 @@ class DaemonProcess:
     ----------
     instance, endpoint, runtime_dir, shm_dir, log_path
         Its name, and where its socket, segments and log are.
-    cache_dir
-        ``XDG_CACHE_HOME`` of the daemon.
+    cache_dir, state_dir
+        ``XDG_CACHE_HOME`` and ``XDG_STATE_HOME`` of the daemon.
     process
         Of its present life; None when it does not run.
     killed
@@ -116,6 +116,7 @@ class DaemonProcess:
         self.endpoint = f"{self.runtime_dir}/{self.instance}.sock"
         self.log_path = Path(self.runtime_dir, "log.txt")
         self.cache_dir = Path(self.scratch_dir, "cache")
+        self.state_dir = Path(self.scratch_dir, "state")
         self._temporary_dir = Path(self.scratch_dir, "temporary")
         for directory in (self.cache_dir, self._temporary_dir):
             directory.mkdir()
@@ -125,6 +126,7 @@ class DaemonProcess:
             "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR") or _kernels_dir(),
             "TMPDIR": str(self._temporary_dir),
             "XDG_CACHE_HOME": str(self.cache_dir),
+            "XDG_STATE_HOME": str(self.state_dir),
             _MARK: self.instance,
             **(environment or {}),
         }

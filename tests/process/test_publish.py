@@ -12,9 +12,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,46 +23,12 @@ from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.published_map_reader import PublishedMapReader, columns_of
+from tests.support.publishing_verbs import Shmmap
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 NDT = "ndt(leaf=2.0,min_points=3)"
 DAY_S = 86_400
-
-
-class Shmmap:
-    """Runs the command line, with a home and a cache of its own."""
-
-    def __init__(self, home: Path) -> None:
-        hidden = ("SHMMAP_", "AWS_", "GOOGLE_", "AZURE_")
-        self.environment = {k: v for k, v in os.environ.items() if not k.startswith(hidden)} | {
-            "PYTHONPATH": str(ROOT),
-            "HOME": str(home),
-            "XDG_CACHE_HOME": str(home / "cache"),
-        }
-
-    def start(self, *words: str | Path, env: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
-        """Start a verb; one worker is enough for these maps."""
-        if words[0] == "publish":
-            words = (*words, "--workers", "1")
-        return subprocess.Popen(
-            [sys.executable, "-m", "shmmap.cli", *map(str, words)],
-            env={**self.environment, **(env or {})},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def __call__(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> str:
-        process = self.start(*words, env=env)
-        out, errors = process.communicate()
-        assert process.returncode == code, errors + out
-        return out if code in (0, 1) else errors
-
-    def json(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> dict[str, Any]:
-        found = json.loads(self(*words, "--json", code=code, env=env))
-        assert isinstance(found, dict)
-        return found
 
 
 @pytest.fixture
@@ -541,6 +506,30 @@ def test_pruning_spares_what_is_young_and_what_is_being_published(
 
 
 # --- back into files ----------------------------------------------------------------------------------
+
+
+def test_what_a_daemon_keeps_on_the_disk_is_not_fetched(
+    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+) -> None:
+    """And nothing that is fetched is put there."""
+    from shmmap.origin.remote.object_tier import ObjectTier  # needs zstandard
+
+    tier = ObjectTier(str(tmp_path / "cache/shmmap"), limit_bytes=1 << 30)
+    shmmap("fetch", store, tmp_path / "one")
+    assert not (tmp_path / "cache/shmmap/objects").exists()
+    blobs = {path: path.read_bytes() for path in (store / "blobs/sha256").iterdir()}
+    for path, data in blobs.items():
+        for is_index in (False, True):
+            tier.put(bytes.fromhex(path.name), data, is_index=is_index)
+        path.unlink()
+    done = shmmap.json("fetch", store, tmp_path / "two")
+    assert (done["fetched_cells"], done["fetched_bytes"]) == (4, 0)
+    for name in ("one", "two"):
+        assert files_of(tmp_path / name / "pointcloud_map.pcd") == files_of(town.pcd_dir)
+    for kept in (tmp_path / "cache/shmmap/objects/cells").glob("*/*"):
+        kept.write_bytes(b"damaged")
+    assert "is not there" in shmmap("fetch", store, tmp_path / "three", code=66)
+    shmmap("fetch", store, tmp_path / "three", "--cache-dir", tmp_path / "none", code=66)
 
 
 def test_fetched_files_have_every_field_bit_by_bit(

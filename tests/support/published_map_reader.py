@@ -135,9 +135,12 @@ def columns_of(unpacked: bytes, layer: str, builder_version: int) -> dict[str, N
     assert unpacked[:8] == b"SHMMAP\x00\x01"
     header_bytes, total_bytes = struct.unpack_from("<QQ", unpacked, 16)
     assert total_bytes == len(unpacked)
-    for first, last in EMPTY.values():
-        assert unpacked[first:last] == bytes(last - first)
-    assert struct.unpack_from("<I", unpacked, 208)[0] == 1
+    flags = struct.unpack_from("<I", unpacked, 208)[0]
+    assert flags in (1, 3)
+    assert flags == 1 or layer == "points"
+    for name, (first, last) in EMPTY.items():
+        assert unpacked[first:last] == bytes(last - first) or (flags == 3 and name == "mm_origin")
+    mm_origin = struct.unpack_from("<3d", unpacked, 296)
     count, table, row_bytes = struct.unpack_from("<III", unpacked, 172)
     assert struct.unpack_from("<I", unpacked, 168)[0] == builder_version
     id_bytes, _, layer_at, layer_bytes, _, frame_bytes = (
@@ -161,6 +164,10 @@ def columns_of(unpacked: bytes, layer: str, builder_version: int) -> dict[str, N
         data = bytearray(nbytes)
         for b in range(row):
             data[b::row] = planes[b * count_rows : (b + 1) * count_rows]
-        assert xxhash.xxh3_64_intdigest(data) == checksum
-        found[name] = np.frombuffer(bytes(data), dtype).reshape(shape[:dimensions])
+        values = np.frombuffer(bytes(data), dtype).reshape(shape[:dimensions])
+        if flags == 3 and name == "xyz":
+            assert dtype == "<u2"
+            values = (np.array(mm_origin) + 0.001 * values.astype(np.float64)).astype("<f4")
+        assert xxhash.xxh3_64_intdigest(np.ascontiguousarray(values).tobytes()) == checksum
+        found[name] = values
     return found

@@ -35,6 +35,7 @@ BASE = {
     "compiling",
     "sharded_dict",
     "sparse_table",
+    "disk_budget",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -54,6 +55,7 @@ PARTS = {
     "compiling": {"kernel_cache"},
     "sharded_dict": set[str](),
     "sparse_table": set[str](),
+    "disk_budget": {"failpoints"},
     "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "sharded_dict", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},

@@ -97,7 +97,7 @@ def run_check(args: argparse.Namespace) -> int:
     access_of_segments(config)
     if not config.map_path:
         raise ConfigError("no map is named", key="map_path", hint="set map_path, or give `shmmap serve MAP`")
-    if not os.path.exists(config.map_path):
+    if "://" not in config.map_path and not os.path.exists(config.map_path):
         raise MapMissing(f"there is no map at {config.map_path}", hint="map_path names it")
     if args.json:
         print_json({"file": file or None, "good": True})

@@ -13,7 +13,7 @@ __all__ = ["add_parser", "run"]
 
 _EPILOG = """\
 Every object is compared with its hash.  DIR appears complete or not at all; a stopped run, started again,
-fetches only what is missing.
+fetches only what is missing.  What a daemon of the same user keeps on this disk is not fetched.
 JSON (fields may be added, none is removed):
   {"url", "path", "version", "map_version": hex, "cells", "points", "fetched_cells", "fetched_bytes",
    "seconds"}
@@ -36,6 +36,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("out", metavar="DIR", help="the map directory to make")
     parser.add_argument("--at", metavar="N", type=at_least(1), help="version N instead of the current one")
     parser.add_argument("--force", action="store_true", help="replace a divided map that exists")
+    parser.add_argument("--cache-dir", metavar="DIR", default="", help="where a daemon keeps what it fetched")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_store_options(parser)
     add_json_option(parser)
@@ -43,16 +44,27 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fetch, with progress on stderr."""
+    import os
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.origin.sidecar import default_cache_directory
 
     store = store_at(args.url, args)
+    from shmmap.origin.remote.object_tier import ObjectTier
     from shmmap.publishing.fetch import fetch_map
 
     began_s = time.monotonic()
     progress = StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0)
-    made = fetch_map(store, args.out, version=args.at, force=args.force, progress=progress)
+    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    made = fetch_map(
+        store,
+        args.out,
+        version=args.at,
+        force=args.force,
+        tier=ObjectTier(cache_dir, limit_bytes=0),
+        progress=progress,
+    )
     seconds = time.monotonic() - began_s
     if args.json:
         print_json(

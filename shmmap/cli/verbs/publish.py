@@ -62,6 +62,13 @@ def add_parser(subparsers: Subparsers) -> None:
         default="",
         help="what cell ids begin with, in all versions (default: /<last part of URL>/)",
     )
+    parser.add_argument(
+        "--encoding",
+        choices=("exact", "mm"),
+        default="",
+        help="mm: points are rounded to millimetres, and take half the bytes (default: as in the version"
+        " before, at first exact)",
+    )
     parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
@@ -119,6 +126,7 @@ def run(args: argparse.Namespace) -> int:
                 args.insecure_http,
                 args.instance_credentials,
                 cache_dir if os.path.isdir(os.path.join(cache_dir, "layers")) else "",
+                encoding=args.encoding,
             ),
             id_prefix=args.id_prefix,
             workers=args.workers or len(os.sched_getaffinity(0)),
@@ -141,6 +149,7 @@ def run(args: argparse.Namespace) -> int:
                 "cells": done.cells,
                 "layers": list(done.layers),
                 "id_prefix": done.id_prefix,
+                "encoding": done.encoding,
                 "objects": done.objects,
                 "bytes": done.bytes,
                 "sent_objects": done.sent_objects,

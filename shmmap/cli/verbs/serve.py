@@ -17,6 +17,9 @@ or inside the folder of the files), or one cloud of any format that is read.  A 
 is one cell as it is.  Any other cloud is first divided into the cache directory, as `shmmap divide` does
 it.  A LAS or float64 cloud far from the origin is shifted close to it, and the log and `shmmap status` say
 by how much.  To keep its frame: `shmmap divide --translate none`, and serve that map.
+MAP may also be where `shmmap publish` has put a map: an s3://, gs://, az://, https:// or file:// URL, or a
+directory.  Its cells are fetched as they are needed; a new version is taken by itself (--poll), and on
+`shmmap reload`.
 `shmmapd` is `shmmap serve`: the same options.
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
@@ -37,7 +40,9 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Load map cells into shared memory and answer clients until told to stop.",
         epilog=_EPILOG,
     )
-    parser.add_argument("map_path", metavar="MAP", nargs="?", help="the map: a directory or a cloud")
+    parser.add_argument(
+        "map_path", metavar="MAP", nargs="?", help="the map: a directory, a cloud, or a published map's URL"
+    )
     parser.add_argument(
         "--metadata", metavar="FILE", help="the map's YAML, if it lies neither beside nor in the map"
     )
@@ -87,6 +92,36 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     place.add_argument(
         "--admin-group", metavar="GROUP", help="group whose members may reload, evict, pin and stop it"
+    )
+    published = parser.add_argument_group("a published map")
+    published.add_argument(
+        "--poll",
+        metavar="SECONDS",
+        dest="poll_s",
+        help="how often it is asked whether there is another version; 0: only when a reload is asked for "
+        "(default: 60)",
+    )
+    published.add_argument(
+        "--catalogue-budget",
+        metavar="BYTES",
+        help="most of the daemon's memory for the list of cells (default: 256M, a million cells)",
+    )
+    published.add_argument(
+        "--accept-version",
+        metavar="N",
+        help="take version N although a later one was taken before",
+    )
+    published.add_argument(
+        "--insecure-http",
+        action="store_true",
+        default=None,
+        help="take plain http:// from beyond this machine: it can be read and changed on its way",
+    )
+    published.add_argument(
+        "--instance-credentials",
+        action="store_true",
+        default=None,
+        help="ask the cloud's metadata address for credentials if none are given",
     )
     limits = parser.add_argument_group("limits")
     limits.add_argument(

@@ -124,6 +124,9 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         lines.insert(
             4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
         )
+    if count.get("origin_out", 0):
+        since = format_duration(count.get("last_outage_ns", 0) * 1e-9)
+        lines.append(("origin", f"out of reach for {since}: what is in memory is served"))
     if problems := count.get("map_problems", 0):
         lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
     if outside := count.get("cells_outside_box", 0):

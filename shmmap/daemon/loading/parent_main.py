@@ -126,7 +126,8 @@ def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID``.
 
     The first packet has the settings, with zero bytes between them: the directory of segments, the memory
-    that a loader may take, bytes; directory and size of the disk cache where there is one.
+    that a loader may take, bytes; directory and size of the disk cache, empty and 0 where there is none; of
+    a published map what `shmmap.origin.remote.serving_store.ServedFrom` says.
     """
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
@@ -140,10 +141,10 @@ def main(arguments: list[str]) -> int:
         data, _ = receive_packet(channel, bytearray(MOST_SETTINGS_BYTES))
         if not data:
             return 0  # the daemon did not start after all
-        shm_dir, memory_bytes, *cache = map(os.fsdecode, bytes(data).split(b"\0"))
+        shm_dir, memory_bytes, *more = map(os.fsdecode, bytes(data).split(b"\0"))
         limit_memory(int(memory_bytes))
-        cache_dir, cache_bytes = cache or ("", "0")
-        settings = WorkerSettings(shm_dir, cache_dir, int(cache_bytes))
+        cache_dir, cache_bytes, *origin = more or ("", "0")
+        settings = WorkerSettings(shm_dir, cache_dir, int(cache_bytes), tuple(origin))
         channel.send(__version__.encode())
         _Parent(channel, settings).run()
     return 0

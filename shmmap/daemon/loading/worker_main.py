@@ -57,11 +57,15 @@ class _Refused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class WorkerSettings:
-    """Where segments are made; where finished layers are kept, and how much of them (empty: nowhere)."""
+    """Where segments are made; where finished layers are kept, and how much of them (empty: nowhere).
+
+    ``origin`` are the words of `shmmap.origin.remote.serving_store.ServedFrom`; none: cells are files.
+    """
 
     shm_dir: str
     cache_dir: str = ""
     cache_bytes: int = 0
+    origin: tuple[str, ...] = ()
 
 
 @dataclass(eq=False, slots=True)
@@ -277,6 +281,13 @@ def work(channel: socket.socket, settings: WorkerSettings) -> int:
     cache = None
     if settings.cache_dir and settings.cache_bytes:
         cache = LayerCache(settings.cache_dir, limit_bytes=settings.cache_bytes)
+    reader: SourceReader = FILES
+    if settings.origin:
+        from shmmap.daemon.loading.published_reader import PublishedReader
+        from shmmap.origin.remote.serving_store import ServedFrom
+
+        served = ServedFrom.from_words(*settings.origin)
+        reader = PublishedReader(served, settings.cache_dir, settings.cache_bytes)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        _Worker(channel, ShmDirectory(settings.shm_dir), cache).run()
+        _Worker(channel, ShmDirectory(settings.shm_dir), cache, reader).run()
     return 0

@@ -73,9 +73,18 @@ class BucketStore:
         """Return a whole object, and its ETag."""
         return self._read(path, max_bytes)
 
-    def _read(self, path: str, max_bytes: int, *, exact: bool = False) -> tuple[memoryview, Tag]:
+    def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
+        """Return a whole object and its ETag, unless that is the one of ``tag``."""
+        try:
+            return self._read(path, max_bytes, unless=tag.get("e_tag"))
+        except exceptions.NotModifiedError:
+            return None
+
+    def _read(
+        self, path: str, max_bytes: int, *, exact: bool = False, unless: str | None = None
+    ) -> tuple[memoryview, Tag]:
         def read() -> tuple[Any, Tag]:
-            result = obstore.get(self._store, path)
+            result = obstore.get(self._store, path, options={"if_none_match": unless} if unless else None)
             meta = result.meta
             size = meta["size"]
             if size > max_bytes or (exact and size != max_bytes):
@@ -177,6 +186,8 @@ class BucketStore:
             if conditional:
                 raise
             raise Offline(f"{self._name(path)}: refused (status 412)") from None
+        except exceptions.NotModifiedError:  # asked for by `get_if_changed` alone
+            raise
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError):
             raise Offline(f"{self._name(path)}: refused, no permission", hint=_CLOCK) from None
         except (exceptions.BaseError, OSError) as error:

@@ -70,6 +70,11 @@ class DirectoryStore:
         data = self._read(path, max_bytes)
         return data, {"sha256": sha256(data).digest(), "size": len(data)}
 
+    def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
+        """Return a whole file and its hash, unless that is the one of ``tag``."""
+        found = self.get_tagged(path, max_bytes)
+        return None if found[1] == tag else found
+
     def head(self, path: str) -> Listed | None:
         """Return a file's size and age."""
         try:

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from shmmap.errors import MapDataError
+from shmmap.origin.remote.object_tier import KeptObjects
 from shmmap.origin.remote.published_object import CellIdentity, ObjectName, unpack_object, write_segment
-from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.segment.layout import SegmentHeader
 
@@ -15,7 +15,7 @@ __all__ = ["fetch_segment"]
 
 
 def fetch_segment(
-    store: Store,
+    objects: KeptObjects,
     name: ObjectName,
     identity: CellIdentity,
     layer: str,
@@ -46,22 +46,22 @@ def fetch_segment(
     Raises
     ------
     Offline
-        The store does not answer, or refuses.
+        It is not in the tier, and the store does not answer, or refuses.
     MapMissing
-        The object is gone.
+        The store does not have it either.
     MapDataError
         It is damaged (cause ``damaged``), or made by a later version (``newer``).
     OSError
         ENOSPC if the file system is full.
     """
-    frame = store.get_exactly(name.path, name.size)
-    header = write_segment(
-        unpack_object(frame, name), fd, identity, layer, name=f"{store.url}/{name.path}", reserve=reserve
-    )
+    frame = objects.read(name.sha256, name.size)
+    path = f"{objects.url}/{name.path}"
+    unpacked = unpack_object(frame, name, verified=True)
+    header = write_segment(unpacked, fd, identity, layer, name=path, reserve=reserve)
     if builder_version is not None and header.builder_version != builder_version:
         raise MapDataError(
             f"builder version {header.builder_version}, the map says {builder_version}",
-            path=f"{store.url}/{name.path}",
+            path=path,
             cause=DAMAGED,
         )
     return header

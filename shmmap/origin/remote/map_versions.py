@@ -22,7 +22,7 @@ from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.published_object import blob_path
-from shmmap.origin.remote.store import Store, Tag
+from shmmap.origin.remote.store import ObjectReader, Store, Tag
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "new_entry",
     "pack_json",
     "read_current",
+    "read_current_again",
     "read_entry",
     "read_root",
     "read_root_object",
@@ -126,6 +127,26 @@ def read_current(store: Store) -> CurrentState:
     return CurrentState(unpack_current(data, f"{store.url}/{CURRENT}"), tag)
 
 
+def read_current_again(store: Store, seen: CurrentState) -> CurrentState:
+    """Return which version is current now; what was seen before is not sent again where it still is.
+
+    Raises
+    ------
+    MapMissing
+        There is none any more.
+    MapDataError, Offline
+        As `read_current`.
+    """
+    if seen.tag is None:
+        found = None
+    else:
+        found = store.get_if_changed(CURRENT, _MAX_JSON_BYTES, seen.tag)
+        if found is None:
+            return seen
+    data, tag = found if found is not None else store.get_tagged(CURRENT, _MAX_JSON_BYTES)
+    return CurrentState(unpack_current(data, f"{store.url}/{CURRENT}"), tag)
+
+
 def require_current(store: Store) -> Current:
     """Return which version is current; `MapMissing` where nothing is published."""
     found = read_current(store).current
@@ -185,7 +206,7 @@ def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
             return
 
 
-def read_root(store: Store, current: Current) -> Root:
+def read_root(store: ObjectReader, current: Current) -> Root:
     """Return the root of a version, verified.
 
     Raises
@@ -201,7 +222,7 @@ def root_path(current: Current) -> str:
     return blob_path(bytes.fromhex(current.root))
 
 
-def read_root_object(store: Store, current: Current) -> bytes:
+def read_root_object(store: ObjectReader, current: Current) -> bytes:
     """Return the object of a version's root, its hash compared; errors are those of `read_root`."""
     path = root_path(current)
     data = bytes(store.get_exactly(path, current.bytes))
@@ -210,12 +231,12 @@ def read_root_object(store: Store, current: Current) -> bytes:
     return data
 
 
-def read_shard_object(store: Store, root: Root, number: int) -> memoryview:
+def read_shard_object(store: ObjectReader, root: Root, number: int) -> memoryview:
     """Return the object of a shard; `unpack_shard` compares its hash."""
     return store.get_exactly(blob_path(root.shard_sha256(number)), int(root.sizes[number]))
 
 
-def read_shards(store: Store, root: Root) -> Iterator[Shard]:
+def read_shards(store: ObjectReader, root: Root) -> Iterator[Shard]:
     """All shards of a root in order, several read at a time; errors are those of `read_root`."""
 
     def read(number: int) -> Shard:

@@ -26,9 +26,11 @@ from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.version import cell_version
 
 __all__ = [
+    "ENCODINGS",
     "EXACT",
     "MAX_ROOT_BYTES",
     "MAX_SHARD_BYTES",
+    "MILLIMETRES",
     "POINTS",
     "LayerObjects",
     "Root",
@@ -51,6 +53,9 @@ FORMAT: Final = "shmmap published map"
 READER: Final = 1
 """The version of this reader: a root that needs a greater one is refused."""
 EXACT: Final = "exact"
+MILLIMETRES: Final = "mm"
+ENCODINGS: Final = (EXACT, MILLIMETRES)
+"""How points may be published; of those in millimetres some cells are exact."""
 
 _MAX_LAYERS: Final = 64
 _MAX_SPEC_CHARACTERS: Final = 200
@@ -126,7 +131,7 @@ class Root:
     crs, origin, unit_m
         Where the frame lies, see `shmmap.origin.map_frame.MapFrame`.
     encoding
-        ``exact`` (``mm`` is reserved).
+        One of `ENCODINGS`.
     bounds
         Box around all cells, metres, map frame.
     shard_m
@@ -236,10 +241,10 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
     head = _decode(unpacked, _Head, wrong)
     if head.format != FORMAT:
         raise wrong(f"its format is {head.format[:40]!r}, not {FORMAT!r}")
-    if head.min_reader > READER or head.encoding != EXACT:
+    if head.min_reader > READER or head.encoding not in ENCODINGS:
         raise MapDataError(
             f"it needs reader {head.min_reader} and encoding {head.encoding[:40]!r};"
-            f" this is reader {READER}, for {EXACT!r}",
+            f" this is reader {READER}, for {' and '.join(ENCODINGS)}",
             path=name,
             cause="newer",
             hint="update shmmap",

@@ -10,19 +10,29 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
+import xxhash
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, SegmentCorrupt
+from shmmap.origin.remote.millimetres import MillimetrePoints, from_millimetres, to_millimetres
 from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
 from shmmap.segment.header import pack_header, unpack_header
-from shmmap.segment.layout import NO_SOURCE, TAIL_BYTES, Column, SegmentHeader, SourceStamp, header_size
+from shmmap.segment.layout import (
+    ALIGNMENT_BYTES,
+    NO_SOURCE,
+    TAIL_BYTES,
+    Column,
+    SegmentHeader,
+    SourceStamp,
+    header_size,
+)
 from shmmap.segment.writer import write_all
 
 __all__ = [
@@ -46,9 +56,14 @@ STAMP_BYTES: Final = 24
 
 FLAGS_AT: Final = 208
 PLANES: Final = 1
-MILLIMETRES: Final = 2  # reserved: not written yet, and refused
+MILLIMETRES: Final = 2
+MM_ORIGIN_AT: Final = 296
+XYZ: Final = "xyz"
 MAX_PLANED_COMPONENTS: Final = 8
 _FLAGS: Final = struct.Struct("<I")
+_MM_ORIGIN: Final = struct.Struct("<3d")
+_COUNTS: Final = np.dtype("<u2")
+_XYZ: Final = np.dtype("<f4")
 _BLOCK_ROWS: Final = 1 << 14  # at a time: what is read and written stays in the cache
 
 
@@ -99,8 +114,13 @@ class CellIdentity:
 # --- out of a segment ---------------------------------------------------------------------------------
 
 
-def bare_object(segment: memoryview) -> bytearray:
+def bare_object(segment: memoryview, *, millimetres: bool = False) -> bytearray:
     """Return the unpacked object of a prepared segment, publish block empty.
+
+    Parameters
+    ----------
+    millimetres
+        Points are rounded, see `shmmap.origin.remote.millimetres`; those that cannot be stay exact.
 
     Raises
     ------
@@ -114,15 +134,22 @@ def bare_object(segment: memoryview) -> bytearray:
     bare = msgspec.structs.replace(
         bare, cell_id="", frame_id="", box=(0.0, 0.0, 0.0, 0.0), source=NO_SOURCE, source_digest=bytes(16)
     )
+    arrays = [_rows(segment, column) for column in header.columns]
+    flags, mm_origin = PLANES, b""
+    rounded = _rounded_points(segment, header) if millimetres else None
+    if rounded is not None:
+        flags |= MILLIMETRES
+        mm_origin = _MM_ORIGIN.pack(*rounded.origin.tolist())
+        bare, arrays = _in_millimetres(bare, arrays, rounded)
     unpacked = bytearray(bare.total_bytes)
-    unpacked[:header_bytes] = _flagged(pack_header(bare), PLANES)
-    for column in filter(_has_bytes, header.columns):
-        count = _plane_count(column)
-        rows = np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(-1, count)
-        planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset + shift).reshape(count, -1)
+    unpacked[:header_bytes] = _flagged(pack_header(bare), flags, mm_origin)
+    for column, rows in zip(bare.columns, arrays, strict=True):
+        planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(rows.shape[::-1])
         for begin in range(0, len(rows), _BLOCK_ROWS):
             end = begin + _BLOCK_ROWS
-            for plane in range(count):  # one at a time is up to three times as fast as a transposed copy
+            for plane in range(
+                len(planes)
+            ):  # one at a time is up to three times as fast as a transposed copy
                 planes[plane, begin:end] = rows[begin:end, plane]
     return unpacked
 
@@ -145,16 +172,13 @@ def _moved(header: SegmentHeader, shift: int) -> SegmentHeader:
     )
 
 
-def _flagged(page: bytes, flags: int) -> bytearray:
+def _flagged(page: bytes, flags: int, mm_origin: bytes) -> bytearray:
     flagged = bytearray(page)
     _FLAGS.pack_into(flagged, FLAGS_AT, flags)
+    flagged[MM_ORIGIN_AT : MM_ORIGIN_AT + len(mm_origin)] = mm_origin
     end = len(page) - TAIL_BYTES
     _FLAGS.pack_into(flagged, end, zlib.crc32(memoryview(flagged)[:end]))
     return flagged
-
-
-def _has_bytes(column: Column) -> bool:
-    return column.nbytes > 0
 
 
 def _plane_count(column: Column) -> int:
@@ -165,11 +189,67 @@ def _plane_count(column: Column) -> int:
     return itemsize
 
 
+def _rows(segment: memoryview, column: Column) -> NDArray[np.uint8]:
+    """The bytes of a column, (rows, bytes of one)."""
+    count = _plane_count(column)
+    return np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(-1, count)
+
+
+def _rounded_points(segment: memoryview, header: SegmentHeader) -> MillimetrePoints | None:
+    """Points in millimetres; None if the segment has none, or they stay exact."""
+    for column in header.columns:
+        if (column.name, column.dtype, column.shape) == (XYZ, _XYZ, (header.rows, 3)) and header.rows:
+            return to_millimetres(np.frombuffer(segment, _XYZ, 3 * header.rows, column.offset).reshape(-1, 3))
+    return None
+
+
+def _in_millimetres(
+    bare: SegmentHeader, arrays: list[NDArray[np.uint8]], rounded: MillimetrePoints
+) -> tuple[SegmentHeader, list[NDArray[np.uint8]]]:
+    """Return header and rows of points in millimetres: what the checksums are of is what a reader makes."""
+    xyz = rounded.xyz
+    columns, ordered = [], []
+    for column, rows in zip(bare.columns, arrays, strict=True):
+        if column.name == XYZ:
+            ordered.append(rounded.counts.view(np.uint8))
+            checksum = xxhash.xxh3_64_intdigest(xyz.data)
+            columns.append(
+                msgspec.structs.replace(
+                    column, dtype=_COUNTS, nbytes=rounded.counts.nbytes, checksum=checksum
+                )
+            )
+        else:
+            ordered.append(rows[rounded.order])
+            columns.append(
+                msgspec.structs.replace(column, checksum=xxhash.xxh3_64_intdigest(ordered[-1].data))
+            )
+    placed, total_bytes = _placed(columns, bare.header_bytes)
+    z = xyz[:, 2]
+    header = msgspec.structs.replace(
+        bare, columns=placed, total_bytes=total_bytes, z_min=float(z.min()), z_max=float(z.max())
+    )
+    return header, ordered
+
+
+def _placed(columns: Sequence[Column], header_bytes: int) -> tuple[tuple[Column, ...], int]:
+    """Place columns one after the other, each 64-byte aligned; returns them and the total bytes."""
+    placed, offset = [], header_bytes
+    for column in columns:
+        placed.append(msgspec.structs.replace(column, offset=offset))
+        offset = -(-(offset + column.nbytes) // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
+    return tuple(placed), offset
+
+
 # --- into a segment -----------------------------------------------------------------------------------
 
 
-def unpack_object(frame: bytes | memoryview, name: ObjectName) -> bytes:
+def unpack_object(frame: bytes | memoryview, name: ObjectName, *, verified: bool = False) -> bytes:
     """Verify an object against its name and return what is in its frame.
+
+    Parameters
+    ----------
+    verified
+        Its hash was compared already.
 
     Raises
     ------
@@ -179,7 +259,7 @@ def unpack_object(frame: bytes | memoryview, name: ObjectName) -> bytes:
     path = name.path
     if len(frame) != name.size:
         raise MapDataError(f"it has {len(frame):,} bytes, not {name.size:,}", path=path, cause=DAMAGED)
-    if sha256(frame).digest() != name.sha256:
+    if not verified and sha256(frame).digest() != name.sha256:
         raise MapDataError("its SHA-256 is not its name", path=path, cause=DAMAGED)
     return unpack_frame(frame, name.raw, name=path, exact=True)
 
@@ -230,17 +310,26 @@ def write_segment(
         source=SourceStamp.from_token(identity.stamp),
         source_digest=identity.stamp[:16],
     )
+    mm_origin = _mm_origin(unpacked)
+    if mm_origin is not None:
+        columns, total_bytes = _placed([_decoded(column) for column in header.columns], header.header_bytes)
+        header = msgspec.structs.replace(header, columns=columns, total_bytes=total_bytes)
     page = pack_header(header)
     if reserve is not None:
         reserve(header.total_bytes)
     os.ftruncate(fd, header.total_bytes)
-    for column in filter(_has_bytes, bare.columns):
-        _write_rows(fd, unpacked, column, column.offset + shift)
+    for column, target in zip(bare.columns, header.columns, strict=True):
+        offset = target.offset
+        for rows in _decoded_blocks(unpacked, column, mm_origin):
+            write_all(fd, rows.data.cast("B"), offset)
+            offset += rows.nbytes
     write_all(fd, memoryview(page), 0)
     return header
 
 
-def read_bare_header(unpacked: bytes | memoryview, layer: str, *, name: str = "") -> SegmentHeader:
+def read_bare_header(
+    unpacked: bytes | bytearray | memoryview, layer: str, *, name: str = ""
+) -> SegmentHeader:
     """Return the header of an unpacked object; errors are those of `write_segment`."""
     view = memoryview(unpacked)
     try:
@@ -252,24 +341,56 @@ def read_bare_header(unpacked: bytes | memoryview, layer: str, *, name: str = ""
             f"it has {len(view):,} bytes, its header says {header.total_bytes:,}", path=name, cause=DAMAGED
         )
     (flags,) = _FLAGS.unpack_from(view, FLAGS_AT)
-    if flags != PLANES:
+    if flags not in (PLANES, PLANES | MILLIMETRES):
         raise MapDataError(
-            f"its flags are {flags:#x}, this program reads {PLANES:#x}",
+            f"its flags are {flags:#x}, this program reads {PLANES:#x} and {PLANES | MILLIMETRES:#x}",
             path=name,
             cause="newer",
             hint="update shmmap",
         )
     if header.layer != layer:
         raise MapDataError(f"it is layer {header.layer!r}, not {layer!r}", path=name, cause=DAMAGED)
+    if (mm_origin := _mm_origin(view)) is not None:
+        counts = [c for c in header.columns if (c.name, c.dtype, c.shape) == (XYZ, _COUNTS, (header.rows, 3))]
+        if len(counts) != 1 or not np.isfinite(mm_origin).all():
+            raise MapDataError("its points are not what their flag says", path=name, cause=DAMAGED)
     return header
 
 
 def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray[Any]:
-    """Return a column of an unpacked object as it will be in memory, dtype and shape as its header says."""
+    """Return a column of an unpacked object as it will be in memory, shape as its header says."""
+    mm_origin = _mm_origin(unpacked)
+    dtype = column.dtype if mm_origin is None else _decoded(column).dtype
     if not column.nbytes:
-        return np.empty(column.shape, column.dtype)
-    rows = np.concatenate([block.copy() for block in _row_blocks(unpacked, column)])
-    return rows.reshape(-1).view(column.dtype).reshape(column.shape)
+        return np.empty(column.shape, dtype)
+    rows = np.concatenate([block.copy() for block in _decoded_blocks(unpacked, column, mm_origin)])
+    return rows.reshape(-1).view(dtype).reshape(column.shape)
+
+
+def _mm_origin(unpacked: bytes | bytearray | memoryview) -> NDArray[np.float64] | None:
+    """Where the counts of points in millimetres begin; None where they are exact."""
+    (flags,) = _FLAGS.unpack_from(unpacked, FLAGS_AT)
+    return np.array(_MM_ORIGIN.unpack_from(unpacked, MM_ORIGIN_AT)) if flags & MILLIMETRES else None
+
+
+def _decoded(column: Column) -> Column:
+    """The column as it will be in memory, of an object in millimetres."""
+    if column.name != XYZ:
+        return column
+    return msgspec.structs.replace(column, dtype=_XYZ, nbytes=2 * column.nbytes)
+
+
+def _decoded_blocks(
+    unpacked: bytes | bytearray | memoryview, column: Column, mm_origin: NDArray[np.float64] | None
+) -> Iterator[NDArray[Any]]:
+    """The rows of a column as they will be in memory, some at a time; valid until the next are taken."""
+    if not column.nbytes:
+        return
+    for rows in _row_blocks(unpacked, column):
+        if mm_origin is not None and column.name == XYZ:
+            yield from_millimetres(rows.view(_COUNTS), mm_origin)
+        else:
+            yield rows
 
 
 def _row_blocks(unpacked: bytes | bytearray | memoryview, column: Column) -> Iterator[NDArray[np.uint8]]:
@@ -283,9 +404,3 @@ def _row_blocks(unpacked: bytes | bytearray | memoryview, column: Column) -> Ite
         for plane in range(count):
             rows[:, plane] = block[plane]
         yield rows
-
-
-def _write_rows(fd: int, unpacked: bytes | memoryview, column: Column, offset: int) -> None:
-    for rows in _row_blocks(unpacked, column):
-        write_all(fd, rows.data.cast("B"), offset)
-        offset += rows.nbytes

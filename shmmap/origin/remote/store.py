@@ -19,8 +19,10 @@ __all__ = [
     "BUCKET_SCHEMES",
     "HASTY",
     "PATIENT",
+    "PROBE",
     "WEB_SCHEMES",
     "Listed",
+    "ObjectReader",
     "Patience",
     "Store",
     "StoreUrl",
@@ -46,16 +48,33 @@ class Listed(NamedTuple):
     modified_s: float
 
 
-class Store(Protocol):
+class ObjectReader(Protocol):
+    """Reads whole objects whose size is known; may be called in threads."""
+
+    @property
+    def url(self) -> str:
+        """Where it is, as a person would name it."""
+
+    def get_exactly(self, path: str, nbytes: int) -> memoryview:
+        """Return an object of so many bytes.
+
+        Raises
+        ------
+        Offline
+            Nothing answers in time, or the answer is a refusal.
+        MapMissing
+            There is none.
+        MapDataError
+            It has more or fewer bytes.
+        """
+
+
+class Store(ObjectReader, Protocol):
     """Objects below one URL.  All methods may be called in threads.
 
     Every method raises `Offline` where nothing answers in time or the answer is a refusal, and `CannotWrite`
     where a directory's disk is full or not writable.  No message holds a credential.
     """
-
-    @property
-    def url(self) -> str:
-        """Where it is, as a person would name it."""
 
     @property
     def read_only(self) -> str:
@@ -72,11 +91,11 @@ class Store(Protocol):
             It has more than ``max_bytes``; it is not read.
         """
 
-    def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object of so many bytes; `MapDataError` if it has more or fewer."""
-
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
         """Return a whole object, and the tag of this state of it."""
+
+    def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
+        """Return a whole object and its tag; None if it still is in the state that ``tag`` names."""
 
     def head(self, path: str) -> Listed | None:
         """Return an object's size and age; None if there is none."""
@@ -107,8 +126,10 @@ class Patience:
     retry_s: float
 
 
-HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.0)
-"""For what somebody waits for."""
+HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
+"""For what somebody waits for: a server that says nothing is asked once more, as is one that falls silent."""
+PROBE: Final = Patience(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
+"""To find out whether a server is back."""
 PATIENT: Final = Patience(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
 """For long runs."""
 

@@ -15,7 +15,7 @@ import pytest
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.doctor import access, kernel, lifetime, live, memory
+from shmmap.doctor import access, disk_cache, kernel, lifetime, live, memory
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
@@ -86,6 +86,61 @@ def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
     for one in findings:
         assert one.fact
         assert one.advice or one.state == "ok", one
+
+
+# --- disk cache ---
+
+
+def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    uid = os.geteuid()
+    assert disk_cache.check_disk_cache(ward.patient(cache_bytes=0)).skipped
+    assert disk_cache.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town")).skipped
+    ward.file("/var/town/layers/ab/1.layer", "x" * 5000)
+    ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x" * 5000)
+    found = disk_cache.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town", cache_bytes=1 << 20))
+    assert (found.state, found.advice) == ("ok", "")
+    assert found.fact.startswith("/var/town: 9.8 KiB of 1.0 MiB used, ")
+    monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
+    assert disk_cache.check_disk_cache(ward.patient(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+
+
+@pytest.mark.parametrize("mode", [0o775, 0o1777])
+def test_a_disk_cache_that_others_may_write(ward: Ward, mode: int) -> None:
+    ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x")
+    ward.root.joinpath("var/town/objects").chmod(mode)
+    found = disk_cache.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    assert found.state == "warn"
+    assert f"/var/town/objects may be written by other users (mode {mode:04o})" in found.fact
+    assert "chmod go-w /var/town/objects" in found.advice
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("which", ["var/town", "var/town/objects"])
+def test_a_disk_cache_of_another_user(ward: Ward, which: str) -> None:
+    ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x")
+    os.chown(ward.root / which, USER, -1)
+    found = disk_cache.check_disk_cache(ward.patient(uid=0, cache_dir="/var/town"))
+    assert found.state == "warn"
+    assert f"belongs to user {USER}" in found.fact or f"belongs to {USER}" in found.fact
+    for name in ("var/town", "var/town/objects"):
+        os.chown(ward.root / name, USER, -1)
+    assert disk_cache.check_disk_cache(ward.patient(uid=USER, cache_dir="/var/town")).state == "ok"
+
+
+def test_a_disk_cache_that_is_none(ward: Ward) -> None:
+    ward.file("/var/town", "a file")
+    found = disk_cache.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    assert (found.state, found.fact) == ("warn", "/var/town is no directory")
+
+
+def test_a_disk_cache_without_room(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
+    ward.file("/var/town/layers/ab/1.layer", "x")
+    here = os.statvfs(ward.root)
+    full = os.statvfs_result((*here[:4], here.f_blocks // 25, *here[5:]))  # f_bavail
+    monkeypatch.setattr(os, "statvfs", lambda _: full)
+    found = disk_cache.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    assert found.state == "warn"
+    assert "nothing more is kept" in found.fact
 
 
 # --- memory ---

@@ -237,26 +237,26 @@ def test_the_least_recently_used_go_first(one: Bench) -> None:
     os.utime(interim, (1, 1))
     fresh = Path(one.cache.directory) / ".new-running"
     fresh.write_bytes(b"half")
-    one.cache.limit_bytes = sum(sizes.values()) - 1
-    assert one.cache.trim() == sum(sizes.values()) - sizes[LAYERS[0]]
+    one.cache.budget.limit_bytes = sum(sizes.values()) - 1
+    assert one.cache.budget.trim() == sum(sizes.values()) - sizes[LAYERS[0]]
     assert [one.cache.has(one.key(layer)) for layer in LAYERS] == [False, True, True, True]
     assert not interim.exists()
     assert fresh.exists()
     assert len(one.files()) == 6  # both names of what went are gone
-    one.cache.limit_bytes = 0
-    assert one.cache.trim() == 0
+    one.cache.budget.limit_bytes = 0
+    assert one.cache.budget.trim() == 0
     assert one.files() == []
 
 
 def test_what_is_larger_than_the_limit_is_not_stored(one: Bench) -> None:
-    one.cache.limit_bytes = 5000
+    one.cache.budget.limit_bytes = 5000
     made, _ = one.make(LAYERS[1])
     assert not made.cached
     assert one.files() == []
 
 
 def test_trims_as_it_grows(one: Bench) -> None:
-    one.cache.limit_bytes = 60_000
+    one.cache.budget.limit_bytes = 60_000
     for points in range(300, 330):
         one.write(points)
         one.make("voxel(leaf=0.5)")

@@ -26,11 +26,14 @@ class OriginHealth:
     ----------
     failed_in_a_row
         Loads that failed since the last one that succeeded.
+    unreachable
+        It is known otherwise that it does not answer.
     slow_s, mean_s
         Time that few of the last loads exceeded (5 %), and their mean time; 0 before the first.
     """
 
     failed_in_a_row: int = 0
+    unreachable: bool = False
     slow_s: float = 0.0
     mean_s: float = 0.0
     _took_s: deque[float] = field(default_factory=lambda: deque(maxlen=LOADS))
@@ -39,7 +42,7 @@ class OriginHealth:
     @property
     def is_out(self) -> bool:
         """Whether nothing can be loaded just now."""
-        return self.failed_in_a_row >= IN_A_ROW
+        return self.unreachable or self.failed_in_a_row >= IN_A_ROW
 
     def next_try_s(self) -> float:
         """Until when nothing is tried: minus infinity unless nothing can be loaded."""

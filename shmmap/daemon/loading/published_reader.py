@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads cells of a published map in a loader: objects are fetched at once, and verified before use."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from shmmap.errors import LoadFailed, MapDataError, Offline, ShmmapError
+from shmmap.layers.contract import Box, PointTable
+from shmmap.layers.derive import CellJob
+from shmmap.layers.points import LAYER
+from shmmap.layers.sources import CellSource
+from shmmap.layers.spec import LayerSpec
+from shmmap.origin.remote.object_tier import KeptObjects
+from shmmap.origin.remote.published_object import (
+    CellIdentity,
+    ObjectName,
+    read_bare_header,
+    rows_of,
+    write_segment,
+)
+from shmmap.origin.remote.published_source import LayerSource, stamp_of, unpack_source
+from shmmap.origin.remote.serving_store import ServedFrom, kept_objects, open_for_serving
+from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
+from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.source import Source
+from shmmap.segment.version import Stamp
+
+__all__ = ["AT_ONCE", "PublishedReader"]
+
+AT_ONCE: Final = 32
+"""Objects that a loader fetches at once, as long as they are small."""
+MOST_BYTES: Final = 8 << 20
+"""Of larger ones fewer are fetched or held at once; always one."""
+_STACK_BYTES: Final = 512 << 10
+"""Of a thread: what a loader may take of memory counts them whole."""
+
+
+@dataclass(eq=False, slots=True)
+class _Fetch:
+    """An object that jobs need; ``frame`` is it, or why it could not be had, once that is known."""
+
+    name: ObjectName
+    jobs: set[int] = field(default_factory=set)
+    begun: bool = False
+    frame: memoryview | ShmmapError | None = None
+
+
+def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
+    """Return the frame of an object, verified.
+
+    Raises
+    ------
+    MapDataError, MapMissing, Offline
+        It is damaged, gone, or out of reach.
+    """
+    try:
+        return objects.read(name.sha256, name.size)
+    except MapDataError:  # it may have been damaged on its way
+        return objects.read(name.sha256, name.size)
+
+
+class ObjectFetcher:
+    """Fetches what jobs need, in threads; see `shmmap.layers.source_reader.Fetcher`.
+
+    What two jobs need is fetched once.  As soon as one object is out of reach, so are those that have not
+    been begun: who waits for many would wait for one after the other.
+    """
+
+    def __init__(self, objects: KeptObjects) -> None:
+        self._objects = objects
+        self._lock = threading.Lock()
+        threading.stack_size(_STACK_BYTES)
+        self._threads = ThreadPoolExecutor(AT_ONCE, "fetch")  # the loader's end waits for none of them
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
+        self._fetches: dict[bytes, _Fetch] = {}
+        self._lacking: dict[int, set[bytes]] = {}
+        self._needs: dict[int, tuple[bytes, ...]] = {}
+        self._queue: deque[_Fetch] = deque()
+        self._done: deque[int] = deque()
+        self._at_work = 0
+        self._under_way = 0
+        self._held_bytes = 0
+
+    def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
+        """Begin to fetch what a layer of a cell is made from."""
+        names = {name.sha256: name for name in _needed(spec, job)}
+        with self._lock:
+            self._forget_last()
+            self._needs[number] = tuple(names)
+            lacking = self._lacking[number] = set()
+            for digest, name in names.items():
+                fetch = self._fetches.get(digest)
+                if fetch is None:
+                    fetch = self._fetches[digest] = _Fetch(name)
+                    self._queue.append(fetch)
+                fetch.jobs.add(number)
+                if fetch.frame is None:
+                    lacking.add(digest)
+            if not lacking:
+                self._finish(number)
+            self._begin_some()
+
+    def done(self) -> int | None:
+        """Return the number of a job for which all is here, or will not come."""
+        with self._lock:
+            self._forget_last()
+            try:
+                os.eventfd_read(self.fd)
+            except BlockingIOError:
+                return None
+            self._at_work = self._done.popleft()
+            self._begin_some()
+            return self._at_work
+
+    def get(self, name: ObjectName) -> memoryview:
+        """Return an object that was fetched for the job at work, or fetch it."""
+        with self._lock:
+            fetch = self._fetches.get(name.sha256)
+            frame = fetch.frame if fetch is not None else None
+        if isinstance(frame, ShmmapError):
+            raise frame
+        return frame if frame is not None else _get(self._objects, name)
+
+    def _fetch(self, fetch: _Fetch) -> None:
+        """Fetch an object, in a thread."""
+        frame: memoryview | ShmmapError
+        try:
+            frame = _get(self._objects, fetch.name)
+        except ShmmapError as error:
+            frame = error
+        except Exception as error:  # noqa: BLE001  else the job would wait for ever
+            frame = LoadFailed(f"{fetch.name.path}: {type(error).__name__}: {error}")
+        with self._lock:
+            self._under_way -= 1
+            self._over(fetch, frame)
+            if isinstance(frame, Offline):
+                while self._queue:
+                    self._over(self._queue.popleft(), frame)
+            self._begin_some()
+
+    # --- under the lock ---------------------------------------------------------------------------
+
+    def _forget_last(self) -> None:
+        """Drop what the last job needed, now that it has been worked on."""
+        for digest in self._needs.pop(self._at_work, ()):
+            fetch = self._fetches[digest]
+            fetch.jobs.discard(self._at_work)
+            if not fetch.jobs:
+                del self._fetches[digest]
+                self._held_bytes -= fetch.name.size * fetch.begun
+        self._at_work = 0
+        self._begin_some()
+
+    def _finish(self, number: int) -> None:
+        del self._lacking[number]
+        self._done.append(number)
+        os.eventfd_write(self.fd, 1)
+
+    def _begin_some(self) -> None:
+        while self._queue and self._under_way < AT_ONCE:
+            fetch = self._queue[0]
+            is_much = self._held_bytes and self._held_bytes + fetch.name.size > MOST_BYTES
+            if is_much and (self._under_way or self._done):
+                break  # what is held goes when its job is done; without one to do there would be no end
+            self._queue.popleft()
+            fetch.begun = True
+            self._under_way += 1
+            self._held_bytes += fetch.name.size
+            self._threads.submit(self._fetch, fetch)
+
+    def _over(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
+        fetch.frame = frame
+        for number in fetch.jobs:
+            lacking = self._lacking.get(number)
+            if lacking is not None:
+                lacking.discard(fetch.name.sha256)
+                if not lacking:
+                    self._finish(number)
+
+
+def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
+    """Objects that a layer of a cell is made from."""
+    own = unpack_source(job.source)
+    if job.ready:
+        yield own[str(spec)].name
+        return
+    yield own[LAYER].name
+    for near in job.neighbours:
+        yield unpack_source(near.source)[LAYER].name
+
+
+class PublishedReader:
+    """Reads sources that are objects of a published map; see `shmmap.layers.source_reader.SourceReader`."""
+
+    def __init__(self, served: ServedFrom, cache_dir: str, cache_bytes: int) -> None:
+        store = open_for_serving(served)
+        self._url = store.url
+        self.fetcher = ObjectFetcher(kept_objects(store, cache_dir, cache_bytes, quiet=True))
+
+    def stamp(self, source: Source) -> Stamp:
+        """Return the state that its objects are of: they never change."""
+        return stamp_of(source)
+
+    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
+        """Read the columns that a layer needs of a cell's points.
+
+        Raises
+        ------
+        LoadFailed
+            They are damaged: a layer made without them would be another one than its version says.
+        """
+        name = unpack_source(source)[LAYER].name
+        try:
+            unpacked = self._unpacked(name)
+            header = read_bare_header(unpacked, LAYER, name=self._path(name))
+        except MapDataError as error:
+            raise LoadFailed(str(error), cell_id=source.name) from None
+        stamp = self.stamp(source)
+        columns: dict[str, NDArray[Any]] = {
+            column.name: rows_of(unpacked, column)
+            for column in header.columns
+            if needs is None or column.name in needs
+        }
+        units = {column.name: column.unit for column in header.columns if column.name in columns}
+        return CellSource(
+            points=PointTable(columns, units, box),
+            stamp=SourceStamp.from_token(stamp),
+            digest=stamp[:16],
+            source_points=header.source_points,
+            dropped_points=header.dropped_points,
+            z_min=header.z_min,
+            z_max=header.z_max,
+            outside_points=header.outside_points,
+        )
+
+    def fill(
+        self,
+        spec: LayerSpec,
+        job: CellJob,
+        fd: int,
+        *,
+        reserve: Callable[[int], None] | None,
+        warn: Callable[[str], None],
+    ) -> SegmentHeader | None:
+        """Write a layer that is published into a segment file; None: it has to be computed."""
+        del warn
+        if not job.ready and spec.kind.name != LAYER:
+            return None
+        layer: LayerSource = unpack_source(job.source)[str(spec)]
+        identity = CellIdentity(job.cell_id, job.box, job.frame_id, self.stamp(job.source))
+        path = self._path(layer.name)
+        header = write_segment(
+            self._unpacked(layer.name), fd, identity, str(spec), name=path, reserve=reserve
+        )
+        if header.builder_version != layer.builder_version:
+            raise MapDataError(
+                f"builder version {header.builder_version}, the map says {layer.builder_version}",
+                path=path,
+                cause=DAMAGED,
+            )
+        return header
+
+    def named(self, message: str) -> str:
+        """Names of cells are what they are."""
+        return message
+
+    def explain(self, source: Source, message: str) -> str:
+        """Say what is wrong as it is."""
+        del source
+        return message
+
+    def _unpacked(self, name: ObjectName) -> bytes:
+        return unpack_frame(self.fetcher.get(name), name.raw, name=self._path(name), exact=True)
+
+    def _path(self, name: ObjectName) -> str:
+        return f"{self._url}/{name.path}"

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asks, in a thread, whether an origin elsewhere has another version, and whether it is back in reach."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import random
+import threading
+import time
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from shmmap.errors import Offline, ShmmapError
+from shmmap.logfmt import log
+
+__all__ = ["LinkNews", "OriginLink"]
+
+PROBE_S: Final = 1.0
+"""How often an origin that is out of reach is asked."""
+JITTER: Final = 0.2
+"""Of the time between two questions: a fleet must not ask all at once."""
+END_S: Final = 0.5
+
+
+class LinkNews(NamedTuple):
+    """What was found since the last time: another version is there; the origin answers again."""
+
+    changed: bool
+    back: bool
+
+
+class OriginLink:
+    """One origin, as it answers.
+
+    Parameters
+    ----------
+    ask
+        Asks it whether there is another version than the one that was taken last; raises `Offline`.
+    poll_s
+        How often, seconds; 0: only to find out whether it answers again.
+
+    Attributes
+    ----------
+    fd
+        Readable when there are news: call `take` then.
+    """
+
+    def __init__(self, ask: Callable[[], bool], poll_s: float) -> None:
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._ask = ask
+        self._poll_s = poll_s
+        self._condition = threading.Condition()
+        self._is_out = False
+        self._changed = self._back = False
+        self._closed = self._now = False
+        self._thread: threading.Thread | None = None
+        if poll_s:
+            self._start()
+
+    @property
+    def is_out(self) -> bool:
+        """Whether it did not answer when it was last asked for anything."""
+        return self._is_out
+
+    def doubt(self) -> None:
+        """Something could not be had: find out when it can.  May be called in any thread."""
+        with self._condition:
+            if not self._is_out:
+                self._is_out = True
+                log.warning("the map's origin is out of reach")
+                os.eventfd_write(self.fd, 1)
+            if not self._closed:
+                self._start()
+                self._condition.notify()
+
+    def ask_now(self) -> None:
+        """Ask without waiting for the next time."""
+        with self._condition:
+            self._now = True
+            self._start()
+            self._condition.notify()
+
+    def take(self) -> LinkNews:
+        """Return what was found since the last time."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.fd)
+        with self._condition:
+            news = LinkNews(self._changed, self._back)
+            self._changed = self._back = False
+        return news
+
+    def _start(self) -> None:
+        if self._thread is None:
+            thread = threading.Thread(target=self._run, name="origin", daemon=True)
+            with contextlib.suppress(RuntimeError):  # as many threads as there may be: at the next doubt
+                thread.start()
+                self._thread = thread
+
+    def _run(self) -> None:
+        asked_s = -math.inf if self._is_out else time.monotonic()
+        while True:
+            wait_s = self._poll_s * random.uniform(1 - JITTER, 1 + JITTER)  # noqa: S311  no secret
+            with self._condition:
+                while not self._closed:
+                    due_s = asked_s + (PROBE_S if self._is_out else wait_s or math.inf)
+                    now_s = time.monotonic()
+                    if now_s >= due_s or self._now:
+                        break
+                    self._condition.wait(min(due_s - now_s, threading.TIMEOUT_MAX))
+                if self._closed:
+                    return
+                self._now = False
+            asked_s = time.monotonic()
+            self._look()
+
+    def _look(self) -> None:
+        try:
+            changed, answers = self._ask(), True
+        except Offline:
+            changed, answers = False, False
+        except ShmmapError as error:
+            log.error("the map's origin gives no version", reason=error)
+            changed, answers = False, True
+        except Exception:  # noqa: BLE001  else it would never be asked again
+            log.exception("the map's origin gives no version", cause="a defect in shmmap")
+            changed, answers = False, False
+        with self._condition:
+            if self._is_out and answers:
+                self._back = True
+                log.info("the map's origin answers again")
+            elif not answers and not self._is_out:
+                log.warning("the map's origin is out of reach")
+            self._is_out = not answers
+            self._changed = self._changed or changed
+            os.eventfd_write(self.fd, 1)
+
+    def close(self) -> bool:
+        """End the thread; False if it still waits for the origin."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify()
+        if self._thread is not None:
+            self._thread.join(END_S)
+        return self._thread is None or not self._thread.is_alive()

@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One version of a published map as requests see it: its root, and the shards that are here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.daemon.map.catalogue_view import Ready
+from shmmap.daemon.map.shard_fetcher import ShardFetcher
+from shmmap.daemon.map.shard_pages import ShardPages
+from shmmap.errors import BadRequest
+from shmmap.geometry import Area
+from shmmap.layers.spec import layer_spec
+from shmmap.origin.catalogue_change import CatalogueChange
+from shmmap.origin.map_frame import MapFrame
+from shmmap.origin.remote.published_index import POINTS, Root, Shard, published_layer_version
+from shmmap.origin.remote.published_source import LayerSource, pack_source
+from shmmap.origin.spatial_index import touches
+from shmmap.segment.source import Source
+from shmmap.segment.version import Stamp
+
+__all__ = ["PublishedView"]
+
+Indices: TypeAlias = NDArray[np.intp]
+_Pair: TypeAlias = tuple[int | None, int | None]
+"""Numbers of the shards at one place in an earlier version and in a later one."""
+_NOTHING: Final = np.empty(0, np.intp)
+
+
+@dataclass(frozen=True, slots=True)
+class _Difference:
+    """Rows of a shard, before or now, that differ: added, removed, changed, moved."""
+
+    added: tuple[int, ...] = ()
+    removed: tuple[int, ...] = ()
+    changed: tuple[int, ...] = ()
+    moved: tuple[int, ...] = ()
+
+
+class PublishedView:
+    """The cells of one version of a published map; see `shmmap.daemon.map.catalogue_view.CatalogueView`.
+
+    Parameters
+    ----------
+    number
+        Of the version.
+    known
+        Shards that are here from the beginning, by number.
+    """
+
+    problems: Final = ()
+    opened: Final = None
+    tables: Final = None
+
+    def __init__(
+        self, root: Root, number: int, fetcher: ShardFetcher, known: Mapping[int, Shard], *, most_bytes: int
+    ) -> None:
+        self.root = root
+        self.number = number
+        self.pages: ShardPages = ShardPages(root, fetcher, known, most_bytes=most_bytes)
+        self.map_version = root.map_version
+        self.id_prefix = root.id_prefix
+        self.frame_id = root.frame_id
+        self.frame = MapFrame(root.origin, root.crs, root.unit_m)
+        self.bounds: tuple[float, float, float, float] | None = root.bounds
+        self.mean_size = root.mean_m
+        self._differing: tuple[Root, list[_Pair]] | None = None
+        self._compared: dict[_Pair, _Difference] = {}
+
+    @cached_property
+    def _ready(self) -> dict[str, int]:
+        """Builder versions of published layers that this program would make the same way."""
+        found = {}
+        for spec, builder_version in self.root.layers.items():
+            try:
+                ours = layer_spec(spec)
+            except BadRequest:
+                continue
+            if spec == POINTS or (str(ours) == spec and ours.builder_version == builder_version):
+                found[spec] = builder_version
+        return found
+
+    def __len__(self) -> int:
+        return self.root.cells
+
+    @property
+    def complete(self) -> bool:
+        """Whether all cells are known."""
+        return self.pages.complete
+
+    # --- cells ------------------------------------------------------------------------------------
+
+    def query(self, area: Area, most: int | None = None) -> tuple[Indices, bool]:
+        """Known cells that touch an area, in id order, and whether these are all."""
+        found: list[Indices] = []
+        names: list[list[bytes]] = []
+        known, count = True, 0
+        for number in self.pages.of_area(area):
+            page = self.pages.page(number)
+            if page is None:
+                known = False
+                continue
+            if most is not None and count > most:
+                continue
+            rows = np.flatnonzero(touches(area, page.shard.boxes))
+            if len(rows):
+                found.append(rows + page.first)
+                names.append([page.shard.names[row] for row in rows.tolist()])
+                count += len(rows)
+        if len(found) <= 1:
+            return (found[0] if found else _NOTHING), known
+        indices = np.concatenate(found)
+        if most is None or count <= most:
+            indices = indices[np.argsort(np.array([name for some in names for name in some]), kind="stable")]
+        return indices, known
+
+    def find(self, cell: str) -> int | None:
+        """Index of a known cell by its id or a unique base name."""
+        name = cell
+        if cell.startswith("/"):
+            if not cell.startswith(self.id_prefix):
+                return None
+            name = cell[len(self.id_prefix) :]
+        try:
+            key = name.encode()
+        except UnicodeEncodeError:
+            return None
+        index = self.pages.find(key)
+        if index is None and "/" not in cell:
+            index = self.pages.find_base(key)
+        return index
+
+    def id(self, index: int) -> str:
+        """Id of a cell."""
+        page, row = self.pages.row(index)
+        return page.shard.id(row, self.id_prefix)
+
+    def ids(self, indices: Indices) -> list[str]:
+        """Ids of several cells."""
+        return [self.id(index) for index in indices.tolist()]
+
+    def box(self, index: int) -> tuple[float, float, float, float]:
+        """Box of a cell."""
+        page, row = self.pages.row(index)
+        return page.shard.box(row)
+
+    def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
+        """(K, 4) float64, boxes of these cells."""
+        boxes = np.empty((len(indices), 4))
+        for at, index in enumerate(indices.tolist()):
+            page, row = self.pages.row(index)
+            boxes[at] = page.shard.boxes[row]
+        return boxes
+
+    def version(self, index: int) -> int:
+        """64-bit version of a cell."""
+        page, row = self.pages.row(index)
+        version = int(page.versions[row])
+        if not version:
+            version = page.shard.version(row, self.id_prefix)
+            page.versions[row] = version
+        return version
+
+    def source(self, index: int) -> Source:
+        """Return the objects of a cell that are of use here."""
+        page, row = self.pages.row(index)
+        shard = page.shard
+        layers = {
+            spec: LayerSource(*shard.layers[spec].name(row), builder_version)
+            for spec, builder_version in self._ready.items()
+        }
+        return pack_source(shard.id(row, self.id_prefix), layers)
+
+    def stamp(self, index: int) -> Stamp:
+        """Stamp of a cell."""
+        page, row = self.pages.row(index)
+        return page.shard.stamp(row)
+
+    def set_stamp(self, index: int, stamp: Stamp) -> None:
+        """Do nothing: within a version no cell changes."""
+
+    def source_bytes(self, index: int) -> int:
+        """Size of a cell's points in memory."""
+        page, row = self.pages.row(index)
+        return int(page.shard.layers[POINTS].raws[row])
+
+    def ready(self, index: int, layer: str) -> Ready | None:
+        """What is known of a layer that is published; None: it is computed here."""
+        builder_version = self._ready.get(layer)
+        if builder_version is None:
+            return None
+        page, row = self.pages.row(index)
+        objects = page.shard.layers[layer]
+        cell = self.version(index)
+        if layer != POINTS:
+            content = objects.contents[row].tobytes()
+            cell = published_layer_version(cell, layer, builder_version, content)
+        return Ready(int(objects.raws[row]), cell)
+
+    # --- what changed -----------------------------------------------------------------------------
+
+    def changes_from(self, before: object) -> CatalogueChange:
+        """Find what differs from another version, as far as both know it."""
+        if not isinstance(before, PublishedView):
+            raise TypeError(f"{type(before).__name__} is no version of a published map")
+        unknown = CatalogueChange(before, self, _NOTHING, _NOTHING, _NOTHING, _NOTHING, known=False)
+        same_ids = before.id_prefix == self.id_prefix
+        if self._differing is None or self._differing[0] is not before.root:
+            self._compared.clear()
+            self._differing = before.root, _differing_shards(before.root, self.root, same_ids=same_ids)
+        found: dict[str, list[int]] = {"added": [], "removed": [], "changed": [], "moved": []}
+        for in_old, in_new in self._differing[1]:
+            theirs = before.pages.page(in_old) if in_old is not None else None
+            ours = self.pages.page(in_new) if in_new is not None else None
+            if (in_old is not None and theirs is None) or (in_new is not None and ours is None):
+                return unknown
+            difference = self._compared.get((in_old, in_new))
+            if difference is None:
+                difference = _compare(
+                    theirs.shard if theirs is not None else None, ours.shard if ours is not None else None,
+                    same_ids=same_ids,
+                )  # fmt: skip
+                self._compared[in_old, in_new] = difference
+            for how, page in (("added", ours), ("removed", theirs), ("changed", ours), ("moved", ours)):
+                if page is not None:
+                    found[how] += [page.first + row for row in getattr(difference, how)]
+        if same_ids and found["added"] and found["removed"]:
+            self._note_moved(found, before)
+        added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in found.values())
+        return CatalogueChange(before, self, added, removed, changed, moved)
+
+    def _note_moved(self, found: dict[str, list[int]], before: PublishedView) -> None:
+        """Cells that left one shard and came to another one have only moved."""
+        left = {before.id(index): index for index in found["removed"]}
+        came = {self.id(index): index for index in found["added"]}
+        moved = left.keys() & came.keys()
+        found["removed"] = [index for cell, index in left.items() if cell not in moved]
+        found["added"] = [index for cell, index in came.items() if cell not in moved]
+        found["moved"] += [came[cell] for cell in moved]
+
+
+def _differing_shards(old: Root, new: Root, *, same_ids: bool) -> list[_Pair]:
+    """Which shards are not the same in both."""
+
+    def by_place(root: Root) -> dict[tuple[int, int], int]:
+        return {(row, column): number for number, (row, column) in enumerate(root.keys.tolist())}
+
+    before, after = by_place(old), by_place(new)
+    if old.shard_m != new.shard_m:
+        return [*((n, None) for n in before.values()), *((None, n) for n in after.values())]
+    return [
+        (was, now)
+        for was, now in ((before.get(place), after.get(place)) for place in {**before, **after})
+        if not same_ids
+        or was is None
+        or now is None
+        or old.hashes[was].tobytes() != new.hashes[now].tobytes()
+    ]
+
+
+def _compare(old: Shard | None, new: Shard | None, *, same_ids: bool) -> _Difference:
+    """Find which cells differ in two states of a shard; None: it has none."""
+    before = {name: row for row, name in enumerate(old.names)} if old is not None else {}
+    after = {name: row for row, name in enumerate(new.names)} if new is not None else {}
+    both = before.keys() & after.keys() if same_ids else set[bytes]()
+    changed, moved = [], []
+    if old is not None and new is not None:
+        for name in both:
+            was, row = before[name], after[name]
+            if old.box(was) != new.box(row):
+                moved.append(row)
+            if old.stamp(was) != new.stamp(row):
+                changed.append(row)
+    return _Difference(
+        tuple(row for name, row in after.items() if name not in both),
+        tuple(row for name, row in before.items() if name not in both),
+        tuple(changed),
+        tuple(moved),
+    )

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shards of a published map as pages of its list of cells: which are here, and what they say."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.daemon.map.catalogue_view import PageNews, Pages
+from shmmap.daemon.map.shard_fetcher import ShardFetcher
+from shmmap.errors import BadRequest
+from shmmap.geometry import Area, distance_to_boxes
+from shmmap.origin.remote.published_index import Root, Shard
+from shmmap.sharded_dict import ShardedDict
+
+__all__ = ["FEW_SHARDS", "Page", "ShardPages"]
+
+FEW_SHARDS: Final = 16
+"""So many shards are all fetched at the start, and kept."""
+NAME_BYTES: Final = 150
+"""What a cell's name takes in memory, and its entry in the table of names."""
+NAME_TABLES: Final = 64
+"""Names are shared out among many dicts: one of all would stop the loop whenever it grows."""
+BACKGROUND_AT_ONCE: Final = 8
+BACKGROUND: Final = 1e15
+"""Priority of pages that nothing needs yet: behind all that something does."""
+NAMED: Final = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Page:
+    """A shard that is here; ``first`` is the index of its first cell, ``versions`` are 0 if not computed."""
+
+    number: int
+    shard: Shard
+    first: int
+    versions: NDArray[np.uint64]
+    nbytes: int
+    has_folders: bool
+
+    @classmethod
+    def of(cls, number: int, shard: Shard, first: int) -> Page:
+        """Return the page of a shard."""
+        arrays: list[NDArray[Any]] = [shard.boxes, shard.z, shard.points]
+        for layer in shard.layers.values():
+            arrays += [layer.sizes, layer.raws, layer.hashes, layer.contents]
+        nbytes = sum(int(array.nbytes) for array in arrays) + (8 + NAME_BYTES) * len(shard)
+        has_folders = any(b"/" in name for name in shard.names)
+        return cls(number, shard, first, np.zeros(len(shard), np.uint64), nbytes, has_folders)
+
+
+class _News:
+    """A descriptor that is open as long as this is.
+
+    It is no part of the pages: these may still be found by a weak reference while they are being deleted.
+    """
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def __del__(self) -> None:
+        os.close(self.fd)
+
+    def tell(self) -> None:
+        """Make it readable."""
+        os.eventfd_write(self.fd, 1)
+
+
+def _shared_out(page: Page) -> list[dict[bytes, int]]:
+    """Indices of a page's cells by name, for each table of names."""
+    tables: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
+    for index, name in enumerate(page.shard.names, page.first):
+        tables[hash(name) % NAME_TABLES][name] = index
+    return tables
+
+
+class ShardPages:
+    """Pages of one version of a map; see `shmmap.daemon.map.catalogue_view.Pages`.
+
+    All but `deliver` is called in the serving loop.
+
+    Parameters
+    ----------
+    known
+        Shards that are here from the beginning, by number.
+    most_bytes
+        What pages may take of memory; those of a map of few shards are all kept.
+    """
+
+    def __init__(
+        self, root: Root, fetcher: ShardFetcher, known: Mapping[int, Shard], *, most_bytes: int
+    ) -> None:
+        self.root = root
+        self._fetcher = fetcher
+        self._first = root.first_indices
+        self._most_bytes = most_bytes
+        self._bytes = 0
+        self._here: dict[int, Page] = {}  # least recently needed first
+        self._wanted: dict[int, float] = {}
+        self._lost: set[int] = set()
+        self._by_name: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
+        self._by_base: ShardedDict[bytes, tuple[int, ...]] = ShardedDict()
+        self._arrived: deque[tuple[int, Page | None, list[dict[bytes, int]]]] = deque()
+        self._nearest: Iterator[int] | None = None
+        self.known_cells = 0
+        low = root.keys[:, ::-1] * root.shard_m
+        self._boxes = np.hstack([low, low + root.shard_m + np.array(root.largest_m)])
+        self._around: tuple[float, float] = (
+            0.5 * (root.bounds[0] + root.bounds[2]),
+            0.5 * (root.bounds[1] + root.bounds[3]),
+        )
+        self._news = _News()
+        self._news.tell()  # pages that nothing needs are asked for in the first `collect`
+        for number, shard in known.items():
+            page = self._page(number, shard)
+            self._take(page, _shared_out(page))
+
+    @property
+    def fd(self) -> int:
+        """Readable when there are news."""
+        return self._news.fd
+
+    def __len__(self) -> int:
+        return len(self.root.keys)
+
+    # --- which there are --------------------------------------------------------------------------
+
+    def of_area(self, area: Area) -> Sequence[int]:
+        """Pages that may have cells which touch an area."""
+        found: list[int] = self.root.shards_near(area.bounds).tolist()
+        return found
+
+    def of_cell(self, index: int) -> int:
+        """Return the page of a cell."""
+        return int(np.searchsorted(self._first, index, side="right")) - 1
+
+    def cells(self, page: int) -> range:
+        """Indices of a page's cells."""
+        return range(int(self._first[page]), int(self._first[page + 1]))
+
+    def cells_surely_in(self, area: Area) -> int:
+        """How many cells the pages have that lie wholly in an area."""
+        min_x, min_y, max_x, max_y = area.bounds
+        boxes = self._boxes
+        inside = (boxes[:, 0] >= min_x) & (boxes[:, 1] >= min_y)
+        inside &= (boxes[:, 2] <= max_x) & (boxes[:, 3] <= max_y)
+        if inside.any():  # a circle has no corners
+            numbers = np.flatnonzero(inside)
+            low, high = boxes[numbers, :2], boxes[numbers, 2:]
+            for x, y in ((low, low), (low, high), (high, low), (high, high)):
+                corner = np.column_stack([x[:, 0], y[:, 1], x[:, 0], y[:, 1]])
+                inside[numbers] &= area.overlaps(corner)
+        return int(self.root.counts[inside].sum(dtype=np.int64))
+
+    # --- what is here -----------------------------------------------------------------------------
+
+    @property
+    def complete(self) -> bool:
+        """Whether all pages are here."""
+        return len(self._here) == len(self)
+
+    def is_here(self, page: int) -> bool:
+        """Whether the page's cells are known."""
+        return page in self._here
+
+    def is_out_of_reach(self, page: int) -> bool:
+        """Whether it could not be had when it was last tried."""
+        return page in self._lost
+
+    def shards(self) -> dict[int, Shard]:
+        """Shards that are here, by number; may be called in another thread."""
+        return {number: page.shard for number, page in self._here.copy().items()}
+
+    def page(self, number: int) -> Page | None:
+        """Return a page if it is here."""
+        return self._here.get(number)
+
+    def row(self, index: int) -> tuple[Page, int]:
+        """Page and row of a cell; `KeyError` if it is not here."""
+        page = self._here[self.of_cell(index)]
+        return page, index - page.first
+
+    def find(self, name: bytes) -> int | None:
+        """Index of a known cell by what follows the map's prefix in its id."""
+        return self._by_name[hash(name) % NAME_TABLES].get(name)
+
+    def find_base(self, base: bytes) -> int | None:
+        """Index of a known cell by its base name.
+
+        Raises
+        ------
+        BadRequest
+            Several have it.
+        """
+        found = self._by_base.get(base, ())
+        if len(found) > 1:
+            pages = [self.row(index) for index in found[:NAMED]]
+            some = ", ".join(page.shard.names[row].decode() for page, row in pages)
+            more = ", ..." if len(found) > NAMED else ""
+            raise BadRequest(
+                f"{len(found)} cells are called {base.decode()}: {some}{more}",
+                hint="give the full path of one",
+            )
+        return found[0] if found else None
+
+    # --- coming and going -------------------------------------------------------------------------
+
+    def want(self, pages: Iterable[int], priority: float) -> None:
+        """Have pages fetched, those with the lowest priority first."""
+        absent = []
+        for number in pages:
+            page = self._here.pop(number, None)
+            if page is not None:
+                self._here[number] = page
+                continue
+            absent.append(number)
+            if number not in self._lost and priority < self._wanted.get(number, np.inf):
+                self._wanted[number] = priority
+                self._fetcher.want(self, self.root, number, priority)
+        if absent:
+            x, y = self._boxes[absent, :2].mean(axis=0).tolist()
+            self._around, self._nearest = (x, y), None
+
+    def deliver(self, number: int, shard: Shard | None) -> None:
+        """Take a shard; None: it cannot be had at present.  Called in a thread."""
+        page = self._page(number, shard) if shard is not None else None
+        self._arrived.append((number, page, _shared_out(page) if page is not None else []))
+        self._news.tell()
+
+    def collect(self) -> PageNews:
+        """Take in what has come since the last time: one page, a tenth of a millisecond, and go on later."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.fd)
+        come: list[int] = []
+        lost: list[int] = []
+        while self._arrived and not come:
+            number, page, names = self._arrived.popleft()
+            self._wanted.pop(number, None)
+            if number in self._here:
+                continue
+            if page is None:
+                self._lost.add(number)
+                lost.append(number)
+            else:
+                self._lost.discard(number)
+                self._take(page, names)
+                come.append(number)
+        if self._arrived:
+            self._news.tell()
+        self._fill()
+        return PageNews(come, lost)
+
+    def try_again(self) -> None:
+        """Have fetched again what could not be had."""
+        lost, self._lost = self._lost, set()
+        self.want(lost, 0.0)
+        self._lost |= lost  # until they come
+
+    def lacking(self, before: Pages) -> Sequence[int]:
+        """Pages that are not here where another version has some that are."""
+        if not isinstance(before, ShardPages):
+            return [] if self.complete else list(range(len(self)))
+        keys = {key for number, key in enumerate(before.keys()) if before.is_here(number)}
+        return [n for n, key in enumerate(self.keys()) if key in keys and n not in self._here]
+
+    def keys(self) -> list[tuple[int, int]]:
+        """Row and column of each page, in metres: a version may have shards of another size."""
+        rows = (self.root.keys * self.root.shard_m).tolist()
+        return [(row, column) for row, column in rows]
+
+    def spare(self) -> int | None:
+        """Return the page that was needed least recently, if they take more memory than they may."""
+        if self._bytes <= self._most_bytes or len(self) <= FEW_SHARDS:
+            return None
+        return next(iter(self._here), None)
+
+    def drop(self, page: int) -> None:
+        """Forget a page's cells."""
+        dropped = self._here.pop(page)
+        self._bytes -= dropped.nbytes
+        self.known_cells -= len(dropped.shard)
+        for index, name in enumerate(dropped.shard.names, dropped.first):
+            del self._by_name[hash(name) % NAME_TABLES][name]
+            if dropped.has_folders and b"/" in name:
+                base = name.rpartition(b"/")[2]
+                left = tuple(one for one in self._by_base[base] if one != index)
+                if left:
+                    self._by_base[base] = left
+                else:
+                    del self._by_base[base]
+
+    def _page(self, number: int, shard: Shard) -> Page:
+        return Page.of(number, shard, int(self._first[number]))
+
+    def _take(self, page: Page, names: list[dict[bytes, int]]) -> None:
+        self._here[page.number] = page
+        self._bytes += page.nbytes
+        self.known_cells += len(page.shard)
+        for table, some in zip(self._by_name, names, strict=True):
+            table.update(some)
+        if page.has_folders:
+            for index, name in enumerate(page.shard.names, page.first):
+                if b"/" in name:
+                    base = name.rpartition(b"/")[2]
+                    self._by_base[base] = (*self._by_base.get(base, ()), index)
+
+    def _fill(self) -> None:
+        """Have some more pages fetched that nothing needs yet, the nearest first, while there is room."""
+        under_way = len(self._wanted)
+        if self._lost or under_way > BACKGROUND_AT_ONCE // 2 or self.complete:
+            return
+        counts = self.root.counts
+        cell_bytes = self._bytes / self.known_cells if self.known_cells else 2.0 * NAME_BYTES
+        room = self._most_bytes - self._bytes if len(self) > FEW_SHARDS else np.inf
+        room -= cell_bytes * sum(int(counts[number]) for number in self._wanted)
+        if self._nearest is None:
+            order = np.argsort(distance_to_boxes(*self._around, self._boxes), kind="stable")
+            self._nearest = iter(order.tolist())
+        for number in self._nearest:
+            if number in self._here or number in self._wanted:
+                continue
+            room -= cell_bytes * int(counts[number])
+            if room < 0:
+                self._nearest = iter((number,))  # there is no room, until an area needs other pages
+                return
+            self._wanted[number] = BACKGROUND
+            self._fetcher.want(self, self.root, number, BACKGROUND)
+            if len(self._wanted) >= BACKGROUND_AT_ONCE:
+                return

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One budget for all that is kept in a cache directory: computed layers, and objects of published maps.
+
+::
+
+    DIRECTORY/layers/...                   entries of shmmap.layers.disk_cache, named *.layer
+    DIRECTORY/objects/cells/ab/<sha256>    objects of shmmap.origin.remote.object_tier
+    DIRECTORY/objects/index/ab/<sha256>    its index pages
+
+Any number of processes use it at once, and none of them is in charge.  Each counts what it adds, and looks
+through the directory now and then: where there is too much, the files used least recently are removed until
+a sixteenth of the budget is free.  Index pages go last, as long as they are at most a quarter of the budget:
+without them no cell is found, however many are there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from shmmap.failpoints import step
+
+__all__ = ["CELLS", "INDEX", "INTERIM", "LAYERS", "OBJECTS", "DiskBudget", "mark_used", "why_not_private"]
+
+LAYERS: Final = "layers"
+OBJECTS: Final = "objects"
+CELLS: Final = "cells"
+INDEX: Final = "index"
+INTERIM: Final = ".new-"
+"""What the name of a file begins with until it is whole."""
+
+_KEPT: Final = re.compile(r".+\.layer|[0-9a-f]{64}")
+_SPARE_SHARE: Final = 0.05  # of the file system: left free
+_FREED_SHARE: Final = 1 / 16
+_STEPS: Final = 64  # parts of the budget: one may be added before a process looks again
+_PROCESSES: Final = 8  # that may add at the same rate
+_INDEX_SHARE: Final = 1 / 4
+_USED_AGAIN_S: Final = 600.0
+_STALE_INTERIM_S: Final = 3600.0
+
+
+@dataclass(slots=True)
+class _Kept:
+    """A file, which may have several names."""
+
+    used_s: float
+    nbytes: int
+    is_index: bool
+    paths: list[str] = field(default_factory=list)
+
+
+class DiskBudget:
+    """Keeps what lies in one cache directory under one budget; may be used in threads.
+
+    Parameters
+    ----------
+    directory
+        The cache directory.
+    limit_bytes
+        Most bytes of all files that are kept in it.
+    owner
+        Whose objects they are; None: this process's user.
+    """
+
+    def __init__(self, directory: str, limit_bytes: int, *, owner: int | None = None) -> None:
+        self.directory = directory
+        self.limit_bytes = limit_bytes
+        self._owner = owner
+        self._lock = threading.Lock()
+        self._added_bytes = 0
+        self._left_bytes = limit_bytes
+
+    def has_room(self, nbytes: int) -> bool:
+        """Whether a file of this size may be added: some of the file system is left free.
+
+        Raises
+        ------
+        OSError
+            The directory cannot be looked at.
+        """
+        room = os.statvfs(self.directory)
+        spare = int(room.f_blocks * room.f_frsize * _SPARE_SHARE)
+        return nbytes <= min(self.limit_bytes, room.f_bavail * room.f_frsize - spare)
+
+    def added(self, nbytes: int) -> None:
+        """Count a file that was added; trims when it is time to."""
+        with self._lock:
+            self._added_bytes += nbytes
+            free_bytes = self.limit_bytes - self._left_bytes
+            if self._added_bytes <= max(self.limit_bytes // _STEPS, free_bytes // _PROCESSES):
+                return
+            self._added_bytes = 0
+        self.trim()
+
+    def used_bytes(self) -> int:
+        """Bytes of all files that are kept, looked at now."""
+        return sum(kept.nbytes for kept in self._kept(remove_stale=False))
+
+    def trim(self) -> int:
+        """Remove files if there are more than the budget allows; returns the bytes of what is left.
+
+        What a killed process left half written goes too, an hour later.
+        """
+        found = self._kept(remove_stale=True)
+        total = sum(kept.nbytes for kept in found)
+        if total > self.limit_bytes:
+            enough = int(self.limit_bytes * (1 - _FREED_SHARE))
+            for kept in _order_of_removal(found, self.limit_bytes):
+                if total <= enough:
+                    break
+                for path in kept.paths:
+                    step("trim.file")
+                    with contextlib.suppress(OSError):
+                        os.unlink(path)
+                total -= kept.nbytes
+        self._left_bytes = total
+        return total
+
+    def _kept(self, *, remove_stale: bool) -> list[_Kept]:
+        found: dict[int, _Kept] = {}
+        now_s = time.time()
+        for path, status, is_index in self._files():
+            name = os.path.basename(path)
+            if name.startswith(INTERIM):
+                if remove_stale and abs(now_s - status.st_mtime) > _STALE_INTERIM_S:
+                    with contextlib.suppress(OSError):
+                        os.unlink(path)
+            elif _KEPT.fullmatch(name):
+                kept = found.setdefault(status.st_ino, _Kept(status.st_mtime, status.st_size, is_index))
+                kept.paths.append(path)
+        return list(found.values())
+
+    def _files(self) -> Iterator[tuple[str, os.stat_result, bool]]:
+        """All files, and whether they are index pages; links are not followed, neither out nor in."""
+        layers, objects = (os.path.join(self.directory, name) for name in (LAYERS, OBJECTS))
+        places = {layers: False}
+        with contextlib.suppress(OSError):
+            owner = os.geteuid() if self._owner is None else self._owner
+            if not why_not_private(os.lstat(objects), owner):
+                places |= {os.path.join(objects, CELLS): False, os.path.join(objects, INDEX): True}
+        for place, is_index in places.items():
+            with contextlib.suppress(OSError):  # it, or a folder in it, is not there
+                if not stat.S_ISDIR(os.lstat(place).st_mode):
+                    continue
+                for folder, _, names, fd in os.fwalk(place):
+                    for name in names:
+                        with contextlib.suppress(OSError):
+                            status = os.stat(name, dir_fd=fd, follow_symlinks=False)
+                            yield os.path.join(folder, name), status, is_index
+
+
+def _order_of_removal(found: list[_Kept], limit_bytes: int) -> list[_Kept]:
+    """The least recently used first, then the index pages that are kept longest."""
+    found.sort(key=lambda kept: kept.used_s)
+    index_bytes = 0
+    last: set[int] = set()
+    for kept in reversed(found):
+        if kept.is_index and index_bytes + kept.nbytes <= limit_bytes * _INDEX_SHARE:
+            index_bytes += kept.nbytes
+            last.add(id(kept))
+    return sorted(found, key=lambda kept: id(kept) in last)
+
+
+def mark_used(fd: int, status: os.stat_result) -> None:
+    """Say that a file is used now; costs nothing if that was said within the last minutes."""
+    # a clock that was ahead by a day leaves stamps that are ahead
+    if abs(time.time() - status.st_mtime) > _USED_AGAIN_S:
+        with contextlib.suppress(OSError):
+            os.utime(fd)
+
+
+def why_not_private(status: os.stat_result, uid: int) -> str:
+    """Why a directory is not an account's alone, as the end of a sentence; empty if it is."""
+    if stat.S_ISLNK(status.st_mode):
+        return "is a symbolic link"
+    if not stat.S_ISDIR(status.st_mode):
+        return "is no directory"
+    if status.st_uid != uid:
+        return f"belongs to user {status.st_uid}, not to user {uid}"
+    if status.st_mode & 0o022:
+        return f"may be written by other users (mode {stat.S_IMODE(status.st_mode):04o})"
+    return ""

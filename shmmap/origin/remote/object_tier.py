@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Objects of published maps on this machine's disk, so that nothing is fetched twice and no link is needed.
+
+An object is named by its SHA-256, here as in the store.  Its file is read into memory once and hashed there:
+so it does not matter who wrote it, whether it is whole, and what becomes of it meanwhile.  A file that is not
+what its name says is removed, and the object fetched again.  Nothing else depends on the disk: it may be
+full, read-only, or emptied at any moment.
+
+All processes of one account share the tier, and none of them is in charge: a file has its name once it is
+whole.  Only index pages are flushed to the disk: what a power cut leaves of the others is noticed by its
+hash.  How much is kept, and what goes first, is in `shmmap.disk_budget`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import secrets
+import stat
+import threading
+from collections.abc import Iterable, Iterator
+from hashlib import sha256
+from typing import Final, NamedTuple
+
+from shmmap.disk_budget import CELLS, INDEX, INTERIM, OBJECTS, DiskBudget, mark_used, why_not_private
+from shmmap.errors import MapDataError
+from shmmap.failpoints import step
+from shmmap.logfmt import log
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.store import ObjectReader
+from shmmap.origin.remote.zstd_frame import DAMAGED
+from shmmap.segment.writer import write_all
+
+__all__ = ["KeptObjects", "ObjectCounts", "ObjectTier"]
+
+_BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
+_ABSENT: Final = (errno.ENOENT, errno.ESTALE)
+_NEVER_RIGHT: Final = (errno.ELOOP, errno.ENXIO, errno.EIO)  # a link, a socket, a bad block
+_FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+class ObjectTier:
+    """The objects kept in one cache directory; may be used in threads.
+
+    No method raises for what the disk does: an object is then not there, or not kept, and the log says once
+    why.
+
+    Parameters
+    ----------
+    cache_dir
+        The cache directory, which is made when the first object is kept.
+    limit_bytes
+        Most bytes of all files kept in it, computed layers included; 0: no object is kept.
+    quiet
+        Log nothing: another process of the same daemon does.
+    """
+
+    def __init__(self, cache_dir: str, *, limit_bytes: int, quiet: bool = False) -> None:
+        self.directory = os.path.join(cache_dir, OBJECTS)
+        self._cache_dir = cache_dir
+        self._budget = DiskBudget(cache_dir, limit_bytes)
+        self._quiet = quiet
+        self._lock = threading.Lock()
+        self._said: set[str] = set()
+        self._damaged = 0
+
+    @property
+    def damaged_objects(self) -> int:
+        """How many objects were found damaged, and removed."""
+        return self._damaged
+
+    @property
+    def problem(self) -> str:
+        """Why the directory is not used: it is another user's, say; empty if it is, or is not there yet."""
+        try:
+            with self._opened():
+                return ""
+        except OSError as error:
+            return "" if error.errno in _ABSENT else self._reason(error)
+
+    def get(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bytes | None:
+        """Return an object, its size and hash compared; None if it is not there, or was damaged.
+
+        Parameters
+        ----------
+        digest
+            Its SHA-256.
+        """
+        path = _path(digest, is_index)
+        try:
+            with self._opened() as place:
+                try:
+                    data = _read(place, path, nbytes)
+                except OSError as error:
+                    if error.errno not in _NEVER_RIGHT:
+                        raise
+                    data = b""
+                if len(data) == nbytes and sha256(data).digest() == digest:
+                    return data
+                with self._lock:
+                    self._damaged += 1
+                os.unlink(path, dir_fd=place)
+        except OSError as error:
+            self._say(error)
+        return None
+
+    def put(self, digest: bytes, data: bytes | memoryview, *, is_index: bool = False) -> bool:
+        """Keep an object whose hash was compared; False if it cannot be kept.
+
+        Index pages are on the disk when this returns.
+        """
+        nbytes = len(data)
+        if nbytes > self._budget.limit_bytes:
+            return False
+        try:
+            os.makedirs(self._cache_dir, mode=0o755, exist_ok=True)
+            if not self._budget.has_room(nbytes):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._require_our_cache()
+            with contextlib.suppress(FileExistsError):
+                os.mkdir(self.directory, 0o700)
+            with self._opened() as place:
+                _write(place, _path(digest, is_index), memoryview(data), durable=is_index)
+        except OSError as error:
+            self._say(error)
+            return False
+        self._budget.added(nbytes)
+        return True
+
+    def mark_index_used(self, digests: Iterable[bytes]) -> None:
+        """Say that index pages are those of the version in use: they are kept before others."""
+        with contextlib.suppress(OSError), self._opened() as place:
+            for digest in digests:
+                with contextlib.suppress(OSError):
+                    os.utime(_path(digest, True), dir_fd=place, follow_symlinks=False)
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[int]:
+        """Open the directory for what is done now: it may be another one, or gone, the next time.
+
+        Raises
+        ------
+        OSError
+            It is not there, or not this account's alone (`_NotPrivate`).
+        """
+        self._require_our_cache()
+        if why := why_not_private(os.lstat(self.directory), os.geteuid()):
+            raise _NotPrivate(f"{self.directory} {why}")
+        place = os.open(self.directory, _FOLDER_FLAGS)
+        try:
+            if why := why_not_private(os.fstat(place), os.geteuid()):
+                raise _NotPrivate(f"{self.directory} {why}")
+            yield place
+        finally:
+            os.close(place)
+
+    def _require_our_cache(self) -> None:
+        """Refuse a cache of another user: what root made in it, its service could not use."""
+        uid, owner = os.geteuid(), os.stat(self._cache_dir).st_uid
+        if owner not in (0, uid):
+            raise _NotPrivate(f"{self._cache_dir} belongs to user {owner}, not to user {uid}")
+
+    def _reason(self, error: OSError) -> str:
+        return str(error) if isinstance(error, _NotPrivate) else f"{self.directory}: {error.strerror}"
+
+    def _say(self, error: OSError) -> None:
+        if self._quiet or error.errno in _ABSENT:
+            return
+        reason = self._reason(error)
+        with self._lock:
+            if reason in self._said:
+                return
+            self._said.add(reason)
+        log.warning("objects not kept on disk", reason=reason)
+
+
+class _NotPrivate(OSError):
+    """The directory is not this account's alone."""
+
+
+def _path(digest: bytes, is_index: bool) -> str:
+    name = digest.hex()
+    return f"{INDEX if is_index else CELLS}/{name[:2]}/{name}"
+
+
+def _read(place: int, path: str, nbytes: int) -> bytes:
+    """Read a file of so many bytes into memory; whatever else is there gives other bytes, and never waits."""
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=place)
+    try:
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode) or status.st_size != nbytes:
+            return b""
+        mark_used(fd, status)
+        data = os.read(fd, nbytes)
+        while len(data) < nbytes and (more := os.read(fd, nbytes - len(data))):
+            data += more
+        return data
+    finally:
+        os.close(fd)
+
+
+def _write(place: int, path: str, data: memoryview, *, durable: bool) -> None:
+    folder, name = os.path.split(path)
+    for made in (os.path.dirname(folder), folder):
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(made, 0o700, dir_fd=place)
+    within = os.open(folder, _FOLDER_FLAGS, dir_fd=place)
+    try:
+        interim = INTERIM + secrets.token_hex(8)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        fd = os.open(interim, flags, 0o600, dir_fd=within)
+        try:
+            try:
+                step("tier.made")
+                write_all(fd, data, 0)
+                step("tier.written")
+                if durable:
+                    os.fsync(fd)
+            finally:
+                os.close(fd)
+            os.rename(interim, name, src_dir_fd=within, dst_dir_fd=within)
+            step("tier.named")
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(interim, dir_fd=within)
+            raise
+        if durable:
+            os.fsync(within)
+    finally:
+        os.close(within)
+
+
+class ObjectCounts(NamedTuple):
+    """What was read: out of the tier, and out of the store; bytes of objects."""
+
+    disk_objects: int = 0
+    disk_bytes: int = 0
+    fetched_objects: int = 0
+    fetched_bytes: int = 0
+
+
+class KeptObjects:
+    """Reads objects of a store: out of the tier where they are there, else fetched, and kept.
+
+    It reads as a store does, so what fetches need not know which of the two answers; may be used in threads.
+
+    Parameters
+    ----------
+    store
+        Where objects are fetched.
+    tier
+        None: nothing is kept.
+    is_index
+        They are index pages.
+    keep
+        Whether what is fetched is kept.
+    """
+
+    def __init__(
+        self, store: ObjectReader, tier: ObjectTier | None, *, is_index: bool = False, keep: bool = True
+    ) -> None:
+        self._store = store
+        self._tier = tier
+        self._is_index = is_index
+        self._keep = keep
+        self._lock = threading.Lock()
+        self._counts = ObjectCounts()
+
+    @property
+    def url(self) -> str:
+        """Where the store is."""
+        return self._store.url
+
+    @property
+    def counts(self) -> ObjectCounts:
+        """What was read so far."""
+        return self._counts
+
+    def read(self, digest: bytes, nbytes: int) -> memoryview:
+        """Return the object of a SHA-256 and a size, both compared: they need not be compared again.
+
+        Raises
+        ------
+        Offline, MapMissing
+            It is not in the tier, and the store does not answer, or does not have it.
+        MapDataError
+            The store has another one under its name (cause ``damaged``); that is not kept.
+        """
+        kept = self._tier.get(digest, nbytes, is_index=self._is_index) if self._tier is not None else None
+        if kept is not None:
+            self._count(ObjectCounts(disk_objects=1, disk_bytes=nbytes))
+            return memoryview(kept)
+        path = blob_path(digest)
+        data = self._store.get_exactly(path, nbytes)
+        if sha256(data).digest() != digest:
+            raise MapDataError("its SHA-256 is not its name", path=f"{self.url}/{path}", cause=DAMAGED)
+        self._count(ObjectCounts(fetched_objects=1, fetched_bytes=nbytes))
+        if self._tier is not None and self._keep:
+            self._tier.put(digest, data, is_index=self._is_index)
+        return data
+
+    def get_exactly(self, path: str, nbytes: int) -> memoryview:
+        """Return an object by its path in the store; what is not named by its hash is fetched."""
+        blob = _BLOB.fullmatch(path)
+        if blob is None:
+            return self._store.get_exactly(path, nbytes)
+        return self.read(bytes.fromhex(blob[1]), nbytes)
+
+    def _count(self, more: ObjectCounts) -> None:
+        with self._lock:
+            self._counts = ObjectCounts(*map(sum, zip(self._counts, more, strict=True)))

@@ -1,0 +1,610 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whole daemons that serve published maps to ordinary clients, beside one that serves the map's files."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import shmmap
+from tests.process.conftest import DaemonFactory
+from tests.support.bucket_server import BucketServer
+from tests.support.cpp_client import CppClient
+from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.faulty_web import FaultyWeb, faulty_web
+from tests.support.patience import Patience
+from tests.support.publishing import publish
+from tests.support.raw_client import RawClient, circle
+from tests.support.served_cells import names
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+pytest.importorskip("obstore", reason="obstore is not installed")
+
+NDT = "ndt(leaf=2.0,min_points=3)"
+ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
+PUBLISHED = ("points", NDT)
+COMPUTED = ("voxel(leaf=1.0)", "normals(radius=2.0)")
+"""Of one cell alone, and of the cells around it, too."""
+
+Connect = Callable[..., RawClient]
+
+
+@pytest.fixture(scope="session")
+def _published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("published")
+    made = make_map(folder / "town", columns=3, rows=3, points=300)
+    publish(made.root, folder / "www", "--layer", NDT, "--id-prefix", "/town/")
+    return folder
+
+
+@pytest.fixture
+def town(_published: Path, tmp_path: Path) -> DividedMap:
+    """The map's files."""
+    source = DividedMap(tmp_path / "town")
+    shutil.copytree(_published / "town", source.root)
+    made = make_map(tmp_path / "names", columns=3, rows=3, points=1)
+    source.corners = dict(made.corners)
+    return source
+
+
+@pytest.fixture
+def web(_published: Path, tmp_path: Path) -> Iterator[FaultyWeb]:
+    """A web server of the published map."""
+    shutil.copytree(_published / "www", tmp_path / "www")
+    with faulty_web(tmp_path / "www") as one:
+        yield one
+
+
+def listing(client: RawClient) -> list[Any]:
+    """All rows of ``metadata``."""
+    rows: list[Any] = []
+    reply: list[Any] = client.ask("metadata")
+    while True:
+        rows += reply[4]
+        if reply[5] is None:
+            return rows
+        reply = client.ask("metadata", None, None, reply[5])
+
+
+def columns_of(cells: Any) -> dict[tuple[str, str], dict[str, bytes]]:
+    return {
+        (cell.id.rsplit("/", 1)[1], cell.layer): {name: cell[name].tobytes() for name in cell.columns}
+        for cell in cells
+    }
+
+
+# --- the same cells -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["directory", "file", "web", "bucket"])
+def url(request: pytest.FixtureRequest, _published: Path) -> tuple[str, dict[str, str]]:
+    """Where the town is published, and the environment that it needs."""
+    if request.param == "bucket":
+        buckets: BucketServer = request.getfixturevalue("buckets")
+        publish(_published / "town", buckets.url("served/town"), "--layer", NDT, "--id-prefix", "/town/")
+        return buckets.url("served/town"), buckets.environment
+    if request.param == "web":
+        return request.getfixturevalue("web").url, {}
+    return ("" if request.param == "directory" else "file://") + str(_published / "www"), {}
+
+
+@pytest.mark.usefixtures("layer_kernels")
+def test_every_column_is_that_of_the_files(
+    url: tuple[str, dict[str, str]], daemon: DaemonFactory, town: DividedMap
+) -> None:
+    local, remote = daemon(town.root), daemon(url[0], environment=url[1])
+    layers = (*PUBLISHED, *COMPUTED) if url[0].startswith("/") else PUBLISHED
+    found = []
+    for one in (local, remote):
+        with shmmap.connect(one.endpoint) as client:
+            cells = client.area(ALL, layers=layers, wait=120.0)
+            assert cells.complete, cells.failed
+            found.append((columns_of(cells), names(cells)))
+            for cell in cells:
+                cell.verify()
+                assert cell.box == town.box(cell.id.rsplit("/", 1)[1])
+                assert cell.frame_id == "map"
+    (of_files, order), (of_objects, other_order) = found
+    assert len(of_files) == 9 * len(layers)
+    assert order == other_order
+    assert of_files == of_objects
+    with shmmap.connect(remote.endpoint) as client:
+        assert {cell.id for cell in client.area(ALL)} == {f"/town/{name}" for name in town.corners}
+
+
+def test_a_client_in_cpp_maps_the_same_bytes(
+    daemon: DaemonFactory, town: DividedMap, web: FaultyWeb, cpp_program: Path
+) -> None:
+    found = []
+    for one in (daemon(town.root), daemon(web.url)):
+        with CppClient(cpp_program, one.endpoint) as client:
+            cells = client.around(0.0, 0.0, 100.0, ["points", NDT], wait=60.0)
+            assert cells.complete
+            for cell in cells:
+                if cell.layer == "points":
+                    cell.verify()
+            found.append([[words[0].rsplit("/", 1)[-1], *words[1:]] for words in client.columns()])
+            del cells, cell
+            client.release()
+    assert found[0] == found[1]
+
+
+def test_requests_are_answered_as_for_files(
+    daemon: DaemonFactory, connect: Connect, town: DividedMap, web: FaultyWeb
+) -> None:
+    clients = [connect(daemon(town.root)), connect(daemon(web.url))]
+    assert clients[1].id_prefix == "/town/"
+    assert (clients[0].cells, clients[0].bounds) == (clients[1].cells, clients[1].bounds)
+    for x, y, radius in ((0, 0, 25), (-25, 10, 5), (500, 500, 10), (0, 0, 1000)):
+        replies = [client.area(circle(x, y, radius)) for client in clients]
+        assert names(replies[0].cells) == names(replies[1].cells)
+        held = [[handle.version for handle in reply.cells][::2] for reply in replies]
+        less = [
+            client.differential(circle(x, y, radius / 2), packed=versions)
+            for client, versions in zip(clients, held, strict=True)
+        ]
+        assert names(less[0].cells) == names(less[1].cells)
+        assert len(less[0].removed_versions) == len(less[1].removed_versions)
+    listed = [{row[0].rsplit("/", 1)[-1]: row[2:6] for row in listing(client)} for client in clients]
+    assert sorted(listed[0]) == sorted(listed[1]) == sorted(town.corners)
+    assert listed[0] == listed[1]
+    for wanted in ("0_0.pcd", "/town/0_0.pcd"):
+        (handle,) = clients[1].selected([wanted]).cells
+        assert handle.id == "/town/0_0.pcd"
+    assert [f.code for f in clients[1].selected(["nowhere.pcd"]).failed] == ["unknown_cell"]
+
+
+def test_one_loader_fetches_many_objects_at_once(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    """All of a window's cells are asked for before the first one has been sent."""
+    asked: set[str] = set()
+
+    def stall(path: str) -> str:
+        if path.startswith("blobs/") and path not in asked:
+            asked.add(path)
+            return "stall"
+        return ""
+
+    one = daemon(web.url, "--workers", "1")
+    web.fault = stall
+    with shmmap.connect(one.endpoint) as client:
+        client.area(ALL, wait=None)
+        waiting = Patience()
+        while waiting(len(asked) < 9):
+            time.sleep(0.01)
+        web.heal()
+        again = Patience()
+        while again(not client.area(ALL, wait=5.0).complete):
+            pass
+
+
+# --- out of reach -------------------------------------------------------------------------------------
+
+
+def health(one: DaemonProcess) -> tuple[int, str]:
+    """Exit code of ``shmmap health --strict``, and what it says."""
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap.cli", "health", "--strict", "--instance", one.instance,
+         "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir],
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
+    )  # fmt: skip
+    return done.returncode, done.stdout
+
+
+def offline_codes(cells: Any) -> set[str]:
+    return {failure.code for failure in cells.failed}
+
+
+@pytest.mark.parametrize("how", ["refuse", "stall", "503"])
+def test_an_origin_out_of_reach_costs_only_what_is_not_here(
+    daemon: DaemonFactory, web: FaultyWeb, how: str
+) -> None:
+    one = daemon(web.url)
+    with shmmap.connect(one.endpoint) as client:
+        warm = client.around(0.0, 0.0, 1.0, wait=60.0)
+        assert warm.complete
+        assert len(warm) == 4
+        if how == "refuse":
+            web.refuse()
+        else:
+            web.fault = lambda _path: how
+        cold = client.area(ALL, wait=60.0)
+        assert offline_codes(cold) == {"offline"}
+        assert len(cold.failed) == 5
+        assert {cell.id for cell in cold} == {cell.id for cell in warm}
+        assert client.around(0.0, 0.0, 1.0, wait=60.0).complete, "what is here is served all the while"
+        waiting = Patience()
+        while waiting((said := health(one))[0] != 1):
+            time.sleep(0.05)
+        assert "out of reach" in said[1]
+        if how == "refuse":
+            web.listen()
+        web.heal()
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=5.0).complete):
+            time.sleep(0.05)
+        while waiting((said := health(one))[0] != 0):
+            time.sleep(0.05)
+
+
+def test_bodies_that_end_early_are_no_cells(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    web.fault = lambda path: "truncate" if path.startswith("blobs/") else ""
+    with shmmap.connect(one.endpoint) as client:
+        cells = client.area(ALL, wait=60.0)
+        assert (len(cells), offline_codes(cells)) == (0, {"offline"})
+        web.heal()
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=5.0).complete):
+            time.sleep(0.05)
+
+
+def test_a_daemon_ends_while_its_origin_says_nothing(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    with shmmap.connect(one.endpoint) as client:
+        web.fault = lambda _path: "stall"
+        client.area(ALL, wait=None)
+        assert one.stop() == 0
+
+
+# --- damaged ------------------------------------------------------------------------------------------
+
+
+def test_a_damaged_object_costs_its_cell_by_name(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    one = daemon(web.url)
+    blobs = sorted((web.folder / "blobs/sha256").iterdir())
+    damaged = {}
+    for path in blobs:  # one byte of each object but for the index, which is here
+        damaged[path] = path.read_bytes()
+        path.write_bytes(damaged[path][:-1] + bytes([damaged[path][-1] ^ 1]))
+    with shmmap.connect(one.endpoint) as client:
+        cells = client.area(ALL, wait=60.0)
+        assert len(cells) == 0
+        assert offline_codes(cells) == {"load_failed"}
+        assert len(cells.failed) == 9
+        for failure in cells.failed:
+            assert "its SHA-256 is not its name" in failure.message
+            assert re.search("blobs/sha256/[0-9a-f]{64}", failure.message)
+        for path, data in damaged.items():
+            path.write_bytes(data)
+        waiting = Patience()
+        while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
+            time.sleep(0.05)
+        assert {cell.id.rsplit("/", 1)[1] for cell in cells} == set(town.corners)
+
+
+def test_a_body_that_stalls_is_gone_on_with(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    web.fault = lambda path: "stall body" if path.startswith("blobs/") else ""
+    with shmmap.connect(one.endpoint) as client:
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=30.0).complete):  # a busy machine may take too long for it
+            time.sleep(0.05)
+    assert 206 in {status for _path, status in web.requests()}
+
+
+def test_what_was_damaged_on_its_way_once_is_fetched_again(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    seen: set[str] = set()
+
+    def once(path: str) -> str:
+        if path in seen or not path.startswith("blobs/"):
+            return ""
+        seen.add(path)
+        return "corrupt"
+
+    web.fault = once
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, wait=60.0).complete
+
+
+# --- versions -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["poll", "reload"])
+def test_another_version_is_taken_and_unchanged_cells_stay(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap, how: str
+) -> None:
+    one = daemon(web.url, "--poll", "1" if how == "poll" else "0")
+    with shmmap.connect(one.endpoint) as client:
+        before = {cell.id: cell.version for cell in client.area(ALL, wait=60.0)}
+        town.change("0_0.pcd", seed=5)
+        town.remove_cell("-20_0.pcd")
+        corner = (60, 0)
+        town.write_cell("60_0.pcd", corner, random_points(np.random.default_rng(8), corner, 100))
+        town.write_metadata()
+        publish(town.root, web.folder, "--layer", NDT)
+        web.requests()
+        if how == "reload":
+            assert client.reload().map_version
+        waiting = Patience()
+        while waiting(
+            client.map_version == (cells := client.area(ALL, wait=30.0)).map_version == 0
+            or {cell.id for cell in cells} == before.keys()
+        ):
+            time.sleep(0.02)
+        assert cells.complete
+        after = {cell.id: cell.version for cell in cells}
+        assert after.keys() == before.keys() - {"/town/-20_0.pcd"} | {"/town/60_0.pcd"}
+        same = after.keys() & before.keys() - {"/town/0_0.pcd"}
+        assert {cell: after[cell] for cell in same} == {cell: before[cell] for cell in same}
+        assert after["/town/0_0.pcd"] != before["/town/0_0.pcd"]
+        (changed,) = client.selected(["0_0.pcd"])
+        assert changed.xyz[:, 0].tobytes() == town.points("0_0.pcd")["x"].tobytes()
+    fetched = [path for path, status in web.requests() if path.startswith("blobs/") and status == 200]
+    assert len(fetched) == 5, "the root, two shards, and two cells"
+
+
+def test_a_version_never_goes_back(daemon: DaemonFactory, web: FaultyWeb, town: DividedMap) -> None:
+    first = (web.folder / "CURRENT").read_bytes()
+    town.change("0_0.pcd", seed=5)
+    publish(town.root, web.folder, "--layer", NDT)
+    second = (web.folder / "CURRENT").read_bytes()
+    one = daemon(web.url, "--poll", "0")
+    with shmmap.connect(one.endpoint) as client:
+        served = client.area(ALL, wait=60.0).map_version
+        (web.folder / "CURRENT").write_bytes(first)
+        with pytest.raises(shmmap.ShmmapError, match="offers version 1, older than version 2") as refused:
+            client.reload()
+        assert "--accept-version 1" in refused.value.hint
+        assert client.area(ALL, wait=60.0).map_version == served
+        assert "could not be read again" in health(one)[1]
+        (web.folder / "CURRENT").write_bytes(second)
+        client.reload()
+        assert health(one)[0] == 0
+
+
+def test_a_link_lost_half_way_keeps_the_old_version_whole(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    one = daemon(web.url, "--poll", "0")
+    with shmmap.connect(one.endpoint) as client:
+        before = {(cell.id, cell.version) for cell in client.area(ALL, wait=60.0)}
+        known = {path.name for path in (web.folder / "blobs/sha256").iterdir()}
+        town.change("0_0.pcd", seed=5)
+        publish(town.root, web.folder, "--layer", NDT)
+        new = {path.name for path in (web.folder / "blobs/sha256").iterdir()} - known
+        root = re.search('"root": "([0-9a-f]+)"', (web.folder / "CURRENT").read_text())
+        assert root is not None
+        web.fault = lambda path: "503" if path.rpartition("/")[2] in new - {root[1]} else ""
+        with pytest.raises(shmmap.ShmmapError):
+            client.reload()
+        cells = client.area(ALL, wait=60.0)
+        assert {(cell.id, cell.version) for cell in cells} == before
+        assert cells.complete
+        web.heal()
+        waiting = Patience()
+        while waiting({(cell.id, cell.version) for cell in client.area(ALL, wait=30.0)} == before):
+            time.sleep(0.05)
+
+
+def test_polls_are_conditional(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url, "--poll", "1")
+    waiting = Patience()
+    while waiting(("CURRENT", 304) not in web.requests()):
+        time.sleep(0.05)
+    assert "reload done" not in one.log
+
+
+# --- many shards --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def country(tmp_path: Path) -> Iterator[tuple[DividedMap, FaultyWeb]]:
+    """A map of 24 shards, two cells each, in a row along x; and a web server of it."""
+    made = DividedMap(tmp_path / "country")
+    made.pcd_dir.mkdir(parents=True)
+    rng = np.random.default_rng(3)
+    for number in range(24):
+        for x in (640 * number, 640 * number + 20):
+            made.write_cell(f"{x}_0.pcd", (x, 0), random_points(rng, (x, 0), 50))
+    made.write_metadata()
+    publish(made.root, tmp_path / "www")
+    with faulty_web(tmp_path / "www") as web:
+        yield made, web
+
+
+def test_pages_come_as_areas_need_them_and_then_the_rest(
+    daemon: DaemonFactory, connect: Connect, country: tuple[DividedMap, FaultyWeb]
+) -> None:
+    made, web = country
+    client = connect(daemon(web.url))
+    assert client.cells == 48
+    for number in (20, 3, 11):
+        reply = client.area(circle(640 * number + 10, 10, 15))
+        assert names(reply.cells) == [f"{640 * number}_0.pcd", f"{640 * number + 20}_0.pcd"]
+    assert sorted(row[0] for row in listing(client)) == sorted(made.corners)
+    found = client.area(["box", -1e5, -1e5, 1e5, 1e5])
+    assert {handle.id.rsplit("/", 1)[1] for handle in found.cells} == set(made.corners)
+
+
+def test_pages_out_of_reach_are_not_waited_for_and_come_by_themselves(
+    daemon: DaemonFactory, country: tuple[DividedMap, FaultyWeb]
+) -> None:
+    made, web = country
+    shards = shard_objects(web.folder)
+    held_back = set(shards[1:])
+    web.fault = lambda path: "503" if path.rpartition("/")[2] in held_back else ""
+    one = daemon(web.url)
+    with shmmap.connect(one.endpoint) as client:
+        assert client.around(10.0, 10.0, 15.0, wait=30.0).complete
+        waiting = Patience()
+        while waiting((far := client.around(640.0 * 20 + 10, 10.0, 15.0, wait=30.0)).covered):
+            pass
+        assert len(far) == 0
+        web.heal()
+        while waiting(not (far := client.around(640.0 * 20 + 10, 10.0, 15.0, wait=5.0)).complete):
+            time.sleep(0.02)
+        assert len(far) == 2
+        del made
+
+
+def shard_objects(folder: Path) -> list[str]:
+    """Names of the objects of the shards, in order, as another reader finds them."""
+    import json
+
+    import msgspec
+    import zstandard
+
+    current = json.loads((folder / "CURRENT").read_text())
+    frame = (folder / "blobs/sha256" / current["root"]).read_bytes()
+    root = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(frame))
+    hashes = root["shard_sha256"]
+    return [hashes[at : at + 32].hex() for at in range(0, len(hashes), 32)]
+
+
+# --- restarts -----------------------------------------------------------------------------------------
+
+
+def test_segments_are_kept_over_a_restart(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, layers=("points", NDT), wait=60.0).complete
+        kept = set(one.segments())
+    until_remembered(one)
+    one.leave()
+    web.requests()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, layers=("points", NDT), wait=60.0).complete
+        assert set(one.segments()) == kept
+    assert not [path for path, _ in web.requests() if path.startswith("blobs/")], "root and shards are here"
+
+
+def test_a_start_without_a_link_serves_what_was_taken(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    """Out of the disk, all of it: the list of cells, points, and published layers."""
+    one = daemon(web.url, "--poll", "1")
+    with shmmap.connect(one.endpoint) as client:
+        before = client.area(ALL, layers=PUBLISHED, wait=60.0)
+        assert before.complete
+        versions = {(cell.id, cell.layer, cell.version) for cell in before}
+        del before
+    until_remembered(one)
+    one.stop()
+    web.refuse()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        again = client.area(ALL, layers=PUBLISHED, wait=60.0)
+        assert again.complete
+        assert {(cell.id, cell.layer, cell.version) for cell in again} == versions
+        waiting = Patience()
+        while waiting(health(one)[0] != 1):
+            time.sleep(0.05)
+    town.change("0_0.pcd", seed=5)
+    publish(town.root, web.folder, "--layer", NDT)
+    web.listen()
+    with shmmap.connect(one.endpoint) as client:
+        while waiting({(c.id, c.layer, c.version) for c in client.area(ALL, layers=PUBLISHED)} == versions):
+            time.sleep(0.05)
+
+
+def test_an_older_offer_is_no_reason_not_to_start(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    first = (web.folder / "CURRENT").read_bytes()
+    town.change("0_0.pcd", seed=5)
+    publish(town.root, web.folder, "--layer", NDT)
+    one = daemon(web.url, "--poll", "1")
+    with shmmap.connect(one.endpoint) as client:
+        served = client.map_version
+    until_remembered(one)
+    one.stop()
+    (web.folder / "CURRENT").write_bytes(first)
+    one.start()
+    waiting = Patience()
+    with shmmap.connect(one.endpoint) as client:
+        assert client.map_version == served
+        while waiting("could not be read again" not in health(one)[1]):
+            time.sleep(0.05)
+        assert client.area(ALL, wait=60.0).map_version == served
+    one.stop()
+    one.arguments += ["--accept-version", "1"]
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        assert client.map_version != served
+        assert client.area(ALL, wait=60.0).complete
+        assert health(one)[0] == 0
+
+
+def until_remembered(one: DaemonProcess) -> None:
+    """Wait until the daemon has written down what it has taken."""
+    waiting = Patience()
+    while waiting(not list(one.state_dir.rglob("*.taken"))):
+        time.sleep(0.02)
+
+
+# --- what is refused, what is kept quiet --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["ftp://host/map"], 2, "a map cannot lie at a ftp:// URL"),
+        (["http://example.invalid/map"], 2, "--insecure-http"),
+        (["https://me:secret@host/map"], 2, "may hold a secret"),
+        (["file:///nowhere/at/all"], 66, "no map is published"),
+        (["http://127.0.0.1:9/map"], 75, "no answer"),
+        (["http://127.0.0.1:9/map", "--watch"], 78, "--watch is not for a published map"),
+        (["http://127.0.0.1:9/map", "--poll", "0.1"], 78, "--poll cannot be 0.1"),
+    ],
+)
+def test_what_cannot_be_served_is_refused(
+    daemon: DaemonFactory, words: list[str], code: int, says: str
+) -> None:
+    one = daemon(*words, start=False)
+    assert one.run_to_end() == code
+    assert says in one.log
+    assert "secret@" not in one.log
+
+
+@pytest.mark.parametrize("package", ["obstore", "zstandard"])
+def test_without_the_extra_it_is_said_what_to_install(
+    daemon: DaemonFactory, tmp_path: Path, package: str
+) -> None:
+    (tmp_path / "hidden").mkdir()
+    (tmp_path / "hidden" / f"{package}.py").write_text(
+        f"raise ModuleNotFoundError('hidden', name={package!r})\n"
+    )
+    path = f"{tmp_path / 'hidden'}{os.pathsep}{ROOT}"
+    one = daemon("http://127.0.0.1:9/map", start=False, environment={"PYTHONPATH": path})
+    assert one.run_to_end() == 69
+    assert f"pip install {package}" in one.log
+
+
+def loaded(pid: int) -> str:
+    return Path(f"/proc/{pid}/maps").read_text()
+
+
+def test_a_daemon_of_files_loads_nothing_of_this(daemon: DaemonFactory, town: DividedMap) -> None:
+    one = daemon(town.root)
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, wait=60.0).complete
+    for pid in (one.pid, *one.children()):
+        assert not re.search("obstore|zstandard", loaded(pid))
+
+
+def test_secrets_are_shown_nowhere(buckets: BucketServer, daemon: DaemonFactory, town: DividedMap) -> None:
+    publish(town.root, buckets.url("quiet"))
+    one = daemon(buckets.url("quiet"), environment=buckets.environment)
+    secret = buckets.environment["AWS_SECRET_ACCESS_KEY"]
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, wait=60.0).complete
+    assert secret not in one.log
+    for pid in (one.pid, *one.children()):
+        assert secret.encode() not in Path(f"/proc/{pid}/cmdline").read_bytes()
+    for path in Path(one.shm_dir).iterdir():
+        assert secret.encode() not in path.read_bytes()

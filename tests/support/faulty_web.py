@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A web server on loopback that serves a directory, and fails as it is told: for published maps.
+
+It answers conditional and range requests, keeps connections open, and writes down what was asked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http.server
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+__all__ = ["FaultyWeb", "faulty_web"]
+
+Fault = Callable[[str], str]
+"""What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
+``truncate``, ``corrupt``, a status such as ``503``; or nothing."""
+
+
+def _no_fault(_path: str) -> str:
+    return ""
+
+
+class _Server(http.server.ThreadingHTTPServer):
+    daemon_threads = True
+    web: FaultyWeb
+
+    def get_request(self) -> tuple[socket.socket, object]:
+        connection, address = super().get_request()
+        self.web.connections.add(connection)
+        return connection, address
+
+    def handle_error(self, *_: object) -> None:
+        """A client that has gone, or whose connection was ended: that is meant."""
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: _Server
+
+    def log_message(self, *arguments: object) -> None:
+        """Say nothing."""
+
+    def do_GET(self) -> None:
+        """Answer."""
+        web = self.server.web
+        path = self.path.lstrip("/")
+        fault = web.fault(path)
+        if fault == "stall":
+            web.until_healed()
+            self.close_connection = True
+            return
+        if fault.isdigit():
+            self._answer(int(fault), b"")
+            return
+        try:
+            data = (web.folder / path).read_bytes()
+        except OSError:
+            self._answer(404, b"")
+            return
+        tag = f'"{hashlib.md5(data).hexdigest()}"'
+        if self.headers.get("If-None-Match") == tag:
+            self._answer(304, b"", tag)
+            return
+        found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+        first = int(found[1]) if found else 0
+        last = min(int(found[2]), len(data) - 1) if found and found[2] else len(data) - 1
+        part = data[first : last + 1]
+        if fault == "stall body" and found:
+            fault = ""
+        if fault == "corrupt":
+            part = part[:-1] + bytes([part[-1] ^ 1])
+        partly = f"bytes {first}-{last}/{len(data)}" if found else ""
+        self._answer(206 if found else 200, part, tag, partly=partly, fault=fault)
+
+    def _answer(self, status: int, data: bytes, tag: str = "", *, partly: str = "", fault: str = "") -> None:
+        self.server.web.note(self.path.lstrip("/"), status)
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Last-Modified", "Thu, 01 Jan 2026 00:00:00 GMT")
+        if tag:
+            self.send_header("ETag", tag)
+        if partly:
+            self.send_header("Content-Range", partly)
+        self.end_headers()
+        if fault in ("truncate", "stall body"):
+            self.wfile.write(data[: len(data) // 2])
+            self.wfile.flush()
+            if fault == "stall body":
+                self.server.web.until_healed()
+            self.connection.shutdown(socket.SHUT_RDWR)
+            self.close_connection = True
+        else:
+            self.wfile.write(data)
+
+
+class FaultyWeb:
+    """A running server; `fault` says what becomes of each request."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.fault: Fault = _no_fault
+        self.connections: set[socket.socket] = set()
+        self._requests: list[tuple[str, int]] = []
+        self._healed = threading.Event()
+        self._port = 0
+        self._server: _Server | None = None
+        self._thread: threading.Thread | None = None
+        self.listen()
+
+    @property
+    def url(self) -> str:
+        """Where it is."""
+        return f"http://127.0.0.1:{self._port}"
+
+    def listen(self) -> None:
+        """Answer again, at the same port."""
+        self._server = _Server(("127.0.0.1", self._port), _Handler)
+        self._server.web = self
+        self._port = self._server.server_port
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,))
+        self._thread.start()
+
+    def refuse(self) -> None:
+        """Refuse connections, and end those there are."""
+        self.heal()
+        if self._server is not None and self._thread is not None:
+            self._server.shutdown()
+            self._server.server_close()
+            self._thread.join()
+        self._server = None
+        for connection in list(self.connections):
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+        self.connections.clear()
+
+    def heal(self) -> None:
+        """Fail no more; whoever stalls is let go."""
+        self.fault = _no_fault
+        self._healed.set()
+        self._healed = threading.Event()
+
+    def until_healed(self) -> None:
+        """Wait until `heal`."""
+        self._healed.wait()
+
+    def note(self, path: str, status: int) -> None:
+        """Write down what was asked."""
+        self._requests.append((path, status))
+
+    def requests(self) -> list[tuple[str, int]]:
+        """What was asked since the last call: path and status."""
+        found, self._requests = self._requests, []
+        return found
+
+
+@contextmanager
+def faulty_web(folder: Path) -> Iterator[FaultyWeb]:
+    """Run a server until the end of the block."""
+    web = FaultyWeb(folder)
+    try:
+        yield web
+    finally:
+        web.refuse()

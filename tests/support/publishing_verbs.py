@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verbs that publish and fetch maps, as a user runs them without a daemon."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tests.support.daemon_process import ROOT
+
+__all__ = ["Shmmap"]
+
+
+class Shmmap:
+    """Runs the command line, with a home and a cache of its own."""
+
+    def __init__(self, home: Path) -> None:
+        hidden = ("SHMMAP_", "AWS_", "GOOGLE_", "AZURE_")
+        self.environment = {k: v for k, v in os.environ.items() if not k.startswith(hidden)} | {
+            "PYTHONPATH": str(ROOT),
+            "HOME": str(home),
+            "XDG_CACHE_HOME": str(home / "cache"),
+        }
+
+    def start(self, *words: str | Path, env: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+        """Start a verb; one worker is enough for these maps."""
+        if words[0] == "publish":
+            words = (*words, "--workers", "1")
+        return subprocess.Popen(
+            [sys.executable, "-m", "shmmap.cli", *map(str, words)],
+            env={**self.environment, **(env or {})},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def __call__(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> str:
+        process = self.start(*words, env=env)
+        out, errors = process.communicate()
+        assert process.returncode == code, errors + out
+        return out if code in (0, 1) else errors
+
+    def json(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> dict[str, Any]:
+        found = json.loads(self(*words, "--json", code=code, env=env))
+        assert isinstance(found, dict)
+        return found
