@@ -58,7 +58,7 @@ def read_halo(
     seen: list[tuple[SourceStamp, bytes]] = []
     warnings: list[str] = []
     for neighbour in sources:
-        stamp = reader.stamp(neighbour)  # afterwards it may be that of a file that nobody has read
+        stamp = reader.stamp(neighbour)  # afterwards it may be that of a file that was never read
         before = SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
         try:
             source = reader.read(neighbour, box, ("xyz",))

@@ -20,7 +20,7 @@ _BLOCK_CELLS: Final = 1 << 15
 
 
 class CellIds(Protocol):
-    """What tells the ids of cells."""
+    """Cells whose ids can be had by index."""
 
     def ids(self, indices: Indices) -> list[str]:
         """Ids of several cells, in the order given."""

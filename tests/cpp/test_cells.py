@@ -176,11 +176,16 @@ def test_a_header_of_which_any_byte_was_changed(
 def test_messages_that_are_wrong(program: CppProgram) -> None:
     """Cut, changed, longer: each is read or refused, and no byte beyond it."""
     handle = ["-20_20.pcd", 2**63, "points", f"{7:016x}", 0, 8192, 500, -20.0, 20.0, 0.0, 40.0, False]
-    failed = ["c.pcd", "points", "over_budget", "no", [[1, 2, 3, "x", 5]]]
     later = {"unknown": [1.5, None]}
+    box = [-20.0, 20.0, 0.0, 40.0]
+    failed = [
+        ["c.pcd", "points", "over_budget", "no", [[1, 2, 3, "x", 5]], box, later],
+        ["d.pcd", "points", "unknown_cell", "no", [], None],
+        ["e.pcd", "points", "offline", "no"],
+    ]
     reply = [
-        "cells", 3, 5, 7, [handle] * 3, ["a.pcd"], bytes(range(8)), [["b.pcd", "points"]], [failed],
-        ["points"], True, later,
+        "cells", 3, 5, 7, [handle] * 3, ["a.pcd"], bytes(range(8)), [["b.pcd", "points"]], failed,
+        ["points"], False, "offline", later,
     ]  # fmt: skip
     row = ["-20_20.pcd", 2**63, -20.0, 20.0, 0.0, 40.0, 8192, -1.0, None]
     page = ["metadata_page", 3, 5, 7, [row] * 3, 3, True, ["a.pcd"], later]

@@ -224,7 +224,7 @@ def test_every_minor_version_is_answered(served: DaemonProcess, plain: Plain, mi
     cells = one.ask("area", HERE, ["points"], 30.0)
     assert [handle[0] for handle in cells[4]] == FOUR
     assert cells[5:9] == [[], b"", [], []]
-    assert len(cells) == 11
+    assert len(cells) == 12
 
 
 def test_what_the_daemon_does_not_know(served: DaemonProcess, plain: Plain) -> None:
@@ -271,7 +271,7 @@ def test_layers_in_canonical_form(served: DaemonProcess, plain: Plain) -> None:
     handles = [(handle[0], handle[2]) for handle in reply[4]]
     assert handles == [(name, layer) for name in FOUR for layer in ("points", canonical)]
     reply = one.ask("selected", ["0_0.pcd", FOUR[0], "0_0.pcd"], [canonical, "points", "points"], 30.0)
-    assert reply[9:] == [[canonical, "points", "points"], True]
+    assert reply[9:] == [[canonical, "points", "points"], True, ""]
     assert [handle[0] for handle in reply[4]] == [
         name for name in ("0_0.pcd", FOUR[0], "0_0.pcd") for _ in "ab"
     ]

@@ -72,11 +72,11 @@ def test_a_reload_is_seen_by_the_next_request(
     ):
         window.move_to(0, 0, wait=LONG_S)
         divided_map.change("0_0.pcd", 5)
-        told = admin.reload()
+        reloaded = admin.reload()
         asked.clear()
         update = window.move_to(0, 0, wait=LONG_S)
         assert [cell.name for cell in update.changed] == ["0_0.pcd"]
-        assert window.map_version == told.map_version
+        assert window.map_version == reloaded.map_version
         assert set(asked) == {Differential}
 
 

@@ -94,7 +94,7 @@ void print(const shmmap::Answer& answer) {
   for (const auto version : answer.removed_versions) std::cout << "removed_version\t" << version << "\n";
   for (const auto& cell : answer.cells) print("cell", cell);
   print_missing(answer.pending, answer.failed);
-  std::cout << "answer\t" << answer.epoch << "\t" << answer.map_version << "\t" << answer.covered << "\n";
+  std::cout << "answer\t" << answer.epoch << "\t" << answer.map_version << "\t" << answer.covered << "\t" << answer.reason << "\n";
 }
 
 void print(const shmmap::WindowUpdate& update) {

@@ -234,7 +234,7 @@ class CppCells(_Answer):
     def __init__(self, program: CppProgram, lines: list[list[str]]) -> None:
         super().__init__(program, lines)
         self.cells = self.of("cell")
-        epoch, map_version, covered = self.words("answer")
+        epoch, map_version, covered, self.reason = self.words("answer")
         self.epoch, self.map_version, self.covered = int(epoch), int(map_version), covered == "1"
         self.removed_versions = {int(line[1]) for line in lines if line[0] == "removed_version"}
 

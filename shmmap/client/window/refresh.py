@@ -27,10 +27,10 @@ _Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
 
 _SHAPES: Final[dict[str, _Shape]] = {"circle": geometry.Circle, "square": geometry.AutowareSquare}
 
-TELL_S: Final = 1.0
+SENT_S: Final = 1.0
 """A pose that says more of where a client goes than what was asked with last waits for so long at most."""
-_TELL_M: Final = 5.0
-_TELL_MPS: Final = 1.0
+_SENT_M: Final = 5.0
+_SENT_MPS: Final = 1.0
 """A pose or a velocity that differs by so much says more, as does another route."""
 
 
@@ -95,7 +95,7 @@ class WindowRefresher:
         self._timeout_s = timeout_s
         self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
-        self._told: tuple[Intent, float] | None = None
+        self._sent: tuple[Intent, float] | None = None
 
     @property
     def lost(self) -> bool:
@@ -107,8 +107,8 @@ class WindowRefresher:
 
         Whoever has told of another route or velocity less than a second ago lets that second pass.
         """
-        told = self._told
-        return told[1] + TELL_S if told is not None and _says_more(pose, told[0]) else math.inf
+        sent = self._sent
+        return sent[1] + SENT_S if sent is not None and _says_more(pose, sent[0]) else math.inf
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
         """Ask the daemon once.
@@ -135,7 +135,7 @@ class WindowRefresher:
             answer = self._ask(state, area, pose, wait_s, by_name=True)
             del first
         now_s = self._clock()
-        self._told = pose, asked_s
+        self._sent = pose, asked_s
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
             # what is kept beyond the window may be outdated, or in the way of what is in it
             self.retained.clear()
@@ -214,10 +214,10 @@ class WindowRefresher:
         return EMPTY
 
 
-def _says_more(pose: Intent, told: Intent) -> bool:
-    """Whether a pose says more of where a client goes than what the daemon was told last."""
+def _says_more(pose: Intent, sent: Intent) -> bool:
+    """Whether a pose says more of where a client goes than the one that the daemon was sent last."""
     return (
-        pose.route != told.route
-        or math.hypot(pose.vx - told.vx, pose.vy - told.vy) >= _TELL_MPS
-        or math.hypot(pose.x - told.x, pose.y - told.y) >= _TELL_M
+        pose.route != sent.route
+        or math.hypot(pose.vx - sent.vx, pose.vy - sent.vy) >= _SENT_MPS
+        or math.hypot(pose.x - sent.x, pose.y - sent.y) >= _SENT_M
     )

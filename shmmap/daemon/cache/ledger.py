@@ -178,7 +178,7 @@ class Ledger:
             self.order.again(self.by_key[key])
 
     def needed(self) -> Iterable[Key]:
-        """What somebody needs."""
+        """Keys that requests or pins need."""
         return self._needed.keys()
 
     def is_needed(self, key: Key) -> bool:

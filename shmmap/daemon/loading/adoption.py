@@ -43,7 +43,7 @@ CHANGED: Final = "its cell, or one around it, has changed"
 UNDECIDED: Final = (NOT_IN_MAP, CHANGED)
 """What may turn out to be otherwise when more of the map is known."""
 ADOPTED: Final = 0.5 * BACKGROUND
-"""Priority of pages that segments of an earlier life are judged by: behind all that somebody waits for."""
+"""Priority of pages that segments of an earlier run are judged by: behind all that a client waits for."""
 
 
 @dataclass(eq=False, slots=True)

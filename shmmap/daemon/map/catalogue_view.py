@@ -77,7 +77,7 @@ class Pages(Protocol):
         """Indices of a page's cells, here or not."""
 
     def cells_surely_in(self, area: Area) -> int:
-        """How many cells the pages have that lie wholly in an area: so many it has at least."""
+        """How many cells the pages have that lie wholly in an area: it has as many at least."""
 
     @property
     def known_cells(self) -> int:
@@ -107,7 +107,10 @@ class Pages(Protocol):
         """Pages that are not here, and that lie where the version ``before`` has some that are."""
 
     def spare(self) -> int | None:
-        """Return the page that was needed least recently, if they take more memory than they may."""
+        """Return the page that was needed least recently, if they take more memory than they may.
+
+        This is asked at every turn of the loop: it must cost nothing.
+        """
 
     def drop(self, page: int) -> None:
         """Forget a page's cells."""

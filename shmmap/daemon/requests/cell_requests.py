@@ -222,7 +222,7 @@ class CellRequests:
         return True
 
     def _have_loaded(self, wanted: PendingRequest, *, note: bool) -> Iterator[None]:
-        """Find what is warm and have the rest loaded; ``note`` what is, to be told when it has come."""
+        """Find what is warm and have the rest loaded; ``note`` what is, so that its end is noticed."""
         cache, warm, now_s = self._cache, self._cache.warm.layers, self._now_s()
         wanted.refused.clear()
         cold: list[tuple[int, str]] = []
@@ -254,7 +254,7 @@ class CellRequests:
                 self._patient.need(wanted, Key(self._cache.catalogue.id(index), layer))
 
     def _wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Have a request told of its pages; of those that have settled since it was found it is not."""
+        """Let a request wait for its pages, without those that have settled since it was found."""
         pages = self._cache.catalogue.pages
         if pages is not None and wanted.pages:
             come = {page for page in wanted.pages if pages.is_here(page)}
@@ -360,7 +360,7 @@ class CellRequests:
     def _goes_on_waiting(self, wanted: PendingRequest) -> Generator[None, None, bool]:
         """Whether there is more to wait for, and time.
 
-        That is what was found anew; or a cell that had settled and is cold again, or may fit now.
+        That is what was found again; or a cell that had settled and is cold again, or may fit now.
         """
         in_time = self._now_s() < wanted.deadline_s
         if wanted.is_new:

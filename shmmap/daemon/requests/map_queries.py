@@ -125,21 +125,21 @@ class MapQueries:
         if page is None and len(self._waiting) < MOST_WAITING:
             self._waiting.append(_Waiting(session, message, now_s + METADATA_WAIT_S))
         else:
-            session.connection.reply(encode(page or self._empty(message)))
+            session.connection.reply(encode(page or self.page(message, empty=True)))
 
     def pages_settled(self, news: PageNews) -> None:
-        """Pages have come, or cannot be had: answer who waited for one."""
+        """Answer requests that waited for pages which have come, or cannot be had."""
         if self._waiting and (news.come or news.out_of_reach):
             waiting, self._waiting = self._waiting, []
             for one in waiting:
                 self._answer_waiting(one, over=False)
 
     def next_deadline_s(self) -> float:
-        """When somebody has waited long enough; infinity if nobody waits."""
+        """When a request has waited long enough; infinity if none waits."""
         return min((one.deadline_s for one in self._waiting), default=math.inf)
 
     def answer_overdue(self, now_s: float) -> None:
-        """Answer those who have waited long enough: they ask again."""
+        """Answer requests that have waited long enough: clients repeat them."""
         waiting, self._waiting = self._waiting, []
         for one in waiting:
             if now_s < one.deadline_s:
@@ -159,16 +159,16 @@ class MapQueries:
         if page is None and not over:
             self._waiting.append(one)
         else:
-            connection.reply(encode(page or self._empty(one.message)))
+            connection.reply(encode(page or self.page(one.message, empty=True)))
 
-    def _empty(self, message: messages.Metadata) -> messages.MetadataPage:
-        """A page without rows: what comes next is not known yet."""
-        return messages.MetadataPage(
-            message.request, self.cache.epoch, self._catalogue.map_version, (), max(0, message.start)
-        )
+    def page(self, message: messages.Metadata, *, empty: bool = False) -> messages.MetadataPage | None:
+        """A page of the list; if a page of the map has to come first None, or one without rows if ``empty``.
 
-    def page(self, message: messages.Metadata) -> messages.MetadataPage | None:
-        """A page of the list; None if a page of the map has to come first."""
+        Raises
+        ------
+        Offline
+            That cannot be had at present.
+        """
         catalogue = self._catalogue
         removed: tuple[str, ...] = ()
         start, limit = max(0, message.start), max(1, min(message.limit, PAGE_ROWS))
@@ -177,22 +177,49 @@ class MapQueries:
         known = message.since is None or change is not None
         found: tuple[Sequence[int], int | None] | None
         if change is not None:
-            touched = change.cells
-            if area is not None:
-                touched = touched[touches(area, catalogue.boxes_of(touched))]
-            following = start + limit if start + limit < len(touched) else None
-            found = touched[start : start + limit].tolist(), following
+            found = self._changed_rows(change.cells, area, start, limit)
             removed = change.removed if start == 0 else ()
         elif catalogue.pages is None:
             found = self._rows(area, start, limit)
         else:
             found = self._rows_of_pages(catalogue.pages, area, start, limit)
-        if found is None:
+        if found is None and not empty:
             return None
+        found = found or ((), start)
         rows, next_start = tuple(map(self._row, found[0])), found[1]
         return messages.MetadataPage(
             message.request, self.cache.epoch, catalogue.map_version, rows, next_start, known, removed
         )
+
+    def _changed_rows(
+        self, touched: NDArray[np.intp], area: Area | None, start: int, limit: int
+    ) -> tuple[Sequence[int], int | None] | None:
+        """Cells that changed, from the ``start``-th on, and the next place; None: pages have to come."""
+        catalogue = self._catalogue
+        if (pages := catalogue.pages) is not None:
+            page_of = pages.of_cell
+            if not self._have_come(pages, sorted({page_of(index) for index in touched.tolist()})):
+                return None
+        if area is not None:
+            touched = touched[touches(area, catalogue.boxes_of(touched))]
+        return touched[start : start + limit].tolist(), start + limit if start + limit < len(
+            touched
+        ) else None
+
+    def _have_come(self, pages: Pages, needed: Sequence[int]) -> bool:
+        """Whether these pages are here; else they are fetched.
+
+        Raises
+        ------
+        Offline
+            One cannot be had at present.
+        """
+        absent = [page for page in needed if not pages.is_here(page)]
+        pages.want(needed, 0.0)
+        if any(map(pages.is_out_of_reach, absent)):
+            where = self.config.map_path
+            raise Offline(f"{where}: part of the list of cells cannot be reached at present")
+        return not absent
 
     def _rows(self, area: Area | None, start: int, limit: int) -> tuple[Sequence[int], int | None]:
         """Cells from a catalogue index on, and where the next page begins.
@@ -220,7 +247,7 @@ class MapQueries:
     ) -> tuple[Sequence[int], int | None] | None:
         """Cells of one page of the map, from a row on, and where the next ones begin; None: it has to come.
 
-        Where one begins is told as its page's number, shifted by 32 bits, and its row there.
+        A place in the list is its page's number, shifted by 32 bits, and its row there.
 
         Raises
         ------
@@ -233,12 +260,7 @@ class MapQueries:
         if at == len(listed):
             return (), None
         page = listed[at]
-        if not pages.is_here(page):
-            pages.want((page,), 0.0)
-            if pages.is_out_of_reach(page):
-                raise Offline(
-                    f"{self.config.map_path}: part of the list of cells cannot be reached at present"
-                )
+        if not self._have_come(pages, (page,)):
             return None
         cells = pages.cells(page)
         indices = np.arange(cells.start, cells.stop)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose list of cells comes in pages: who hears of those that have come, and which may go again."""
+"""A map whose list of cells comes in pages: what those that have come are for, and which may go again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MOST_RETIRED: Final = 20_000
 
 @dataclass(eq=False, slots=True)
 class Paging:
-    """Tells of pages that have come, or cannot be had, and drops those that nothing needs.
+    """Passes on which pages have come, or cannot be had, and drops those that nothing needs.
 
     A page is needed while there is a segment of one of its cells, a load, a pin, a request that is not
     answered yet, or a session whose area may have cells of it.  It is a chore of the serving loop.
@@ -54,7 +54,7 @@ class Paging:
         return self.cache.catalogue.pages
 
     def follow(self) -> None:
-        """Hear of the pages of the map that is served from now on."""
+        """Follow the pages of the map that is served from now on."""
         self._stop_following_the_next()
         if self._fd >= 0:
             self.watched.unwatch(self._fd)

@@ -372,7 +372,7 @@ class WaitingList:
             self.tidy()
 
     def page_settled(self, page: int, reason: str = "") -> None:
-        """A page has come, or cannot be had for this reason: tell the requests that wait for it."""
+        """A page has come, or cannot be had for this reason: note it for the requests that wait for it."""
 
         def note(waiter: PendingRequest) -> None:
             if page in waiter.pages:

@@ -18,6 +18,7 @@ import pytest
 
 from shmmap import AutowareSquare, Box, HeldCell, MapWindow, Offline, connect
 from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.map.catalogue_view import Ready
 from shmmap.daemon.requests import limits, map_queries
 from shmmap.daemon.requests.operators import operator_requests
 from shmmap.daemon.requests.paging import Paging
@@ -26,6 +27,7 @@ from shmmap.origin.map_directory import open_map
 from shmmap.protocol import events
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions, unpack_versions
+from tests.support.cpp_client import CppClient
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.paging_view import MemoryPages, PagedOrigin, PagedView
 from tests.unit.daemon.whole_daemon import WholeDaemon
@@ -99,8 +101,17 @@ class Paged:
         self.pages.come(*(page for page in pages if not self.pages.is_here(page)))
         self.daemon.turn_until(lambda: set(self.pages.needed) == set(pages))
 
+    def let_come(self, chance: random.Random, failing: float = 0.0) -> None:
+        """Let one of the pages come that are wanted, of this state of the map or the next; or fail."""
+        for view in {id(one): one for one in (self.view, self.origin.last) if one is not None}.values():
+            pages = view.pages
+            if pages.wanted and pages.settled:
+                page = chance.choice(sorted(pages.wanted))
+                fails = chance.random() < failing and not pages.is_out_of_reach(page)
+                (pages.fail if fails else pages.come)(page)
+
     def give_up(self, most: int) -> None:
-        """Let the daemon drop pages until so many are here, or more that are needed."""
+        """Let the daemon drop pages until no more than ``most`` are here, or all are needed."""
         self.pages.most, looked = most, 2 * len(self.pages.needed)
         is_needed = self.paging.is_needed
         while self.pages.spare() is not None and (looked := looked - 1):
@@ -264,7 +275,7 @@ def test_nothing_that_may_lie_in_the_unknown_part_is_removed(paged: Paged, by_na
     reply = paged.answer()
     assert reply.covered
     assert removed(reply) == sorted([*WESTERN, "nowhere.pcd"])
-    assert names(reply.cells) == [], "who kept the cells lacks nothing"
+    assert names(reply.cells) == [], "a client that kept the cells lacks nothing"
 
 
 def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
@@ -360,6 +371,67 @@ def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
     assert 10 < covered < 95, "else nothing was tried"
 
 
+@pytest.mark.parametrize("layer", ["points", HALO])
+def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, layer: str
+) -> None:
+    """Pages come in any order while it waits, some cannot be had, and the map may change meanwhile."""
+    chance = random.Random(7)
+    corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
+    strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
+    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), strips, set())
+    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    held: dict[str, int] = {}
+    reasons: list[str] = []
+    for step in range(40):
+        if chance.random() < 0.3:
+            one.ask(m.Evict)
+            held = {}
+            one.give_up(0)
+        area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
+        one.requests += 1
+        named = tuple(HeldCell(name, version) for name, version in held.items())
+        one.daemon.send(m.Differential(one.requests, area, (layer,), held=named, wait=LONG_S))
+        changes = layer == "points" and chance.random() < 0.15
+        while not one.daemon.answered():
+            one.daemon.turn()
+            one.let_come(chance, failing=0.15)
+            if changes and len(one.daemon.service._loop.cells):
+                changes = False
+                small_map.change(chance.choice(ALL), step)
+                one.origin.whole = open_map(str(small_map.root), cache_dir=str(tmp_path)).load()
+                one.daemon.service._reload()
+        reply = one.daemon.received()
+        if reply.map_version != one.origin.whole.map_version:
+            held = {}  # nothing to compare with: the state that it is of is gone
+            while one.view.map_version != one.origin.whole.map_version:
+                one.daemon.turn()
+                one.let_come(chance)
+            continue
+        reasons.append(reply.reason)
+        assert reply.pending == ()
+        assert {failed.code for failed in reply.failed} <= {"offline"}
+        lost = {failed.id for failed in reply.failed}
+        versions = LayerVersions(lambda: one.origin.whole)
+        index_of = {name: one.origin.whole.find(name) for name in ALL}
+        current = {name: versions.version(i, layer) for name, i in index_of.items() if i is not None}
+        inside = {
+            name for name, i in index_of.items() if i is not None and _touches(area, one.origin.whole.box(i))
+        }
+        fresh = {cell.id: cell.version for cell in reply.cells}
+        assert fresh == {name: current[name] for name in fresh}
+        if reply.covered:
+            assert set(fresh) | lost == {name for name in inside if held.get(name) != current[name]}
+            assert set(reply.removed) == {name for name in held if name not in inside}
+        else:
+            assert reply.reason == "offline"
+            assert set(fresh) | lost <= inside
+            assert not inside & set(reply.removed)
+        held = {name: v for name, v in held.items() if name not in reply.removed} | fresh
+    assert reasons.count("") > 10
+    assert "offline" in reasons
+
+
 # --- within one version ----------------------------------------------------------------------------
 
 
@@ -367,7 +439,7 @@ def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
     reply = paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S))
     cache, statistics = paged.daemon.memory.cache, paged.daemon.memory.statistics
     warm, before = cache.warm, {name: statistics.values[name] for name in ("reloads", "evictions")}
-    told = paged.ask(lambda n: events.Recent(n, after=0)).next
+    first = paged.ask(lambda n: events.Recent(n, after=0)).next
     version, segments = paged.view.map_version, {cell.segment for cell in reply.cells}
     welcome = paged.ask(lambda n: m.Hello(n, *m.PROTOCOL_VERSION, "again"))
     assert (welcome.cells, welcome.bounds) == (16, (-40.0, -40.0, 40.0, 40.0)), "those of the whole map"
@@ -376,10 +448,18 @@ def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
     assert segments < {cell.segment for cell in reply.cells}
     assert (cache.warm is warm, paged.view.map_version) == (True, version)
     assert {name: statistics.values[name] for name in before} == before
-    recent = paged.ask(lambda n: events.Recent(n, after=told - 1)).events
+    recent = paged.ask(lambda n: events.Recent(n, after=first - 1)).events
     assert {type(events.decode_event(one)) for one in recent} <= {events.Loaded, events.Late}
     since = paged.ask(lambda n: m.Metadata(n, since=version))
     assert (since.rows, since.since_known, since.map_version) == ((), True, version)
+
+
+def test_sizes_that_the_catalogue_knows_are_taken(paged: Paged, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By loads, and by what is fetched ahead."""
+    cache = paged.daemon.memory.cache
+    guessed = cache.estimate(0, "points")
+    monkeypatch.setattr(PagedView, "ready", lambda view, index, _: Ready(20_000, view.version(index)))
+    assert (guessed, cache.estimate(0, "points"), cache.estimate(0, "ndt(leaf=2.0)")) == (12288, 20480, 20480)
 
 
 def test_how_many_cells_are_known_is_counted(paged: Paged) -> None:
@@ -485,6 +565,26 @@ def test_a_version_that_is_held_back_gives_way_to_a_later_one(paged: Paged) -> N
     first[1].pages.come(EAST)
     assert [type(paged.answer()), type(paged.answer())] == [m.Reloaded] * 2
     assert paged.view is first[1]
+
+
+def test_what_changed_in_a_page_that_has_gone_comes_with_it(paged: Paged) -> None:
+    paged.know(WEST, EAST)
+    before = paged.view.map_version
+    paged.directory.change("20_20.pcd", 5)
+    paged.read_again()
+    for _ in range(2):
+        page = paged.ask(lambda n: m.Metadata(n, since=before))
+        assert (names(page.rows), page.since_known, page.next) == (["20_20.pcd"], True, None)
+        paged.know(WEST)
+        page = paged.ask(lambda n: m.Metadata(n, since=before))
+        assert (page.rows, page.since_known, page.next) == ((), True, 0), "nothing yet: ask again"
+        paged.know(WEST, EAST)
+
+
+def test_a_first_page_without_rows_says_that_the_whole_list_follows(paged: Paged) -> None:
+    paged.know(EAST)
+    page = paged.ask(lambda n: m.Metadata(n, since=12345))
+    assert (page.rows, page.since_known, page.next) == ((), False, 0)
 
 
 # --- the list of cells -----------------------------------------------------------------------------
@@ -657,6 +757,20 @@ def test_the_client_library_says_so(paged: Paged) -> None:
         while client.stats().counters["map_cells_known"] < 16:
             pass
         assert len(client.metadata()) == 16
+
+
+def test_so_does_the_one_in_cpp(paged: Paged, cpp_program: Path) -> None:
+    with paged.daemon.turning(), CppClient(cpp_program, paged.daemon.endpoint) as client:
+        everywhere = Box(-35.0, -35.0, 35.0, 35.0)
+        found = client.area(everywhere, wait=0.5)
+        assert (found.covered, found.complete, found.reason) == (False, False, "")
+        paged.pages.fail(EAST)
+        found = client.area(everywhere, wait=60.0)
+        assert (len(found), found.covered, found.reason) == (8, False, "offline")
+        paged.pages.come(EAST)
+        while not found.covered:
+            found = client.area(everywhere, wait=60.0)
+        assert (len(found), found.complete, found.reason) == (16, True, "")
 
 
 @pytest.mark.parametrize("background", [True, False])

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -169,3 +170,30 @@ def test_a_layer_that_looks_into_too_many_cells(tmp_path: Path) -> None:
     with pytest.raises(BadRequest, match="would look into about 484 cells"):
         versions.check_reach("normals(radius=5.0)")
     assert len(versions.neighbours(820, "normals(radius=50.0)")) == layer_versions.MAX_NEIGHBOURS + 1
+
+
+def test_a_layer_that_an_origin_has_ready_made(one: Map) -> None:
+    """Its version is the origin's, it is not computed, and it looks into no other cells."""
+
+    class Published(NamedTuple):
+        nbytes: int
+        version: int
+
+    index, other = one.index("0_0.pcd"), one.index("-20_0.pcd")
+    ready = {(index, "denoise"): Published(4096, 77), (index, "points"): Published(8192, 1)}
+
+    class Store(Catalogue):
+        def ready(self, index: int, layer: str) -> Published | None:  # type: ignore[override]
+            return ready.get((index, layer))
+
+    of = one.catalogue
+    store = Store(id_prefix=of.id_prefix, names=of.names, boxes=of.boxes, stamps=of.stamps)
+    versions = LayerVersions(lambda: store)
+    assert versions.version(index, "denoise") == 77
+    assert versions.neighbours(index, "denoise") == []
+    assert (versions.is_computed(index, "denoise"), versions.looks_into(index, "denoise")) == (False, None)
+    assert versions.version(index, "points") == of.version(index)
+    assert not versions.is_computed(index, "points")
+    assert versions.version(other, "denoise") == one.versions.version(other, "denoise")
+    assert versions.is_computed(other, "denoise")
+    assert versions.neighbours(other, "denoise") == one.versions.neighbours(other, "denoise") != []

@@ -2,7 +2,7 @@
 """Carries out what `Prefetch` wishes for, with loaders and memory that nobody asks for just now.
 
 A wish becomes a load like any other when nothing else is queued and a loader has a free place: so one at most
-waits, none is out of date, and what somebody asks for comes first.  Some places are kept free, so that a
+waits, none is out of date, and what a client asks for comes first.  Some places are kept free, so that a
 demand need not wait for a wish, unless the wish is nearly one itself.  Memory: a wish takes the place of what
 will be needed later than itself, never of what will be needed sooner or is in use, and what was fetched ahead
 and not asked for yet takes its share of the budget at most.
@@ -35,7 +35,7 @@ FOLLOW_S: Final = 0.005
 """So long moves of a few clients may wait, and ended loads while nobody is on a way: of many that follow one
 another all are looked at once."""
 KEPT: Final = 4
-"""A part of one loader's places is kept free for demands: one in so many, one at least."""
+"""A part of one loader's places is kept free for demands: a quarter, one at least."""
 FULL_S: Final = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 

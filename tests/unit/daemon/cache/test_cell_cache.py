@@ -183,6 +183,48 @@ def test_what_a_dead_loader_had_finished_counts(puppet: Puppet) -> None:
     assert len(reply.cells) == 3
 
 
+@pytest.mark.parametrize("begun", [False, True])
+def test_of_a_loader_that_fetches_only_the_job_that_it_works_on_is_to_blame(
+    puppet: Puppet, begun: bool
+) -> None:
+    one = puppet.one
+    puppet.worker.fetches = True
+    ask(one, 1)
+    jobs = puppet.queue(4)
+    if begun:
+        puppet.say(worker_messages.Begun(jobs[2].number))
+    puppet.process.kill()
+    puppet.say(worker_messages.Ended(-11))
+    puppet.channel.close()
+    reply = one.cells_of(1)  # the others are loaded by another one
+    assert len(reply.cells) == 4 - begun
+    assert [jobs[2].source.name in failure.message for failure in reply.failed] == [True] * begun
+    assert one.ledger.reserved_bytes == 0
+
+
+def test_a_loader_that_fetches_and_says_nothing_is_replaced(puppet: Puppet) -> None:
+    """No cell is to blame: all are loaded by another one."""
+    one = puppet.one
+    one.stop_clock()
+    puppet.worker.fetches = True
+    ask(one, 1)
+    first = puppet.queue(4)[0]
+    one.offset_s += 29.0
+    puppet.say(worker_messages.Begun(first.number))
+    one.run_until(lambda: puppet.worker.at_work == first.number)
+    puppet.say(puppet.done(first))
+    one.run_until(lambda: not puppet.worker.at_work)
+    one.pool.deadline_s = 10.0
+    one.offset_s += 11.0
+    one.run_until(lambda: puppet.worker not in list(one.pool))
+    one.pool.deadline_s = 300.0
+    assert puppet.process.wait() == -signal.SIGKILL
+    session = one.session()
+    one.ask(session, Area(2, CircleMessage(0, 0, 5), wait=30.0))
+    assert (len(one.cells_of(2).cells), one.cells_of(2).failed) == (4, ())
+    puppet.channel.close()
+
+
 def test_a_load_that_took_too_long_is_not_tried_again_at_once(puppet: Puppet) -> None:
     """Nor does a loader look at its file: the file system may be what hangs."""
     one = puppet.one
