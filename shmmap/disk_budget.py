@@ -89,15 +89,15 @@ class DiskBudget:
         spare = int(room.f_blocks * room.f_frsize * _SPARE_SHARE)
         return nbytes <= min(self.limit_bytes, room.f_bavail * room.f_frsize - spare)
 
-    def added(self, nbytes: int) -> None:
-        """Count a file that was added; trims when it is time to."""
+    def added(self, nbytes: int) -> bool:
+        """Count a file that was added; True when it is time to `trim`."""
         with self._lock:
             self._added_bytes += nbytes
             free_bytes = self.limit_bytes - self._left_bytes
             if self._added_bytes <= max(self.limit_bytes // _STEPS, free_bytes // _PROCESSES):
-                return
+                return False
             self._added_bytes = 0
-        self.trim()
+        return True
 
     def used_bytes(self) -> int:
         """Bytes of all files that are kept, looked at now."""
@@ -106,7 +106,8 @@ class DiskBudget:
     def trim(self) -> int:
         """Remove files if there are more than the budget allows; returns the bytes of what is left.
 
-        What a killed process left half written goes too, an hour later.
+        A hundred thousand files take a second.  What a killed process left half written goes too, an hour
+        later.
         """
         found = self._kept(remove_stale=True)
         total = sum(kept.nbytes for kept in found)
@@ -124,36 +125,48 @@ class DiskBudget:
         return total
 
     def _kept(self, *, remove_stale: bool) -> list[_Kept]:
-        found: dict[int, _Kept] = {}
+        found: dict[tuple[int, int], _Kept] = {}
         now_s = time.time()
-        for path, status, is_index in self._files():
-            name = os.path.basename(path)
-            if name.startswith(INTERIM):
-                if remove_stale and abs(now_s - status.st_mtime) > _STALE_INTERIM_S:
-                    with contextlib.suppress(OSError):
-                        os.unlink(path)
-            elif _KEPT.fullmatch(name):
-                kept = found.setdefault(status.st_ino, _Kept(status.st_mtime, status.st_size, is_index))
-                kept.paths.append(path)
+
+        def is_old(status: os.stat_result) -> bool:
+            return abs(now_s - status.st_mtime) > _STALE_INTERIM_S
+
+        for place, is_index in self._places():
+            for entry in _files(place):
+                with contextlib.suppress(OSError):  # another process has removed it
+                    status = entry.stat(follow_symlinks=False)
+                    if _KEPT.fullmatch(entry.name):
+                        key = status.st_dev, status.st_ino
+                        kept = found.get(key)
+                        if kept is None:
+                            kept = found[key] = _Kept(status.st_mtime, status.st_size, is_index)
+                        kept.paths.append(entry.path)
+                    elif remove_stale and entry.name.startswith(INTERIM) and is_old(status):
+                        os.unlink(entry.path)
         return list(found.values())
 
-    def _files(self) -> Iterator[tuple[str, os.stat_result, bool]]:
-        """All files, and whether they are index pages; links are not followed, neither out nor in."""
+    def _places(self) -> list[tuple[str, bool]]:
+        """Where files are kept, and whether they are index pages there."""
         layers, objects = (os.path.join(self.directory, name) for name in (LAYERS, OBJECTS))
-        places = {layers: False}
+        places = [(layers, False)]
         with contextlib.suppress(OSError):
             owner = os.geteuid() if self._owner is None else self._owner
             if not why_not_private(os.lstat(objects), owner):
-                places |= {os.path.join(objects, CELLS): False, os.path.join(objects, INDEX): True}
-        for place, is_index in places.items():
-            with contextlib.suppress(OSError):  # it, or a folder in it, is not there
-                if not stat.S_ISDIR(os.lstat(place).st_mode):
-                    continue
-                for folder, _, names, fd in os.fwalk(place):
-                    for name in names:
-                        with contextlib.suppress(OSError):
-                            status = os.stat(name, dir_fd=fd, follow_symlinks=False)
-                            yield os.path.join(folder, name), status, is_index
+                places += [(os.path.join(objects, CELLS), False), (os.path.join(objects, INDEX), True)]
+        return places
+
+
+def _files(place: str) -> Iterator[os.DirEntry[str]]:
+    """All files below a directory; links are not followed, the directory may be one that is not there."""
+    with contextlib.suppress(OSError):
+        if not stat.S_ISDIR(os.lstat(place).st_mode):
+            return
+        with os.scandir(place) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    yield from _files(entry.path)
+                else:
+                    yield entry
 
 
 def _order_of_removal(found: list[_Kept], limit_bytes: int) -> list[_Kept]:

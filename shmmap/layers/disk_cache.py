@@ -205,7 +205,8 @@ class LayerCache:
             with contextlib.suppress(OSError):
                 os.unlink(interim)
             raise
-        self.budget.added(header.total_bytes)
+        if self.budget.added(header.total_bytes):
+            self.budget.trim()
         return True
 
     def _link(self, old: str, new: str) -> None:

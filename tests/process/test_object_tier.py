@@ -27,6 +27,7 @@ USER = """
 import random, sys
 from tests.process.test_object_tier import LIMIT, objects
 from shmmap.origin.remote.object_tier import ObjectTier
+from tests.support.trimming import wait_for_trimming
 cache, seed, rounds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 tier, made, random_ = ObjectTier(cache, limit_bytes=LIMIT), objects(), random.Random(seed)
 hits = 0
@@ -38,6 +39,7 @@ for _ in range(rounds):
     assert found in (None, data), "wrong bytes"
     if found is None:
         assert tier.put(name, data, is_index=page), "not kept"
+        wait_for_trimming()
 print(hits, tier.damaged_objects)
 """
 

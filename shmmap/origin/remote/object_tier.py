@@ -63,6 +63,7 @@ class ObjectTier:
         self._budget = DiskBudget(cache_dir, limit_bytes)
         self._quiet = quiet
         self._lock = threading.Lock()
+        self._trimmer: threading.Thread | None = None
         self._said: set[str] = set()
         self._damaged = 0
 
@@ -126,8 +127,18 @@ class ObjectTier:
         except OSError as error:
             self._say(error)
             return False
-        self._budget.added(nbytes)
+        if self._budget.added(nbytes):
+            self._begin_to_trim()
         return True
+
+    def _begin_to_trim(self) -> None:
+        """Trim beside: what was fetched is waited for."""
+        with self._lock:
+            if self._trimmer is None or not self._trimmer.is_alive():
+                trimmer = threading.Thread(target=self._budget.trim, name="trim", daemon=True)
+                with contextlib.suppress(RuntimeError):  # there are as many threads as there may be
+                    trimmer.start()
+                    self._trimmer = trimmer
 
     def mark_index_used(self, digests: Iterable[bytes]) -> None:
         """Say that index pages are those of the version in use: they are kept before others."""

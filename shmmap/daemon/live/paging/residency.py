@@ -19,7 +19,7 @@ import enum
 import math
 from collections import deque
 from itertools import islice, takewhile
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -51,6 +51,17 @@ class _Short(enum.IntEnum):
     NO = 0
     NEAR = 1
     SCANS = 2
+
+
+class _Rank(NamedTuple):
+    """How soon a chunk is given up: the greatest is the first."""
+
+    is_idle: bool
+    is_unwanted: bool
+    distance: int
+
+
+_SAVED_TO_GO: Final = _Rank(True, True, 1 << 62)
 
 
 class _Missing:
@@ -122,7 +133,7 @@ class Residency:
         self._missing = _Missing(limits.radius)
         self._needing: dict[ChunkKey, Chunk] = {}
         self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
-        self._found: dict[State, list[Chunk]] = {
+        self._found: dict[State, list[tuple[_Rank, Chunk]]] = {
             State.CLEAN: [],
             State.DIRTY: [],
         }  # to give up, the first last
@@ -355,14 +366,25 @@ class Residency:
         if (not found or short < self._reviewed[state]) and self._is_review_due(now_s, state, short):
             self._review(now_s, state, short)
         while found:
-            chunk = found.pop()
+            rank, chunk = found.pop()
             if chunk.state is state and self.chunks.get(chunk.key) is chunk and chunk.retry_s <= now_s:
-                if self._may_go(chunk, now_s, short):
+                may_go = self._may_go(chunk, now_s, short)
+                if may_go and not (state is State.DIRTY and self._has_clean(rank, now_s, short)):
                     return chunk
-                if short < self._reviewed[state]:  # its turn comes when memory is shorter again
-                    found.append(chunk)
+                if may_go or short < self._reviewed[state]:  # its turn comes when memory is shorter again
+                    found.append((rank, chunk))
                     return None
         return None
+
+    def _has_clean(self, rank: _Rank, now_s: float, short: _Short) -> bool:
+        """Whether a clean chunk is given up before one of this rank: then that is not saved for it."""
+        found = self._found[State.CLEAN]
+        return (
+            bool(found)
+            and found[-1][0] >= rank
+            and found[-1][1].state is State.CLEAN
+            and self._may_go(found[-1][1], now_s, short)
+        )
 
     def _note_news(self) -> None:
         """A chunk came, was changed or saved."""
@@ -384,17 +406,18 @@ class Residency:
         found = [one for one in every.values() if one.state is state and self._may_go(one, now_s, short)]
         self._review_s[state] = now_s + REVIEW_S
         self._in_vain_s[state] = -math.inf if found else now_s + IN_VAIN_S
-        order = np.lexsort(
-            (
-                np.array([-one.active for one in found]),
-                self.windows.distances([one.key for one in found]),
-                np.array([not self.is_wanted(one, now_s) for one in found]),
-                np.array([not one.waiting for one in found]),
-            )
-        )
+        is_idle = np.array([not one.waiting for one in found], bool)
+        is_unwanted = np.array([not self.is_wanted(one, now_s) for one in found], bool)
+        distance = self.windows.distances([one.key for one in found])
+        order = np.lexsort((np.array([-one.active for one in found]), distance, is_unwanted, is_idle))
         least, part = FOUND_AT_ONCE
-        most = max(least, len(found) // part)
-        self._found[state][:] = [found[at] for at in order[-most:].tolist()]
+        first = order[-max(least, len(found) // part) :]
+        ranks = zip(
+            is_idle[first].tolist(), is_unwanted[first].tolist(), distance[first].tolist(), strict=True
+        )
+        self._found[state][:] = [
+            (_Rank(*rank), found[at]) for rank, at in zip(ranks, first.tolist(), strict=True)
+        ]
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
         """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
@@ -433,7 +456,7 @@ class Residency:
         if chunk.version > version:
             self._soil(chunk, now_s)
         elif chunk.leaving:
-            self._found[State.CLEAN].append(chunk)
+            self._found[State.CLEAN].append((_SAVED_TO_GO, chunk))
 
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
         """A file could not be written: the chunk stays in memory, and is tried again."""

@@ -22,6 +22,7 @@ from shmmap.errors import MapDataError, MapMissing, Offline
 from shmmap.origin.remote.directory_store import DirectoryStore
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import blob_path
+from tests.support.trimming import wait_for_trimming
 
 DATA = random.Random(1).randbytes(20_000)
 NAME = hashlib.sha256(DATA).digest()
@@ -433,6 +434,7 @@ def test_many_threads(origin: Origin, cache: Path) -> None:
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(read, random_.choices(list(made), k=1500)))
+    wait_for_trimming()
     total = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
     assert 20_000 < total <= 40_000 * 17 / 16
     counts = [sum(both) for both in zip(cells.counts, pages.counts, strict=True)]
@@ -452,5 +454,6 @@ def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
     for number in range(40):
         data = random.Random(100 + number).randbytes(4000)
         tier.put(hashlib.sha256(data).digest(), data)
+        wait_for_trimming()
     left = [tier.get(name, 5000, is_index=True) is not None for name in names]
     assert left == [True, True, False, False, False, True, True, True]

@@ -309,6 +309,22 @@ def test_a_dirty_chunk_is_saved_before_it_is_given_up() -> None:
     assert (one.chunk_bytes, one.active, len(one.chunks), len(one.index)) == (0, 0, 0, 0)
 
 
+@pytest.mark.parametrize("dirty_x", [1, 6, 9])
+def test_a_dirty_chunk_is_saved_to_go_when_no_clean_one_goes_before_it(dirty_x: int) -> None:
+    """Else the chunks that the next scan changes are written and read again for each."""
+    one = Residency(Limits(30, radius=0, loads=100, saves=100), new_bytes=10)
+    one.move("a", (0.5, 9.5, 0.5))
+    dirty = written(one, ChunkKey(dirty_x, 9, 0))
+    for x in (4, 5):
+        one.adopt(ChunkKey(x, 9, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0).changed_s = 0.0
+    one.add(scan_of(ChunkKey(2, 9, 0), ChunkKey(3, 9, 0), number=7))
+    gone = one.next_eviction(1.0)
+    assert gone is not None
+    assert gone.key.x == 5, "at once, whatever else is to be saved"
+    load(one, 1.0)
+    assert one.next_save(1.0) is (dirty if dirty_x > 4 else None)
+
+
 def test_too_many_known_voxels_are_too_many() -> None:
     one = Residency(Limits(10**9, radius=1, most_active=2, loads=100))
     one.move("a", (0.5, 0.5, 0.5))
@@ -482,6 +498,22 @@ def test_what_was_given_up_is_missing_until_it_is_flushed() -> None:
     durability.flushed()
     assert durability.missing(one.chunks.values()) == []
     assert chunk.durable == 1
+
+
+def test_a_chunk_near_a_client_that_a_scan_needed_the_room_of_comes_back_later() -> None:
+    one = Residency(Limits(10, radius=0, loads=100, saves=100), new_bytes=10)
+    one.move("a", (0.5, 0.5, 0.5))
+    load(one)
+    one.add(scan_of(ChunkKey(9, 0, 0)))
+    assert one.next_eviction(0.0) is not None
+    far = load(one)
+    apply(one, far)
+    one.saved(far, far.version, 0.0) if one.next_save(10.0) is far else pytest.fail("it is due")
+    flush(one)
+    assert one.next_eviction(0.1) is None, "what is near comes back later"
+    assert one.next_event_s(0.1) == RETRY_S
+    assert one.next_eviction(10.0) is far
+    assert load(one, 10.0).key == HERE
 
 
 def test_a_chunk_near_a_client_that_cannot_be_read_is_tried_again() -> None:
