@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
 from tests.support.publishing import publish
-from tests.support.raw_client import RawClient, circle
+from tests.support.raw_client import DaemonError, RawClient, circle
 from tests.support.served_cells import names
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -553,6 +554,44 @@ def test_a_start_with_nothing_on_the_disk_and_without_a_link(daemon: DaemonFacto
         web.listen()
         waiting = Patience()
         while waiting(not client.area(ALL, wait=5.0).complete):
+            time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    "step", ["taken.head", "taken.written", "taken.named", "tier.written", "daemon.linked"]
+)
+def test_killed_while_it_takes_a_version(
+    daemon: DaemonFactory, connect: Connect, web: FaultyWeb, town: DividedMap, tmp_path: Path, step: str
+) -> None:
+    """Without a link the next start has the version of before, or this one: all of one of them."""
+    one = daemon(web.url, "--poll", "0")
+    with shmmap.connect(one.endpoint) as client:
+        before = {(cell.id, cell.version) for cell in client.area(ALL, wait=60.0)}
+    until_remembered(one)
+    one.leave()
+    one.environment["SHMMAP_TEST_CRASH"] = f"{step}:1:{tmp_path}/reached"
+    town.change("0_0.pcd", seed=5)
+    publish(town.root, web.folder, "--layer", NDT)
+    one.start()
+    raw, waiting = connect(one, timeout=1.0), Patience()
+    while waiting(not (tmp_path / "reached").exists()):
+        with suppress(TimeoutError, DaemonError):
+            raw.ask("reload")
+            raw.area(circle(0, 0, 1000), wait=1.0)
+    del one.environment["SHMMAP_TEST_CRASH"]
+    one.kill()
+    web.refuse()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        cells = client.area(ALL, wait=60.0)
+        found = {(cell.id, cell.version) for cell in cells}
+        missing = {failure.cell_id for failure in cells.failed}
+        assert cells.covered
+        assert len(found | {(cell, 0) for cell in missing}) == 9
+        assert missing <= {"/town/0_0.pcd"}, "only what changed may not be here"
+        assert len(found & before) >= 8
+        web.listen()
+        while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
             time.sleep(0.02)
 
 
