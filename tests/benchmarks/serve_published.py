@@ -76,9 +76,9 @@ def loader(url: str, jobs: list[CellJob]) -> None:
         reader.fetcher.begin(number, spec, job)
     while waiting:
         select.select([reader.fetcher.fd], [], [])
-        number = reader.fetcher.done()
-        if number is not None:
-            job, fd = waiting.pop(number), segment_file()
+        done = reader.fetcher.done()
+        if done is not None:
+            job, fd = waiting.pop(done), segment_file()
             made = make_layer(spec, CellJob(job.cell_id, job.source, job.box, reader=reader, ready=1), fd)
             assert made.header.rows
             os.close(fd)

@@ -68,9 +68,9 @@ class Driver:
             assert self.held.get(name) != handle.version, "it is held already"
             points = read_segment(self.client.path(handle)).columns["xyz"]
             source = state.points[name]
-            right = np.column_stack([source["x"], source["y"], source["z"]])
-            assert points.tobytes() == right.tobytes()
-            assert self.known.setdefault((name, handle.version), points.tobytes()) == right.tobytes()
+            right = np.column_stack([source["x"], source["y"], source["z"]]).tobytes()
+            assert points.tobytes() == right
+            assert self.known.setdefault((name, handle.version), points.tobytes()) == right
         gone = {name.rsplit("/", 1)[-1] for name in reply.removed}
         if covered:
             assert reason == ""

@@ -123,6 +123,23 @@ def test_every_column_is_that_of_the_files(
         assert {cell.id for cell in client.area(ALL)} == {f"/town/{name}" for name in town.corners}
 
 
+def test_points_in_millimetres_are_those_that_fetch_writes(
+    daemon: DaemonFactory, town: DividedMap, tmp_path: Path
+) -> None:
+    publish(town.root, tmp_path / "mm", "--encoding", "mm", "--id-prefix", "/town/")
+    fetch = [sys.executable, "-m", "shmmap.cli", "fetch", str(tmp_path / "mm"), str(tmp_path / "back")]
+    subprocess.run(fetch, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True)
+    found = []
+    for path in (tmp_path / "back", tmp_path / "mm"):
+        with shmmap.connect(daemon(path).endpoint) as client:
+            cells = client.area(ALL, layers=("points", COMPUTED[0]), wait=120.0)
+            assert cells.complete, cells.failed
+            found.append(columns_of(cells))
+            for cell in cells:
+                cell.verify()
+    assert found[0] == found[1]
+
+
 def test_a_client_in_cpp_maps_the_same_bytes(
     daemon: DaemonFactory, town: DividedMap, web: FaultyWeb, cpp_program: Path
 ) -> None:
@@ -191,14 +208,19 @@ def test_one_loader_fetches_many_objects_at_once(daemon: DaemonFactory, web: Fau
 # --- out of reach -------------------------------------------------------------------------------------
 
 
-def health(one: DaemonProcess) -> tuple[int, str]:
-    """Exit code of ``shmmap health --strict``, and what it says."""
+def verb(one: DaemonProcess, *words: str) -> tuple[int, str]:
+    """Exit code of a verb that reads a daemon's statistics, and what it prints."""
     done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", "health", "--strict", "--instance", one.instance,
+        [sys.executable, "-m", "shmmap.cli", *words, "--instance", one.instance,
          "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir],
         env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
     )  # fmt: skip
     return done.returncode, done.stdout
+
+
+def health(one: DaemonProcess) -> tuple[int, str]:
+    """Exit code of ``shmmap health --strict``, and what it says."""
+    return verb(one, "health", "--strict")
 
 
 def offline_codes(cells: Any) -> set[str]:
@@ -227,6 +249,12 @@ def test_an_origin_out_of_reach_costs_only_what_is_not_here(
         while waiting((said := health(one))[0] != 1):
             time.sleep(0.05)
         assert "out of reach" in said[1]
+        assert "out of reach for" in verb(one, "status")[1]
+        logged = one.log.count("load failed")
+        until = Patience()
+        while until(offline_codes(client.area(ALL, wait=30.0)) != {"offline"}):
+            pass
+        assert one.log.count("load failed") == logged, "it is said once"
         if how == "refuse":
             web.listen()
         web.heal()
@@ -512,6 +540,22 @@ def test_a_start_without_a_link_serves_what_was_taken(
             time.sleep(0.05)
 
 
+def test_a_start_with_nothing_on_the_disk_and_without_a_link(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url)
+    until_remembered(one)
+    one.stop()
+    shutil.rmtree(one.cache_dir)
+    web.refuse()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        nothing = client.area(ALL, wait=30.0)
+        assert (len(nothing), nothing.covered) == (0, False)
+        web.listen()
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=5.0).complete):
+            time.sleep(0.02)
+
+
 def test_an_older_offer_is_no_reason_not_to_start(
     daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
 ) -> None:
@@ -595,6 +639,25 @@ def test_a_daemon_of_files_loads_nothing_of_this(daemon: DaemonFactory, town: Di
         assert client.area(ALL, wait=60.0).complete
     for pid in (one.pid, *one.children()):
         assert not re.search("obstore|zstandard", loaded(pid))
+
+
+def test_no_other_address_is_asked(
+    buckets: BucketServer, daemon: DaemonFactory, town: DividedMap, tmp_path: Path
+) -> None:
+    """Nor the cloud's metadata address where there are no credentials: the store is asked without any."""
+    publish(town.root, buckets.url("private"))
+    shim, seen = tmp_path / "connects.so", tmp_path / "connects"
+    source = ROOT / "tests/support/connects.c"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(shim), str(source), "-ldl"], check=True)
+    watched = {"HOME": str(tmp_path), "LD_PRELOAD": str(shim), "CONNECTS_SEEN": str(seen)}
+    keyless = {**dict.fromkeys(buckets.environment, ""), "AWS_ENDPOINT_URL": buckets.endpoint, **watched}
+    assert daemon(buckets.url("private"), environment=keyless, start=False).run_to_end() == 75
+    assert set(seen.read_text().split()) == {"127.0.0.1"}
+    one = daemon(buckets.url("private"), "--poll", "1", environment={**buckets.environment, **watched})
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, wait=60.0).complete
+        client.reload()
+    assert set(seen.read_text().split()) == {"127.0.0.1"}
 
 
 def test_secrets_are_shown_nowhere(buckets: BucketServer, daemon: DaemonFactory, town: DividedMap) -> None:

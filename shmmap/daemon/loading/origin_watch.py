@@ -34,7 +34,7 @@ class OriginWatch:
     def next_s(self) -> float:
         """At once when a load could not read what it needs, or never."""
         failed = self.scheduler.prefetcher.prefetch.health.failed_in_a_row
-        return -math.inf if failed and not self.link.is_out else math.inf
+        return -math.inf if failed and not self.link.is_doubted else math.inf
 
     def turn(self, now_s: float) -> None:
         """Find out whether the origin is out of reach."""

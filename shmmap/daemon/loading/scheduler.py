@@ -395,7 +395,8 @@ class Scheduler:
         else:
             self._statistics.add("loads_failed")
             cell, layer = load.key
-            log.warning("load failed", cell=cell, layer=layer, code=code, message=message)
+            if code != "offline" or not self.prefetcher.prefetch.health.unreachable:  # that is said once
+                log.warning("load failed", cell=cell, layer=layer, code=code, message=message)
         if self._cache.index_of(load.key.cell_id) is None:  # it left the map: nothing is remembered of it
             self._end(load)
             return

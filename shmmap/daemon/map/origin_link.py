@@ -21,6 +21,8 @@ PROBE_S: Final = 1.0
 """How often an origin that is out of reach is asked."""
 JITTER: Final = 0.2
 """Of the time between two questions: a fleet must not ask all at once."""
+LONG_TRUST_S: Final = 32.0
+"""So long, at most, one that answers is not doubted for single things that cannot be had."""
 END_S: Final = 0.5
 
 
@@ -52,7 +54,9 @@ class OriginLink:
         self._ask = ask
         self._poll_s = poll_s
         self._condition = threading.Condition()
-        self._is_out = False
+        self._is_out = self._is_doubted = self._has_failed = False
+        self._answered_s = -math.inf
+        self._trust_s = PROBE_S
         self._changed = self._back = False
         self._closed = self._now = False
         self._thread: threading.Thread | None = None
@@ -64,16 +68,25 @@ class OriginLink:
         """Whether it did not answer when it was last asked for anything."""
         return self._is_out
 
+    @property
+    def is_doubted(self) -> bool:
+        """Whether it is being found out if it answers."""
+        return self._is_out or self._is_doubted
+
     def doubt(self) -> None:
-        """Something could not be had: find out when it can.  May be called in any thread."""
+        """Something could not be had: find out whether anything can.  May be called in any thread.
+
+        Where it just has answered, that one thing is what cannot be had: it is asked again later.
+        """
         with self._condition:
-            if not self._is_out:
+            if self.is_doubted or self._closed:
+                return
+            self._is_doubted = True
+            if time.monotonic() >= self._answered_s + self._trust_s:
                 self._is_out = True
-                log.warning("the map's origin is out of reach")
                 os.eventfd_write(self.fd, 1)
-            if not self._closed:
-                self._start()
-                self._condition.notify()
+            self._start()
+            self._condition.notify()
 
     def ask_now(self) -> None:
         """Ask without waiting for the next time."""
@@ -104,8 +117,7 @@ class OriginLink:
             wait_s = self._poll_s * random.uniform(1 - JITTER, 1 + JITTER)  # noqa: S311  no secret
             with self._condition:
                 while not self._closed:
-                    due_s = asked_s + (PROBE_S if self._is_out else wait_s or math.inf)
-                    now_s = time.monotonic()
+                    due_s, now_s = self._due_s(asked_s, wait_s), time.monotonic()
                     if now_s >= due_s or self._now:
                         break
                     self._condition.wait(min(due_s - now_s, threading.TIMEOUT_MAX))
@@ -114,6 +126,13 @@ class OriginLink:
                 self._now = False
             asked_s = time.monotonic()
             self._look()
+
+    def _due_s(self, asked_s: float, wait_s: float) -> float:
+        if self._is_out:
+            return asked_s + PROBE_S
+        if self._is_doubted:
+            return self._answered_s + self._trust_s
+        return asked_s + (wait_s or math.inf)
 
     def _look(self) -> None:
         try:
@@ -127,14 +146,24 @@ class OriginLink:
             log.exception("the map's origin gives no version", cause="a defect in shmmap")
             changed, answers = False, False
         with self._condition:
-            if self._is_out and answers:
-                self._back = True
-                log.info("the map's origin answers again")
-            elif not answers and not self._is_out:
+            if answers:
+                self._note_answer(time.monotonic())
+            elif not self._has_failed:
                 log.warning("the map's origin is out of reach")
-            self._is_out = not answers
+            self._has_failed = self._is_out = not answers
+            self._is_doubted = False
             self._changed = self._changed or changed
             os.eventfd_write(self.fd, 1)
+
+    def _note_answer(self, now_s: float) -> None:
+        self._back = self._back or self.is_doubted
+        if self._has_failed:
+            log.info("the map's origin answers again")
+        if self._has_failed or now_s > self._answered_s + LONG_TRUST_S:
+            self._trust_s = PROBE_S
+        elif self.is_doubted:  # it answers, and yet something cannot be had
+            self._trust_s = min(2 * self._trust_s, LONG_TRUST_S)
+        self._answered_s = now_s
 
     def close(self) -> bool:
         """End the thread; False if it still waits for the origin."""

@@ -19,7 +19,13 @@ from shmmap.geometry import Area
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.origin.map_frame import MapFrame
-from shmmap.origin.remote.published_index import POINTS, Root, Shard, published_layer_version
+from shmmap.origin.remote.published_index import (
+    MILLIMETRES,
+    POINTS,
+    Root,
+    Shard,
+    published_layer_version,
+)
 from shmmap.origin.remote.published_source import LayerSource, pack_source
 from shmmap.origin.spatial_index import touches
 from shmmap.segment.source import Source
@@ -30,6 +36,8 @@ __all__ = ["PublishedView"]
 Indices: TypeAlias = NDArray[np.intp]
 _Pair: TypeAlias = tuple[int | None, int | None]
 """Numbers of the shards at one place in an earlier version and in a later one."""
+MM_BYTES: Final = 6
+"""So much larger is a point's place in memory than in millimetres."""
 _NOTHING: Final = np.empty(0, np.intp)
 
 
@@ -186,7 +194,7 @@ class PublishedView:
         """Do nothing: within a version no cell changes."""
 
     def source_bytes(self, index: int) -> int:
-        """Size of a cell's points in memory."""
+        """Size of a cell's points in memory, or near it."""
         page, row = self.pages.row(index)
         return int(page.shard.layers[POINTS].raws[row])
 
@@ -197,11 +205,13 @@ class PublishedView:
             return None
         page, row = self.pages.row(index)
         objects = page.shard.layers[layer]
-        cell = self.version(index)
+        version, nbytes = self.version(index), int(objects.raws[row])
         if layer != POINTS:
             content = objects.contents[row].tobytes()
-            cell = published_layer_version(cell, layer, builder_version, content)
-        return Ready(int(objects.raws[row]), cell)
+            version = published_layer_version(version, layer, builder_version, content)
+        elif self.root.encoding == MILLIMETRES:
+            nbytes += MM_BYTES * int(page.shard.points[row])
+        return Ready(nbytes, version)
 
     # --- what changed -----------------------------------------------------------------------------
 

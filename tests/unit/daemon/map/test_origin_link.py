@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An origin elsewhere is asked for versions, doubted when something fails, and heard when it is back."""
+
+from __future__ import annotations
+
+import select
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from shmmap.daemon.map.origin_link import LinkNews, OriginLink
+from shmmap.errors import MapDataError, Offline
+from tests.support.patience import Patience
+
+
+class Origin:
+    """Answers as it is told; counts questions."""
+
+    def __init__(self) -> None:
+        self.answer: bool | Exception = False
+        self.asked = 0
+        self._links: list[OriginLink] = []
+
+    def ask(self) -> bool:
+        self.asked += 1
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+    def link(self, poll_s: float = 0.0) -> OriginLink:
+        self._links.append(OriginLink(self.ask, poll_s))
+        return self._links[-1]
+
+    def close(self) -> None:
+        assert all(link.close() for link in self._links)
+
+
+@pytest.fixture
+def origin() -> Iterator[Origin]:
+    one = Origin()
+    yield one
+    one.close()
+
+
+def news(link: OriginLink) -> LinkNews:
+    """Wait for the next ones."""
+    assert select.select([link.fd], [], [], 60.0)[0]
+    return link.take()
+
+
+def until_asked(origin: Origin, times: int) -> None:
+    waiting = Patience()
+    while waiting(origin.asked < times):
+        time.sleep(0.001)
+
+
+def test_a_doubt_that_is_unfounded_is_over_at_once(origin: Origin) -> None:
+    link = origin.link()
+    link.doubt()
+    waiting, back = Patience(), False
+    while waiting(not back):
+        back = news(link).back
+    assert (link.is_out, link.is_doubted, origin.asked) == (False, False, 1)
+
+
+def test_it_is_out_until_it_answers(origin: Origin) -> None:
+    origin.answer = Offline("no answer")
+    link = origin.link()
+    link.doubt()
+    assert link.is_out
+    until_asked(origin, 2)
+    assert link.is_out
+    origin.answer = False
+    waiting, back = Patience(), False
+    while waiting(not back):
+        back = news(link).back
+    assert not link.is_out
+
+
+def test_what_cannot_be_had_of_one_that_answers_is_asked_for_less_and_less(origin: Origin) -> None:
+    link = origin.link()
+    times = []
+    for _ in range(3):
+        link.doubt()
+        link.doubt()
+        waiting = Patience()
+        while waiting(not news(link).back):
+            pass
+        times.append(time.monotonic())
+        assert not link.is_doubted
+    assert origin.asked == 3
+    assert times[1] - times[0] >= 0.99
+    assert times[2] - times[1] >= 1.99
+
+
+def test_another_version_is_told_of(origin: Origin) -> None:
+    origin.answer = True
+    link = origin.link(0.05)
+    assert news(link) == LinkNews(changed=True, back=False)
+    link.take()
+    until_asked(origin, origin.asked + 2)
+    assert news(link).changed, "until it was taken"
+    link = origin.link(1e9)
+    link.ask_now()
+    assert news(link).changed
+
+
+def test_a_damaged_answer_is_an_answer(origin: Origin) -> None:
+    origin.answer = MapDataError("it names no root")
+    link = origin.link(0.01)
+    until_asked(origin, 2)
+    assert not link.is_out
+
+
+def test_without_a_reason_nothing_is_asked_and_no_thread_runs(origin: Origin) -> None:
+    threads = threading.active_count()
+    origin.link()
+    assert threading.active_count() == threads
