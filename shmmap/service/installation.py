@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from shmmap.errors import CannotWrite, MapMissing
+from shmmap.origin.remote.store import is_url, read_url
 from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import DROP_IN, MOUNT
 from shmmap.service.program import Program, command_line, is_hidden, quoted
@@ -26,6 +27,9 @@ __all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_tex
 
 SHIPPED_PROGRAM = "/usr/bin/shmmapd"
 SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
+PUBLISHED_MAP = "drop-ins/published-map.conf"
+CREDENTIALS = ("shmmap.aws", "shmmap.google", "shmmap.azure")
+"""Files in /etc/shmmap that are passed to the service, whose account need not be able to read them."""
 _GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
 
 
@@ -84,10 +88,15 @@ def configuration(map_path: str = "", *, group: bool = True) -> str:
     return text if group else re.sub(r"^group = .*$", '#group = ""', text, flags=re.M)
 
 
-def _map_path(given: str, file_system: FileSystem) -> str:
-    """Return the map's path as the service will have it."""
+def _map_path(given: str, file_system: FileSystem) -> tuple[str, bool]:
+    """Return the map's path as the service will have it, and whether that is a URL to fetch it from."""
+    if is_url(given):
+        url = read_url(given)
+        if url.scheme != "file":
+            return url.text, True
+        given = url.path
     if not given:
-        return ""
+        return "", False
     path = file_system.inside(given)
     if file_system.status(path) is None:
         raise MapMissing(
@@ -96,7 +105,7 @@ def _map_path(given: str, file_system: FileSystem) -> str:
             if file_system.is_this_machine
             else f"the service will see what lies below {file_system.root} alone: put the map there",
         )
-    return path
+    return path, False
 
 
 def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFile]:
@@ -110,14 +119,25 @@ def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFi
     return [PlannedFile(path, f"{_GENERATED}# {why}\n[Service]\n{lines}")]
 
 
+def _network(path: Path, file_system: FileSystem, *, is_remote: bool) -> list[PlannedFile]:
+    """A drop-in that lets the daemon fetch the map, with the credentials that there are."""
+    if not is_remote and not path.exists():
+        return []
+    if not is_remote:
+        return [PlannedFile(path, f"{_GENERATED}# The map is on this machine.\n")]
+    there = [name for name in CREDENTIALS if file_system.status(f"/etc/shmmap/{name}") is not None]
+    lines = "".join(f"LoadCredential={name}:/etc/shmmap/{name}\n" for name in there)
+    return [PlannedFile(path, _GENERATED + shipped_text(PUBLISHED_MAP) + lines)]
+
+
 def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False) -> list[PlannedFile]:
     """Return what a service for the whole machine needs.
 
     Parameters
     ----------
     map_path
-        The map of the plain service; empty: what the example says.  Of an image: as it will be named there,
-        or as it is here, below ``root``.
+        The map of the plain service, or its URL; empty: what the example says.  Of an image: as it will be
+        named there, or as it is here, below ``root``.
     root
         Where the machine's file system begins: another directory than ``/`` for an image, which has the
         program in it.
@@ -129,12 +149,12 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
     MapMissing
         There is nothing at ``map_path``.
     BadRequest
-        ``root`` is no directory.
+        ``root`` is no directory, or a URL cannot be served.
     ConfigError
         The image has no program, or the service's account could not read it.
     """
     file_system = FileSystem(root)
-    map_path = _map_path(map_path, file_system)
+    map_path, is_remote = _map_path(map_path, file_system)
     program = Program.this_one() if file_system.is_this_machine else Program.in_image(file_system)
     program.check_readable()
 
@@ -152,9 +172,11 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
     for service in ("shmmapd.service", "shmmapd@.service", "shmmap-ros-bridge.service"):
         planned += _drop_in(place(*units, f"{service}.d", "10-program.conf"), program.hidden_directories, why)
     if map_path:
-        shown = [map_path] if is_hidden(map_path) else []
+        shown = [map_path] if not is_remote and is_hidden(map_path) else []
         why = "The map lies where ProtectHome= or PrivateTmp= would hide it."
         planned += _drop_in(place(*units, "shmmapd.service.d", "20-map.conf"), shown, why)
+        network = place(*units, "shmmapd.service.d", "25-published-map.conf")
+        planned += _network(network, file_system, is_remote=is_remote)
     mount = place(*units, Path(MOUNT).name)
     if huge_pages or mount.exists():
         planned.append(PlannedFile(mount, shipped_text(MOUNT)))
@@ -169,7 +191,7 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
 
 def plan_user(map_path: str = "", config_home: str = "") -> list[PlannedFile]:
     """Return what a user's own service needs; parameters and errors as for `plan_system`."""
-    map_path = _map_path(map_path, FileSystem())
+    map_path, _ = _map_path(map_path, FileSystem())
     home = Path(config_home or os.environ.get("XDG_CONFIG_HOME", "") or Path.home() / ".config")
     return [
         *(

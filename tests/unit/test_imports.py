@@ -70,7 +70,7 @@ PARTS = {
     },
     "prepare": BASE | {"formats", "layers", "origin", "segment"},
     "publishing": BASE | {"dividing", "formats", "layers", "origin", "prepare", "segment"},
-    "service": BASE,
+    "service": BASE | {"origin"},
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
         "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",

@@ -28,6 +28,8 @@ it, as root in shmmap's checkout:
 --huge-pages writes a mount unit for /run/shmmap_huge, of at most half of the machine's memory, and drop-ins
 that let the daemon use it; a later install keeps them.  To undo it, remove run-shmmap_huge.mount and both
 30-huge-pages.conf.
+For the URL of a published map a drop-in lets the service reach the network.  Credentials that are in
+/etc/shmmap, files shmmap.aws, shmmap.google and shmmap.azure of root alone, are passed to it.
 With --root the units start the program that the image has in /opt/shmmap (or /usr/local, /usr), and the
 map is the one that has its path there; what lies outside of the image is refused.
 Exit code: 0, 66 no map there, 73 a file cannot be written, 78 the service could not read this program."""
@@ -55,7 +57,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Install this daemon as a service.",
         epilog=_INSTALL,
     )
-    install.add_argument("--map", metavar="DIR", default="", help="the map to serve")
+    install.add_argument("--map", metavar="MAP", default="", help="the map to serve: a path or a URL")
     install.add_argument(
         "--huge-pages",
         action="store_true",

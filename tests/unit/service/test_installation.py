@@ -108,6 +108,30 @@ def test_a_map_of_an_image(image: Path, tmp_path: Path, monkeypatch: pytest.Monk
         assert ("\nBindReadOnlyPaths=/srv/map\n" in drop_in.read_text()) == hidden
 
 
+def test_a_published_map_is_fetched_over_the_network(image: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the credentials that are there; a map on this machine takes the network away again."""
+    drop_in = image / "etc/systemd/system/shmmapd.service.d/25-published-map.conf"
+
+    def install(where: str) -> set[str]:
+        assert main(["unit", "install", "--root", str(image), "--map", where]) == 0
+        return set(drop_in.read_text().splitlines()) if drop_in.exists() else set()
+
+    assert install("/srv/map") == set()
+    config = image / "etc/shmmap/shmmap.toml"
+    config.unlink()
+    for name in ("shmmap.aws", "shmmap.other"):
+        (config.parent / name).touch()
+    lines = install("s3://maps/town/")
+    assert lines >= {"[Service]", "PrivateNetwork=no", "IPAddressDeny=", "After=network-online.target"}
+    assert {line for line in lines if "Credential" in line} == {
+        "LoadCredential=shmmap.aws:/etc/shmmap/shmmap.aws"
+    }
+    assert tomllib.loads(config.read_text())["map_path"] == "s3://maps/town"
+    assert not [line for line in install("file:///srv/map") if not line.startswith("#")]
+    assert main(["unit", "install", "--root", str(image), "--map", "s3://key:secret@maps/town"]) == 2
+    assert "secret" not in capsys.readouterr().err.replace("may hold a secret", "")
+
+
 def test_links_do_not_lead_out_of_an_image(image: Path, tmp_path: Path) -> None:
     """An absolute link starts at the image's root, and `..` ends there; what is linked to is not written."""
     elsewhere = tmp_path / "etc"
