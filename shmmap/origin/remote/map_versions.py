@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
-from typing import Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import msgspec
 
@@ -297,9 +297,14 @@ def _now_text() -> str:
     return now.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_DECODERS: Final[dict[Any, Any]] = {kind: msgspec.json.Decoder(kind) for kind in (Current, Entry)}
+
+
 def _decode(data: bytes | memoryview, kind: type[_Named], name: str) -> _Named:
     try:
-        return msgspec.json.decode(data, type=kind)
+        found: _Named = _DECODERS[kind].decode(data)
+        return found
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MapDataError(f"it is not what it should be: {error}", path=name, cause=DAMAGED) from None
 

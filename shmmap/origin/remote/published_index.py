@@ -117,6 +117,12 @@ class ShardFields(msgspec.Struct, frozen=True):
     layers: dict[str, LayerFields]
 
 
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_DECODERS: Final[dict[Any, Any]] = {
+    kind: msgspec.msgpack.Decoder(kind) for kind in (_Head, RootFields, LayerFields, ShardFields)
+}
+
+
 # --- the root -----------------------------------------------------------------------------------------
 
 
@@ -502,7 +508,8 @@ class _Wrong:
 
 def _decode(unpacked: bytes, kind: type[_Struct], wrong: _Wrong) -> _Struct:
     try:
-        return msgspec.msgpack.decode(unpacked, type=kind)
+        found: _Struct = _DECODERS[kind].decode(unpacked)
+        return found
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise wrong(f"no MessagePack map of its kind: {error}") from None
 
