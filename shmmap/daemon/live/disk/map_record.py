@@ -175,9 +175,14 @@ def read_chunk(files: FilesToRead, name: str) -> bytes:
     return _whole(files, name, _MOST_CHUNK_BYTES)
 
 
-def _decoded(data: bytes, kind: type[_T], name: str) -> _T:
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_map_record: Final = msgspec.json.Decoder(MapRecord)
+_manifest: Final = msgspec.json.Decoder(Manifest)
+
+
+def _decoded(data: bytes, decoder: msgspec.json.Decoder[_T], name: str) -> _T:
     try:
-        return msgspec.json.decode(data, type=kind)
+        return decoder.decode(data)
     except _NOT_DECODED as error:
         said = str(error) or type(error).__name__
         raise MapDataError(f"it is damaged: {said}", path=name) from error
@@ -193,7 +198,7 @@ def read_map(files: FilesToRead) -> MapRecord:
     OSError
         It cannot be read.
     """
-    found = _decoded(_whole(files, MAP_FILE, _MOST_MAP_BYTES), MapRecord, MAP_FILE)
+    found = _decoded(_whole(files, MAP_FILE, _MOST_MAP_BYTES), _map_record, MAP_FILE)
     if found.format != MAP_FORMAT:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
     numbers = [one.number for one in found.mappers]
@@ -221,7 +226,7 @@ def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, in
     OSError
         It cannot be read; FileNotFoundError: there is none.
     """
-    found = _decoded(_whole(files, MANIFEST, _MOST_MANIFEST_BYTES), Manifest, MANIFEST)
+    found = _decoded(_whole(files, MANIFEST, _MOST_MANIFEST_BYTES), _manifest, MANIFEST)
     if found.format != MAP_FORMAT:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MANIFEST)
     try:
