@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from shmmap.origin.remote.store import Store
+    from shmmap.publishing.signing import MapSigner
 
-__all__ = ["URL_HELP", "add_store_options", "store_at"]
+__all__ = ["URL_HELP", "add_sign_option", "add_store_options", "signer_at", "store_at"]
 
 URL_HELP = "where the map is published: s3://, gs://, az://, https://, file://, or a directory"
 
@@ -39,3 +40,20 @@ def store_at(url: str, args: argparse.Namespace) -> Store:
         return open_store(
             url, insecure_http=args.insecure_http, instance_credentials=args.instance_credentials
         )
+
+
+def add_sign_option(parser: argparse.ArgumentParser) -> None:
+    """Add where the keys of a signed map are."""
+    parser.add_argument("--sign", metavar="KEYDIR", help="sign with the keys in this directory")
+
+
+def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False) -> MapSigner | None:
+    """Return what signs a map, as the options say; None: it is not signed."""
+    from shmmap.optional_packages import needed_packages
+
+    if args.sign is None:
+        return None
+    with needed_packages("a signed map"):
+        from shmmap.publishing.signing import MapSigner
+
+    return MapSigner(store, args.sign, make_keys=make_keys)

@@ -16,7 +16,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
-from shmmap.cli.store_options import URL_HELP, add_store_options, store_at
+from shmmap.cli.store_options import URL_HELP, add_sign_option, add_store_options, signer_at, store_at
 
 if TYPE_CHECKING:
     from shmmap.origin.remote.store import Store
@@ -30,6 +30,7 @@ JSON (fields may be added, none is removed):
    "created": RFC 3339 or "", "root": hash, "bytes": of the root, "before", "restored": the version whose
    content it has again, or 0}]}, the latest first; a web server cannot list those that were never served
   --rollback: {"url", "changed", "version": the current one, "restored", "objects": that were looked for}
+  --refresh: {"url", "version", "valid_until": {"timestamp", "snapshot", "targets": RFC 3339}}
   --prune: {"url", "versions": [number], "objects", "bytes", "kept_versions": [number], "kept_objects",
    "kept_bytes"}
 Exit code: 0, 2 wrong usage, 65 damaged, 66 no such map or version, 69 a package is missing, 75 the store
@@ -56,10 +57,16 @@ def add_parser(subparsers: Subparsers) -> None:
         action="store_true",
         help="remove versions that have not been current for --keep days, and what only they have",
     )
+    what.add_argument(
+        "--refresh",
+        action="store_true",
+        help="sign a signed map's timestamp again, and its snapshot in time; needs --sign",
+    )
     parser.add_argument(
         "--keep", metavar="DAYS", type=_days, default=None, help="with --prune: 7 or more (default: 30)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_sign_option(parser)
     add_store_options(parser)
     add_json_option(parser)
 
@@ -81,13 +88,18 @@ def run(args: argparse.Namespace) -> int:
 
     if args.keep is not None and not args.prune:
         raise BadRequest("--keep goes with --prune")
+    if args.sign is not None and not (args.refresh or args.rollback):
+        raise BadRequest("--sign goes with --refresh or --rollback")
+    if args.refresh and args.sign is None:
+        raise BadRequest("--refresh needs the directory with online.pem and ROOT.json", hint="--sign KEYDIR")
     store = store_at(args.url, args)
+    signer = signer_at(store, args)
     unit = "objects" if args.prune else "cells"
     progress = StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
     if args.rollback is not None:
         from shmmap.publishing.restore import restore_version
 
-        restored = restore_version(store, args.rollback, progress)
+        restored = restore_version(store, args.rollback, progress, signer)
         if args.json:
             print_json(
                 {
@@ -102,6 +114,25 @@ def run(args: argparse.Namespace) -> int:
             print_line(f"version {restored.current} has that content: nothing has changed")
         else:
             print_line(f"version {restored.version} is current: the content of version {restored.restored}")
+        return 0
+    if signer is not None:
+        refreshed = signer.refresh()
+        valid = {
+            "timestamp": refreshed.timestamp,
+            "snapshot": refreshed.snapshot,
+            "targets": refreshed.targets,
+        }
+        if args.json:
+            print_json(
+                {
+                    "url": store.url,
+                    "version": refreshed.current.version,
+                    "valid_until": {role: until.isoformat() for role, until in valid.items()},
+                }
+            )
+        else:
+            print_line(f"version {refreshed.current.version} is signed")
+            print_pairs([(role, f"until {until:%Y-%m-%d %H:%M} UTC") for role, until in valid.items()])
         return 0
     if args.prune:
         from shmmap.publishing.prune import KEEP_DAYS, prune_versions
