@@ -141,7 +141,7 @@ class MapSigner:
         self._sign(entry.current, entry.before)
         step("sign.signed")
         self._follow(entry.current)
-        step("version.switched")
+        step("sign.switched")
 
     def keep(self, current: Current) -> None:
         """Have the current version signed where nothing has changed, and again in time."""
@@ -240,7 +240,7 @@ class MapSigner:
         for number in range(first, first + _MOST_TRIES):
             signed.version = number
             data = self._signed_bytes(signed)
-            step(f"sign.{kind.type}")
+            step("sign.metadata")
             if self._store.put_new(metadata_path(kind.type, number), data):
                 return Metadata.from_bytes(data)
         raise InstanceBusy(f"other publishers take every number at {self._store.url}", hint="try again later")
@@ -298,7 +298,7 @@ class MapSigner:
             seen = read_current(self._store)
             if seen.current is not None and seen.current.version >= current.version:
                 return
-            step("version.switch")
+            step("sign.switch")
             data = pack_json(current)
             if seen.tag is None:
                 done = self._store.put_new(CURRENT, data)

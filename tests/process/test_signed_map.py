@@ -208,7 +208,9 @@ def test_damaged_metadata_is_not_built_upon(
 # --- killed, and two at a time ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("label", ["sign.keys", "sign.root", "sign.targets", "sign.timestamp", "sign.signed"])
+@pytest.mark.parametrize(
+    "label", ["sign.keys", "sign.root", "sign.metadata", "sign.timestamp", "sign.signed"]
+)
 def test_killed_the_first_time_it_goes_on(
     label: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
 ) -> None:
@@ -225,13 +227,13 @@ def test_killed_the_first_time_it_goes_on(
 @pytest.mark.parametrize(
     ("verb", "label"),
     [
-        ("publish", "sign.targets"),
-        ("publish", "sign.snapshot"),
+        ("publish", "sign.metadata"),
+        ("publish", "sign.metadata:2"),
         ("publish", "sign.timestamp"),
         ("publish", "sign.signed"),
-        ("publish", "version.switched"),
+        ("publish", "sign.switched"),
         ("rollback", "sign.timestamp"),
-        ("rollback", "version.switch"),
+        ("rollback", "sign.switch"),
     ],
 )
 def test_killed_anywhere_one_version_is_signed_and_whole(
@@ -247,7 +249,7 @@ def test_killed_anywhere_one_version_is_signed_and_whole(
         town.change("0_0.pcd", seed=1)
         words = ("publish", town.root, store, "--sign", keys)
     shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
-    is_signed = label in ("sign.signed", "version.switch", "version.switched")
+    is_signed = label in ("sign.signed", "sign.switch", "sign.switched")
     assert Signed(store, keys).version == before + is_signed
     shmmap("versions", store, "--refresh", "--sign", keys)  # repairs entry and CURRENT
     assert read_signed(store, keys).version == before + is_signed
@@ -256,7 +258,7 @@ def test_killed_anywhere_one_version_is_signed_and_whole(
     shmmap("fetch", store, tmp_path / "back")
 
 
-@pytest.mark.parametrize("label", ["sign.snapshot", "sign.timestamp", "sign.repaired"])
+@pytest.mark.parametrize("label", ["sign.metadata", "sign.timestamp", "sign.repaired"])
 def test_a_refresh_that_is_killed(label: str, shmmap: Shmmap, store: Path, keys: Path) -> None:
     Signed(store, keys).write("snapshot", expires=in_days(1))
     (store / "CURRENT").unlink()

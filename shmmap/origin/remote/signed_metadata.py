@@ -8,7 +8,6 @@ specification; what is of this map is in ORIGIN.md.  Importing this module takes
 
 from __future__ import annotations
 
-from datetime import datetime, timezone
 from typing import Final, NamedTuple, TypeVar
 
 from tuf.api.exceptions import RepositoryError, UnsignedMetadataError
@@ -29,13 +28,13 @@ __all__ = [
     "TARGET",
     "UNSIGNED",
     "SignedState",
+    "current_of",
+    "is_foreign",
     "metadata_path",
     "newest_root",
     "read_signed_state",
     "refused",
-    "signed_current",
     "target_of",
-    "utc_text",
 ]
 
 TARGET: Final = "root"
@@ -63,7 +62,7 @@ class SignedState(NamedTuple):
     @property
     def current(self) -> Current:
         """The version that is signed."""
-        return signed_current(self.targets.signed)
+        return current_of(self.targets.signed.targets.get(TARGET))
 
 
 def metadata_path(role: str, number: int) -> str:
@@ -82,17 +81,16 @@ def target_of(current: Current) -> TargetFile:
     return TargetFile(current.bytes, {"sha256": current.root}, TARGET, {"custom": {_NUMBER: current.version}})
 
 
-def signed_current(targets: Targets) -> Current:
-    """Return the version that targets name.
+def current_of(target: TargetFile | None) -> Current:
+    """Return the version that the target names.
 
     Raises
     ------
     ValueError
-        They name none.
+        It names none.
     """
-    target = targets.targets.get(TARGET)
     if target is None:
-        raise ValueError(f"it has no target {TARGET!r}")
+        raise ValueError(f"there is no target {TARGET!r}")
     number = target.custom.get(_NUMBER) if isinstance(target.custom, dict) else None
     digest = target.hashes.get("sha256")
     if (
@@ -153,15 +151,20 @@ def read_signed_state(store: Store, root: Metadata[Root]) -> SignedState | None:
         raise refused(store.url, ALTERED, "its snapshot names no targets")
     targets = _read_numbered(store, Targets, named.version, root)
     try:
-        signed_current(targets.signed)
+        current_of(targets.signed.targets.get(TARGET))
     except ValueError as error:
         raise refused(store.url, ALTERED, f"targets: {error}") from None
     return SignedState(timestamp, tag, snapshot, targets)
 
 
-def utc_text(when: datetime) -> str:
-    """Return a time for people."""
-    return f"{when.astimezone(timezone.utc):%Y-%m-%d %H:%M} UTC"
+def is_foreign(store: Store, trusted: bytes) -> bool:
+    """Whether the root that a store has under the number of the trusted one is another one."""
+    root: Metadata[Root] = Metadata.from_bytes(trusted)
+    try:
+        found = store.get(metadata_path(Root.type, root.signed.version), MAX_BYTES)
+    except (MapMissing, MapDataError):
+        return False
+    return bytes(found) != trusted
 
 
 def _read_numbered(store: Store, kind: type[_Role], number: int, root: Metadata[Root]) -> Metadata[_Role]:
