@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
 from tests.support.publishing import publish
-from tests.support.raw_client import RawClient, circle
+from tests.support.raw_client import DaemonError, RawClient, circle
 from tests.support.served_cells import names
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -45,6 +46,10 @@ def _published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("published")
     made = make_map(folder / "town", columns=3, rows=3, points=300)
     publish(made.root, folder / "www", "--layer", NDT, "--id-prefix", "/town/")
+    shutil.copytree(folder / "town", folder / "changed")
+    DividedMap(folder / "changed", corners=dict(made.corners)).change("0_0.pcd", seed=5)
+    shutil.copytree(folder / "www", folder / "next")
+    publish(folder / "changed", folder / "next", "--layer", NDT)
     return folder
 
 
@@ -56,6 +61,21 @@ def town(_published: Path, tmp_path: Path) -> DividedMap:
     made = make_map(tmp_path / "names", columns=3, rows=3, points=1)
     source.corners = dict(made.corners)
     return source
+
+
+@pytest.fixture
+def publish_change(_published: Path, web: FaultyWeb, town: DividedMap) -> Callable[[], None]:
+    """Publish another version, in which ``0_0.pcd`` has changed."""
+
+    def change() -> None:
+        town.change("0_0.pcd", seed=5)
+        shutil.copytree(
+            _published / "next", web.folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("CURRENT")
+        )
+        shutil.copy(_published / "next/CURRENT", web.folder / "CURRENT.new")
+        (web.folder / "CURRENT.new").rename(web.folder / "CURRENT")
+
+    return change
 
 
 @pytest.fixture
@@ -375,10 +395,11 @@ def test_another_version_is_taken_and_unchanged_cells_stay(
     assert len(fetched) == 5, "the root, two shards, and two cells"
 
 
-def test_a_version_never_goes_back(daemon: DaemonFactory, web: FaultyWeb, town: DividedMap) -> None:
+def test_a_version_never_goes_back(
+    daemon: DaemonFactory, web: FaultyWeb, publish_change: Callable[[], None]
+) -> None:
     first = (web.folder / "CURRENT").read_bytes()
-    town.change("0_0.pcd", seed=5)
-    publish(town.root, web.folder, "--layer", NDT)
+    publish_change()
     second = (web.folder / "CURRENT").read_bytes()
     one = daemon(web.url, "--poll", "0")
     with shmmap.connect(one.endpoint) as client:
@@ -395,14 +416,13 @@ def test_a_version_never_goes_back(daemon: DaemonFactory, web: FaultyWeb, town: 
 
 
 def test_a_link_lost_half_way_keeps_the_old_version_whole(
-    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+    daemon: DaemonFactory, web: FaultyWeb, publish_change: Callable[[], None]
 ) -> None:
     one = daemon(web.url, "--poll", "0")
     with shmmap.connect(one.endpoint) as client:
         before = {(cell.id, cell.version) for cell in client.area(ALL, wait=60.0)}
         known = {path.name for path in (web.folder / "blobs/sha256").iterdir()}
-        town.change("0_0.pcd", seed=5)
-        publish(town.root, web.folder, "--layer", NDT)
+        publish_change()
         new = {path.name for path in (web.folder / "blobs/sha256").iterdir()} - known
         root = re.search('"root": "([0-9a-f]+)"', (web.folder / "CURRENT").read_text())
         assert root is not None
@@ -512,7 +532,7 @@ def test_segments_are_kept_over_a_restart(daemon: DaemonFactory, web: FaultyWeb)
 
 
 def test_a_start_without_a_link_serves_what_was_taken(
-    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+    daemon: DaemonFactory, web: FaultyWeb, publish_change: Callable[[], None]
 ) -> None:
     """Out of the disk, all of it: the list of cells, points, and published layers."""
     one = daemon(web.url, "--poll", "1")
@@ -532,8 +552,7 @@ def test_a_start_without_a_link_serves_what_was_taken(
         waiting = Patience()
         while waiting(health(one)[0] != 1):
             time.sleep(0.05)
-    town.change("0_0.pcd", seed=5)
-    publish(town.root, web.folder, "--layer", NDT)
+    publish_change()
     web.listen()
     with shmmap.connect(one.endpoint) as client:
         while waiting({(c.id, c.layer, c.version) for c in client.area(ALL, layers=PUBLISHED)} == versions):
@@ -556,12 +575,51 @@ def test_a_start_with_nothing_on_the_disk_and_without_a_link(daemon: DaemonFacto
             time.sleep(0.02)
 
 
+@pytest.mark.parametrize("step", ["taken.written", "taken.named", "tier.written", "daemon.linked"])
+def test_killed_while_it_takes_a_version(
+    daemon: DaemonFactory,
+    connect: Connect,
+    web: FaultyWeb,
+    publish_change: Callable[[], None],
+    tmp_path: Path,
+    step: str,
+) -> None:
+    """Without a link the next start has the version of before, or this one: all of one of them."""
+    one = daemon(web.url, "--poll", "0")
+    with shmmap.connect(one.endpoint) as client:
+        before = {(cell.id, cell.version) for cell in client.area(ALL, wait=60.0)}
+    until_remembered(one)
+    one.leave()
+    one.environment["SHMMAP_TEST_CRASH"] = f"{step}:1:{tmp_path}/reached"
+    publish_change()
+    one.start()
+    raw, waiting = connect(one, timeout=1.0), Patience()
+    while waiting(not (tmp_path / "reached").exists()):
+        with suppress(TimeoutError, DaemonError):
+            raw.ask("reload")
+            raw.area(circle(0, 0, 1000), wait=1.0)
+    del one.environment["SHMMAP_TEST_CRASH"]
+    one.kill()
+    web.refuse()
+    one.start()
+    with shmmap.connect(one.endpoint) as client:
+        cells = client.area(ALL, wait=60.0)
+        found = {(cell.id, cell.version) for cell in cells}
+        missing = {failure.cell_id for failure in cells.failed}
+        assert cells.covered
+        assert len(found | {(cell, 0) for cell in missing}) == 9
+        assert missing <= {"/town/0_0.pcd"}, "only what changed may not be here"
+        assert len(found & before) >= 8
+        web.listen()
+        while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
+            time.sleep(0.02)
+
+
 def test_an_older_offer_is_no_reason_not_to_start(
-    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+    daemon: DaemonFactory, web: FaultyWeb, publish_change: Callable[[], None]
 ) -> None:
     first = (web.folder / "CURRENT").read_bytes()
-    town.change("0_0.pcd", seed=5)
-    publish(town.root, web.folder, "--layer", NDT)
+    publish_change()
     one = daemon(web.url, "--poll", "1")
     with shmmap.connect(one.endpoint) as client:
         served = client.map_version

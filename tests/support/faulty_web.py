@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A web server on loopback that serves a directory, and fails as it is told: for published maps.
+"""A web server on loopback that serves a directory, and fails as a test wants it: for published maps.
 
 It answers conditional and range requests, keeps connections open, and writes down what was asked.
 """
@@ -140,7 +140,7 @@ class FaultyWeb:
         self.connections.clear()
 
     def heal(self) -> None:
-        """Fail no more; whoever stalls is let go."""
+        """Fail no more; end requests that stall."""
         self.fault = _no_fault
         self._healed.set()
         self._healed = threading.Event()

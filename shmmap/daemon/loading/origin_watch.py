@@ -42,7 +42,7 @@ class OriginWatch:
         self.link.doubt()
 
     def collect(self) -> None:
-        """Hear what was found out."""
+        """Act on what was found out."""
         news = self.link.take()
         health = self.scheduler.prefetcher.prefetch.health
         health.unreachable = self.link.is_out

@@ -72,7 +72,7 @@ class ObjectFetcher:
     """Fetches what jobs need, in threads; see `shmmap.layers.source_reader.Fetcher`.
 
     What two jobs need is fetched once.  As soon as one object is out of reach, so are those that have not
-    been begun: who waits for many would wait for one after the other.
+    been begun: else the jobs would fail one after the other, each in its time.
     """
 
     def __init__(self, objects: KeptObjects) -> None:

@@ -22,7 +22,7 @@ PROBE_S: Final = 1.0
 JITTER: Final = 0.2
 """Of the time between two questions: a fleet must not ask all at once."""
 LONG_TRUST_S: Final = 32.0
-"""So long, at most, one that answers is not doubted for single things that cannot be had."""
+"""Most time that an origin which answers is not doubted for single things that cannot be had."""
 END_S: Final = 0.5
 
 

@@ -37,7 +37,7 @@ Indices: TypeAlias = NDArray[np.intp]
 _Pair: TypeAlias = tuple[int | None, int | None]
 """Numbers of the shards at one place in an earlier version and in a later one."""
 MM_BYTES: Final = 6
-"""So much larger is a point's place in memory than in millimetres."""
+"""What a point takes more in memory than in millimetres."""
 _NOTHING: Final = np.empty(0, np.intp)
 
 

@@ -104,7 +104,7 @@ class ShardFetcher:
             pass  # `OriginLink` says so, once
         except ShmmapError as error:
             log.error("part of the list of cells cannot be used", part=name, reason=error)
-        except Exception:  # noqa: BLE001  else nobody would ever hear of this shard
+        except Exception:  # noqa: BLE001  else it would never be tried again
             log.exception("part of the list of cells cannot be used", part=name, cause="a defect in shmmap")
         return None
 

@@ -23,7 +23,7 @@ from shmmap.sharded_dict import ShardedDict
 __all__ = ["FEW_SHARDS", "Page", "ShardPages"]
 
 FEW_SHARDS: Final = 16
-"""So many shards are all fetched at the start, and kept."""
+"""Up to this number, all shards are fetched at the start, and kept."""
 NAME_BYTES: Final = 150
 """What a cell's name takes in memory, and its entry in the table of names."""
 NAME_TABLES: Final = 64
@@ -68,7 +68,7 @@ class _News:
     def __del__(self) -> None:
         os.close(self.fd)
 
-    def tell(self) -> None:
+    def notify(self) -> None:
         """Make it readable."""
         os.eventfd_write(self.fd, 1)
 
@@ -117,7 +117,7 @@ class ShardPages:
             0.5 * (root.bounds[1] + root.bounds[3]),
         )
         self._news = _News()
-        self._news.tell()  # pages that nothing needs are asked for in the first `collect`
+        self._news.notify()  # pages that nothing needs are asked for in the first `collect`
         for number, shard in known.items():
             page = self._page(number, shard)
             self._take(page, _shared_out(page))
@@ -232,7 +232,7 @@ class ShardPages:
         """Take a shard; None: it cannot be had at present.  Called in a thread."""
         page = self._page(number, shard) if shard is not None else None
         self._arrived.append((number, page, _shared_out(page) if page is not None else []))
-        self._news.tell()
+        self._news.notify()
 
     def collect(self) -> PageNews:
         """Take in what has come since the last time: one page, a tenth of a millisecond, and go on later."""
@@ -253,7 +253,7 @@ class ShardPages:
                 self._take(page, names)
                 come.append(number)
         if self._arrived:
-            self._news.tell()
+            self._news.notify()
         self._fill()
         return PageNews(come, lost)
 

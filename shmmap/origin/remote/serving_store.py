@@ -30,7 +30,7 @@ class ServedFrom(NamedTuple):
 
 
 def open_for_serving(served: ServedFrom, patience: Patience = HASTY) -> Store:
-    """Return the store: somebody waits for what it gives.  Errors are those of `open_store`."""
+    """Return the store, opened for requests that wait.  Errors are those of `open_store`."""
     return open_store(
         served.url,
         patience=patience,

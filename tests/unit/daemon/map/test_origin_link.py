@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An origin elsewhere is asked for versions, doubted when something fails, and heard when it is back."""
+"""An origin elsewhere is asked for versions, doubted when something fails, and found again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.patience import Patience
 
 
 class Origin:
-    """Answers as it is told; counts questions."""
+    """Answers as the test says; counts questions."""
 
     def __init__(self) -> None:
         self.answer: bool | Exception = False
@@ -95,7 +95,7 @@ def test_what_cannot_be_had_of_one_that_answers_is_asked_for_less_and_less(origi
     assert times[2] - times[1] >= 1.99
 
 
-def test_another_version_is_told_of(origin: Origin) -> None:
+def test_another_version_is_reported(origin: Origin) -> None:
     origin.answer = True
     link = origin.link(0.05)
     assert news(link) == LinkNews(changed=True, back=False)
