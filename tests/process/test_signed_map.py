@@ -251,10 +251,13 @@ def test_killed_anywhere_one_version_is_signed_and_whole(
     shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
     is_signed = label in ("sign.signed", "sign.switch", "sign.switched")
     assert Signed(store, keys).version == before + is_signed
+    if label == "sign.signed":  # what is signed must not be removed as if it had never been served
+        assert "CURRENT says 1" in shmmap("versions", store, "--prune", code=2)
     shmmap("versions", store, "--refresh", "--sign", keys)  # repairs entry and CURRENT
     assert read_signed(store, keys).version == before + is_signed
     shmmap(*words)
     read_signed(store, keys)
+    shmmap("versions", store, "--prune")
     shmmap("fetch", store, tmp_path / "back")
 
 
