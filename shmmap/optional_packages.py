@@ -11,10 +11,19 @@ from shmmap.errors import PackageMissing
 
 __all__ = ["needed_packages"]
 
-_PACKAGES: Final = {"lzf": "python-neo-lzf", "yaml": "PyYAML", "zmq": "pyzmq", "open3d": "open3d-cpu"}
+_PACKAGES: Final = {
+    "securesystemslib": "securesystemslib[crypto]",
+    "cryptography": "securesystemslib[crypto]",
+    "lzf": "python-neo-lzf",
+    "yaml": "PyYAML",
+    "zmq": "pyzmq",
+    "open3d": "open3d-cpu",
+}
 """Packages that are not called as the module they bring."""
 
-_OPTIONAL: Final = frozenset({"cyclonedds", "laspy", "obstore", "pyopencl", "tifffile", "zstandard"})
+_OPTIONAL: Final = frozenset(
+    {"cyclonedds", "laspy", "obstore", "pyopencl", "securesystemslib[crypto]", "tifffile", "tuf", "zstandard"}
+)
 """Packages that no ordinary install brings: `project.optional-dependencies`."""
 
 _OURS: Final = ("shmmap", "shmmap_clients")

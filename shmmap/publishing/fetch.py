@@ -24,7 +24,7 @@ from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_frame import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
-from shmmap.origin.remote.map_versions import read_entry, read_root, read_shards, require_current
+from shmmap.origin.remote.map_versions import Current, read_entry, read_root, read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.published_index import POINTS, Root, Shard
 from shmmap.origin.remote.published_object import ObjectName, read_bare_header, rows_of, unpack_object
@@ -72,6 +72,7 @@ def fetch_map(
     out: str,
     *,
     version: int | None = None,
+    current: Current | None = None,
     force: bool = False,
     tier: ObjectTier | None = None,
     progress: Progress,
@@ -84,6 +85,8 @@ def fetch_map(
         The directory to make; must not exist, or be empty, unless ``force`` replaces it.
     version
         None: the current one.
+    current
+        What is current, where that was verified; None: what ``CURRENT`` says.
     tier
         Objects that are there are not fetched; what is fetched is not kept in it.
 
@@ -102,7 +105,7 @@ def fetch_map(
     if not force and os.path.lexists(out) and not (os.path.isdir(out) and not os.listdir(out)):
         raise BadRequest(f"{out} exists already", hint="choose another directory, or --force to replace it")
     if version is None:
-        current = require_current(store)
+        current = current or require_current(store)
     else:
         try:
             current = read_entry(store, version).current

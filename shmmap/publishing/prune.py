@@ -7,13 +7,15 @@ old, are removed.  So whatever is being published, restored or read meanwhile ke
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
-from shmmap.errors import BadRequest, MapMissing
+from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import (
+    TIMESTAMP,
     Current,
     Entry,
     earlier_versions,
@@ -32,6 +34,7 @@ KEEP_DAYS: Final = 30.0
 LEAST_KEEP_DAYS: Final = 7.0
 _DAY_S: Final = 86_400.0
 _BLOBS: Final = "blobs/"
+_MAX_METADATA_BYTES: Final = 512_000
 
 
 @dataclass(slots=True)
@@ -61,7 +64,7 @@ def prune_versions(
     Raises
     ------
     BadRequest
-        ``keep_days`` is too few, or the store takes nothing.
+        ``keep_days`` is too few, the store takes nothing, or another version is signed than is current.
     MapMissing, MapDataError, Offline
         Nothing is published there; a version that is kept cannot be read, so that nobody knows what it has.
     """
@@ -71,6 +74,7 @@ def prune_versions(
         raise BadRequest(f"versions are kept for {LEAST_KEEP_DAYS:g} days at least")
     old_s = (time.time() if now_s is None else now_s) - keep_days * _DAY_S
     current = require_current(store)
+    _require_signed(store, current)
     result = Pruned()
     for version in _old_versions(store, current, old_s):
         step("prune.entry")
@@ -80,6 +84,28 @@ def prune_versions(
     needed = _needed(store, progress, result)
     _remove_objects(store, needed, old_s, progress, result)
     return result
+
+
+def _require_signed(store: Store, current: Current) -> None:
+    """Refuse where a signed map's metadata, which is not verified for this, names another version."""
+
+    def read(path: str) -> dict[str, Any]:
+        signed: dict[str, Any] = json.loads(bytes(store.get(path, _MAX_METADATA_BYTES)))["signed"]
+        return signed
+
+    if store.head(TIMESTAMP) is None:
+        return
+    try:
+        snapshot = read(f"{read(TIMESTAMP)['meta']['snapshot.json']['version']}.snapshot.json")
+        targets = read(f"{snapshot['meta']['targets.json']['version']}.targets.json")
+        version = targets["targets"]["root"]["custom"]["map_version"]
+    except (KeyError, TypeError, ValueError, MapMissing) as error:
+        raise MapDataError(f"what is signed cannot be read: {error}", path=store.url) from None
+    if version != current.version:
+        raise BadRequest(
+            f"version {version} of {store.url} is signed, and CURRENT says {current.version}",
+            hint="correct that: shmmap versions URL --refresh --sign KEYDIR",
+        )
 
 
 def _old_versions(store: Store, current: Current, old_s: float) -> list[int]:

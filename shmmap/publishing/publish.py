@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from hashlib import sha256
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,6 +33,7 @@ from shmmap.origin.remote.map_versions import (
     read_current,
     read_root,
     read_shards,
+    refuse_if_signed,
 )
 from shmmap.origin.remote.published_index import (
     EXACT,
@@ -55,6 +56,9 @@ from shmmap.publishing.messages import CellSent, CellToSend, NotSent, PublishSet
 from shmmap.publishing.sending import send_object
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
 from shmmap.publishing.worker import TASKS_AHEAD
+
+if TYPE_CHECKING:
+    from shmmap.publishing.signing import MapSigner
 
 __all__ = ["Published", "publish_map"]
 
@@ -112,6 +116,7 @@ def publish_map(
     settings: PublishSettings,
     id_prefix: str = "",
     resend: bool = False,
+    signer: MapSigner | None = None,
     workers: int,
     progress: PrepareProgress,
 ) -> Published:
@@ -127,6 +132,8 @@ def publish_map(
         What ids begin with; empty: as before, at first ``/<last part of the URL>/``.
     resend
         Send every object again, as if none were there, and make that a version.
+    signer
+        Signs the version; needed for a map that is signed.
     workers
         How many processes make layers.
 
@@ -147,7 +154,9 @@ def publish_map(
         raise BadRequest(f"{store.url}: {store.read_only}")
     check_names(catalogue)
     names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
-    return _Run(catalogue, store, names, progress, resend=resend).run(settings, id_prefix, max(1, workers))
+    return _Run(catalogue, store, names, progress, resend=resend, signer=signer).run(
+        settings, id_prefix, max(1, workers)
+    )
 
 
 class _Run:
@@ -161,6 +170,7 @@ class _Run:
         progress: PrepareProgress,
         *,
         resend: bool,
+        signer: MapSigner | None,
     ) -> None:
         self._catalogue = catalogue
         self._store = store
@@ -168,7 +178,10 @@ class _Run:
         self._progress = progress
         self._resend = resend
         self._began_s = time.monotonic()
-        self._seen: CurrentState = read_current(store)
+        self._signer = signer
+        if signer is None:
+            refuse_if_signed(store, "publish it with the keys that signed it: --sign KEYDIR")
+        self._seen: CurrentState = read_current(store) if signer is None else signer.begin()
         self._before: Root | None = self._read_root()
         self._shards: dict[tuple[int, int], tuple[bytes, int]] = {}  # before: key, content, row of the root
         has_none = self._before is None and next(iter(store.list("blobs/")), None) is None
@@ -203,10 +216,15 @@ class _Run:
         is_same = before is not None and unpacked == pack_root(before)
         if seen.current is not None and is_same and not self._resend:
             result.root = seen.current.root
+            if self._signer is not None:
+                self._signer.keep(seen.current)
             self._progress.done(len(self._catalogue))
             return result
         entry = self._send_root(unpacked)
-        add_version(self._store, entry, seen)
+        if self._signer is None:
+            add_version(self._store, entry, seen)
+        else:
+            self._signer.switch(entry)
         result.version = result.current = entry.version
         self._progress.done(len(self._catalogue))
         return result

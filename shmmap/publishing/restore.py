@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
@@ -20,11 +20,15 @@ from shmmap.origin.remote.map_versions import (
     read_entry,
     read_root,
     read_shards,
+    refuse_if_signed,
 )
 from shmmap.origin.remote.published_index import LayerObjects, Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
+
+if TYPE_CHECKING:
+    from shmmap.publishing.signing import MapSigner
 
 __all__ = ["Restored", "object_sizes", "objects_of", "restore_version"]
 
@@ -41,7 +45,9 @@ class Restored(NamedTuple):
     objects: int
 
 
-def restore_version(store: Store, version: int, progress: PrepareProgress) -> Restored:
+def restore_version(
+    store: Store, version: int, progress: PrepareProgress, signer: MapSigner | None = None
+) -> Restored:
     """Make the content of an earlier version current again, all of whose objects must be there.
 
     Raises
@@ -55,7 +61,9 @@ def restore_version(store: Store, version: int, progress: PrepareProgress) -> Re
     InstanceBusy
         Another publisher has switched meanwhile.
     """
-    seen = read_current(store)
+    if signer is None:
+        refuse_if_signed(store, "go back with the keys that signed it: --sign KEYDIR")
+    seen = read_current(store) if signer is None else signer.begin()
     if seen.current is None:
         raise MapMissing(f"no map is published at {store.url}")
     served = {entry.version: entry for entry in earlier_versions(store, seen.current)}
@@ -79,7 +87,10 @@ def restore_version(store: Store, version: int, progress: PrepareProgress) -> Re
     _require_entry(store, old)
     objects = _look_for_objects(store, old.current, progress)
     step("restore.looked")
-    add_version(store, entry, seen)
+    if signer is None:
+        add_version(store, entry, seen)
+    else:
+        signer.switch(entry)
     return Restored(entry.version, version, entry.version, objects)
 
 

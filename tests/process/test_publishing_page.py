@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("layer_kernels")
 
 def test_every_block_is_tested() -> None:
     assert set(PAGE.blocks) == {
-        "install", "credentials", "publish", "directory", "fetch", "versions",
+        "install", "credentials", "publish", "directory", "fetch", "install-sign", "sign", "versions",
     }  # fmt: skip
     assert PAGE.fences == len(PAGE.blocks)
 
@@ -37,6 +37,9 @@ def test_packages_are_those_of_the_extra() -> None:
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     (extra,) = re.findall(r"^remote = \[\n(.*?)^\]", project, re.MULTILINE | re.DOTALL)
     assert install.split()[3:] == re.findall(r'"([a-z]+)>=', extra)
+    (install,) = PAGE.commands("install-sign")
+    (extra,) = re.findall(r"^sign = \[\n(.*?)^\]", project, re.MULTILINE | re.DOTALL)
+    assert shlex.split(install)[3:] == re.findall(r'"([a-z\[\]]+)>=', extra)
 
 
 def test_a_map_is_published_fetched_and_goes_back(tmp_path: Path, buckets: BucketServer) -> None:
@@ -87,3 +90,10 @@ def test_a_map_is_published_fetched_and_goes_back(tmp_path: Path, buckets: Bucke
     rolled_back, pruned = map(run, PAGE.commands("versions"))
     assert rolled_back == "version 3 is current: the content of version 1\n"
     assert "removed  no version; 0 objects" in pruned
+    pytest.importorskip("tuf", reason="tuf is not installed")
+    environment["XDG_STATE_HOME"] = str(tmp_path / "state")
+    signed, refreshed, listed, verified = map(run, PAGE.commands("sign"))
+    assert "version  1\n" in signed
+    assert "version 1 is signed" in refreshed
+    assert "version 1 is signed, until" in listed
+    assert "4 cells, 1,200 points" in verified

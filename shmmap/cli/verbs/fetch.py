@@ -7,7 +7,7 @@ import argparse
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, print_json, print_pairs
-from shmmap.cli.store_options import URL_HELP, add_store_options, store_at
+from shmmap.cli.store_options import URL_HELP, add_store_options, add_trust_option, store_at, verified_at
 
 __all__ = ["add_parser", "run"]
 
@@ -17,9 +17,9 @@ fetches only what is missing.  What a daemon of the same user keeps on this disk
 JSON (fields may be added, none is removed):
   {"url", "path", "version", "map_version": hex, "cells", "points", "fetched_cells", "fetched_bytes",
    "seconds"}
-Exit code: 0, 2 wrong usage or DIR exists, 65 an object is damaged, 66 no such map or version, or an object
-is gone, 69 a package is missing, 73 DIR cannot be written, 75 the store does not answer or refuses, or
-another run is making DIR, 78 unusable credentials."""
+Exit code: 0, 2 wrong usage or DIR exists, 65 an object is damaged, or --trust refuses, 66 no such map or
+version, or an object is gone, 69 a package is missing, 73 DIR cannot be written, 75 the store does not
+answer or refuses, or another run is making DIR, 78 unusable credentials."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -38,6 +38,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--force", action="store_true", help="replace a divided map that exists")
     parser.add_argument("--cache-dir", metavar="DIR", default="", help="where a daemon keeps what it fetched")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_trust_option(parser)
     add_store_options(parser)
     add_json_option(parser)
 
@@ -48,19 +49,24 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.errors import BadRequest
     from shmmap.origin.sidecar import default_cache_directory
 
+    if args.trust is not None and args.at is not None:
+        raise BadRequest("--at does not go with --trust: only the current version is signed")
     store = store_at(args.url, args)
     from shmmap.origin.remote.object_tier import ObjectTier
     from shmmap.publishing.fetch import fetch_map
 
     began_s = time.monotonic()
+    verified = verified_at(store, args)
     progress = StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0)
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     made = fetch_map(
         store,
         args.out,
         version=args.at,
+        current=verified.current if verified is not None else None,
         force=args.force,
         tier=ObjectTier(cache_dir, limit_bytes=0),
         progress=progress,

@@ -22,7 +22,7 @@ from shmmap.cli.screens.output import (
     print_line,
     print_pairs,
 )
-from shmmap.cli.store_options import add_store_options, store_at
+from shmmap.cli.store_options import add_sign_option, add_store_options, signer_at, store_at
 
 __all__ = ["add_parser", "run"]
 
@@ -33,6 +33,8 @@ URL is s3://BUCKET/PATH, gs://BUCKET/PATH, az://CONTAINER/PATH, file:///DIR or a
 server can serve.  Credentials come from the environment, from $CREDENTIALS_DIRECTORY, or from a profile.
 Only what the current version does not have is sent.  The new version becomes current at once, at the end; a
 stopped run, started again, sends only what is missing.
+--sign: keys are made in KEYDIR at first; give ROOT.json to vehicles, take root.pem off line, and have the
+map signed again within 7 days: `shmmap versions URL --refresh --sign KEYDIR`.
 JSON (fields may be added, none is removed):
   {"map", "url", "changed", "version": the current one, "map_version": hex, "root": hash of its object,
    "cells", "layers": [spec], "id_prefix", "objects": layers of cells, "bytes": of their objects,
@@ -40,7 +42,7 @@ JSON (fields may be added, none is removed):
    "notes": [text], oddities of the map}
 Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
 or damaged version, 66 no map or bucket, 69 a package is missing, 73 cannot write, 75 the store does not
-answer or refuses, or another publisher was quicker, 78 unusable credentials."""
+answer or refuses, or another publisher was quicker, 78 unusable credentials or keys."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -90,6 +92,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "--cache-dir", metavar="DIR", default="", help="where layers made by `shmmap prepare` are kept"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_sign_option(parser)
     add_store_options(parser)
     add_json_option(parser)
 
@@ -116,6 +119,7 @@ def run(args: argparse.Namespace) -> int:
         unit=args.unit or "", vertical_unit=args.vertical_unit or "",
     )  # fmt: skip
     catalogue = origin.load(fresh=True)
+    signer = signer_at(store, args, make_keys=True)
     try:
         done = publish_map(
             catalogue,
@@ -131,6 +135,7 @@ def run(args: argparse.Namespace) -> int:
             id_prefix=args.id_prefix,
             workers=args.workers or len(os.sched_getaffinity(0)),
             resend=args.resend,
+            signer=signer,
             progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
         )
     except KeyboardInterrupt:

@@ -16,24 +16,36 @@ from shmmap.cli.screens.output import (
     print_pairs,
     print_table,
 )
-from shmmap.cli.store_options import URL_HELP, add_store_options, store_at
+from shmmap.cli.store_options import (
+    URL_HELP,
+    add_sign_option,
+    add_store_options,
+    add_trust_option,
+    signer_at,
+    store_at,
+    verified_at,
+)
 
 if TYPE_CHECKING:
     from shmmap.origin.remote.store import Store
+    from shmmap.origin.remote.verify_apart import Verified
 
 __all__ = ["add_parser", "run"]
 
 _EPILOG = """\
 --rollback gives an old version's content a new number: vehicles never go back to a lower one.
 JSON (fields may be added, none is removed):
-  {"url", "current": number, "versions": [{"version", "state": "current", "earlier" or "never served",
+  {"url", "current": number, "valid_until": Unix time, null without --trust,
+   "versions": [{"version", "state": "current", "earlier" or "never served",
    "created": RFC 3339 or "", "root": hash, "bytes": of the root, "before", "restored": the version whose
    content it has again, or 0}]}, the latest first; a web server cannot list those that were never served
   --rollback: {"url", "changed", "version": the current one, "restored", "objects": that were looked for}
+  --refresh: {"url", "version", "valid_until": {"timestamp", "snapshot", "targets": RFC 3339}}
   --prune: {"url", "versions": [number], "objects", "bytes", "kept_versions": [number], "kept_objects",
    "kept_bytes"}
-Exit code: 0, 2 wrong usage, 65 damaged, 66 no such map or version, 69 a package is missing, 75 the store
-does not answer or refuses, or another publisher was quicker, 78 unusable credentials."""
+Exit code: 0, 2 wrong usage, 65 damaged or --trust refuses, 66 no such map or version, 69 a package is
+missing, 75 the store does not answer or refuses, or another publisher was quicker, 78 unusable
+credentials or keys."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -56,10 +68,17 @@ def add_parser(subparsers: Subparsers) -> None:
         action="store_true",
         help="remove versions that have not been current for --keep days, and what only they have",
     )
+    what.add_argument(
+        "--refresh",
+        action="store_true",
+        help="sign a signed map's timestamp again, and its snapshot in time; needs --sign",
+    )
     parser.add_argument(
         "--keep", metavar="DAYS", type=_days, default=None, help="with --prune: 7 or more (default: 30)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_sign_option(parser)
+    add_trust_option(parser)
     add_store_options(parser)
     add_json_option(parser)
 
@@ -81,13 +100,20 @@ def run(args: argparse.Namespace) -> int:
 
     if args.keep is not None and not args.prune:
         raise BadRequest("--keep goes with --prune")
+    if args.sign is not None and not (args.refresh or args.rollback):
+        raise BadRequest("--sign goes with --refresh or --rollback")
+    if args.trust is not None and (args.refresh or args.rollback or args.prune):
+        raise BadRequest("--trust goes with the list of versions alone")
+    if args.refresh and args.sign is None:
+        raise BadRequest("--refresh needs the directory with online.pem and ROOT.json", hint="--sign KEYDIR")
     store = store_at(args.url, args)
+    signer = signer_at(store, args)
     unit = "objects" if args.prune else "cells"
     progress = StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
     if args.rollback is not None:
         from shmmap.publishing.restore import restore_version
 
-        restored = restore_version(store, args.rollback, progress)
+        restored = restore_version(store, args.rollback, progress, signer)
         if args.json:
             print_json(
                 {
@@ -102,6 +128,25 @@ def run(args: argparse.Namespace) -> int:
             print_line(f"version {restored.current} has that content: nothing has changed")
         else:
             print_line(f"version {restored.version} is current: the content of version {restored.restored}")
+        return 0
+    if signer is not None:
+        refreshed = signer.refresh()
+        valid = {
+            "timestamp": refreshed.timestamp,
+            "snapshot": refreshed.snapshot,
+            "targets": refreshed.targets,
+        }
+        if args.json:
+            print_json(
+                {
+                    "url": store.url,
+                    "version": refreshed.current.version,
+                    "valid_until": {role: until.isoformat() for role, until in valid.items()},
+                }
+            )
+        else:
+            print_line(f"version {refreshed.current.version} is signed")
+            print_pairs([(role, f"until {until:%Y-%m-%d %H:%M} UTC") for role, until in valid.items()])
         return 0
     if args.prune:
         from shmmap.publishing.prune import KEEP_DAYS, prune_versions
@@ -123,7 +168,7 @@ def run(args: argparse.Namespace) -> int:
             ]
         )
         return 0
-    _list(store, as_json=args.json)
+    _list(store, verified_at(store, args), as_json=args.json)
     return 0
 
 
@@ -131,7 +176,7 @@ def _numbers(versions: list[int]) -> str:
     return f"versions {', '.join(map(str, versions))}" if versions else "no version"
 
 
-def _list(store: Store, *, as_json: bool) -> None:
+def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
     from shmmap.errors import MapMissing
     from shmmap.origin.remote.map_versions import (
         Entry,
@@ -141,7 +186,7 @@ def _list(store: Store, *, as_json: bool) -> None:
         require_current,
     )
 
-    current = require_current(store)
+    current = require_current(store) if verified is None else verified.current
     # a map that was copied may have no entries
     entries = {current.version: Entry(current.version, current.root, current.bytes, "")}
     entries |= {entry.version: entry for entry in earlier_versions(store, current)}
@@ -160,6 +205,7 @@ def _list(store: Store, *, as_json: bool) -> None:
             {
                 "url": store.url,
                 "current": current.version,
+                "valid_until": verified.expires_s if verified is not None else None,
                 "versions": [
                     {
                         "version": entry.version,
@@ -194,3 +240,8 @@ def _list(store: Store, *, as_json: bool) -> None:
             for entry in ordered
         ],
     )
+    if verified is not None:
+        import time
+
+        until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(verified.expires_s))
+        print_line(f"version {current.version} is signed, until {until}")

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import msgspec
 
-from shmmap.errors import InstanceBusy, MapDataError, MapMissing
+from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.published_object import blob_path
@@ -27,6 +27,7 @@ from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = [
     "CURRENT",
+    "TIMESTAMP",
     "Current",
     "CurrentState",
     "Entry",
@@ -35,6 +36,7 @@ __all__ = [
     "entry_path",
     "list_entries",
     "new_entry",
+    "new_entry_now",
     "pack_json",
     "read_current",
     "read_current_again",
@@ -43,12 +45,15 @@ __all__ = [
     "read_root_object",
     "read_shard_object",
     "read_shards",
+    "refuse_if_signed",
     "require_current",
     "root_path",
     "unpack_current",
 ]
 
 CURRENT: Final = "CURRENT"
+TIMESTAMP: Final = "timestamp.json"
+"""Of a signed map: `shmmap.origin.remote.signed_metadata`."""
 ENTRIES: Final = "versions/"
 _ENTRY: Final = re.compile(r"versions/([1-9]\d{0,18})\.json")
 _MAX_JSON_BYTES: Final = 64 << 10
@@ -266,6 +271,23 @@ def new_entry(store: Store, root: str, nbytes: int, before: Current | None, *, r
         if store.put_new(entry_path(entry.version), pack_json(entry)):
             return entry
     raise InstanceBusy(f"other publishers take every number at {store.url}", hint="try again later")
+
+
+def refuse_if_signed(store: Store, what: str) -> None:
+    """Refuse to change a signed map without signing: vehicles that verify would never take it.
+
+    Raises
+    ------
+    BadRequest
+        It is signed.
+    """
+    if store.head(TIMESTAMP) is not None:
+        raise BadRequest(f"the map at {store.url} is signed", hint=what)
+
+
+def new_entry_now(current: Current, before: int) -> Entry:
+    """Make the entry of a version again, as of now."""
+    return Entry(current.version, current.root, current.bytes, _now_text(), before)
 
 
 def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:

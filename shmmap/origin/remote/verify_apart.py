@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Have a process of its own verify which version of a signed map is current.
+
+python-tuf takes a third of a second and 35 MB to import: neither is for a daemon that runs for weeks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from hashlib import sha256
+from typing import Final
+
+import msgspec
+
+from shmmap.errors import ConfigError, InternalError, Offline
+from shmmap.origin.reading_apart import Outcome
+from shmmap.origin.remote.map_versions import Current
+from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import how_ended, start_child
+
+__all__ = ["Verified", "VerifyReply", "VerifySettings", "read_trusted_root", "verify_apart"]
+
+MAX_ROOT_OF_TRUST: Final = 512_000
+_LONGEST_S: Final = 300.0
+
+
+class VerifySettings(msgspec.Struct, frozen=True):
+    """What is verified.
+
+    Attributes
+    ----------
+    url
+        Of the store, as `Store.url` says it.
+    trust
+        Path of the trusted root.
+    state_dir
+        Where is kept what was seen: what is older is refused from then on.
+    """
+
+    url: str
+    trust: str
+    state_dir: str
+    insecure_http: bool = False
+    instance_credentials: bool = False
+
+
+class Verified(msgspec.Struct, frozen=True):
+    """A version that was verified.
+
+    Attributes
+    ----------
+    version, root, bytes
+        As ``CURRENT`` says them.
+    trust
+        SHA-256 of the trusted root, in hex.
+    signed_s, expires_s
+        When its timestamp was signed, 0 where that is not said, and when the first of its metadata runs out;
+        Unix time.
+    """
+
+    version: int
+    root: str
+    bytes: int
+    trust: str
+    signed_s: float
+    expires_s: float
+
+    @property
+    def current(self) -> Current:
+        """What ``CURRENT`` would say."""
+        return Current(self.version, self.root, self.bytes)
+
+
+class VerifyReply(msgspec.Struct):
+    """What the process says: the version, or an error."""
+
+    verified: Verified | None = None
+    error: Outcome = msgspec.field(default_factory=Outcome)
+
+
+def read_trusted_root(path: str) -> bytes:
+    """Return the bytes of a trusted root.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, or is too large.
+    """
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
+            data = file.read(MAX_ROOT_OF_TRUST + 1)
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: {error.strerror}", key="trust", hint="it is the ROOT.json that `publish --sign` makes"
+        ) from None
+    if len(data) > MAX_ROOT_OF_TRUST:
+        raise ConfigError(f"{path} is too large for a root of trust", key="trust")
+    return data
+
+
+def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
+    """Return where is kept what was seen signed at a URL under a root of trust."""
+    of = msgspec.msgpack.encode([url, sha256(trusted).hexdigest()])
+    return os.path.join(state_dir, "trust", sha256(of).hexdigest()[:32])
+
+
+def verify_apart(settings: VerifySettings) -> Verified:
+    """Return the version that is signed.
+
+    Raises
+    ------
+    MapDataError
+        What is offered is refused; ``cause`` is ``unsigned``, ``older``, ``expired``, ``altered`` or
+        ``foreign_root``.
+    ConfigError
+        The trusted root is none.
+    PackageMissing
+        Without python-tuf.
+    Offline
+        The store does not answer.
+    CannotWrite
+        What was seen cannot be kept.
+    """
+    read_trusted_root(settings.trust)
+    words = msgspec.json.encode(settings).decode()
+    process, channel = start_child("shmmap.origin.remote.verify_version", words, new_session=False)
+    try:
+        with channel:
+            channel.settimeout(_LONGEST_S)
+            data, _ = receive_packet(channel, packet_buffer())
+            reply = msgspec.json.decode(data, type=VerifyReply) if data else None
+    except TimeoutError:
+        raise Offline(f"{settings.url}: it took more than {_LONGEST_S:.0f} s to verify it") from None
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        code = process.wait()
+    if reply is None:
+        raise InternalError(f"the process that verifies {settings.url} ended ({how_ended(code)})")
+    if reply.verified is None:
+        raise reply.error.raised()
+    return reply.verified

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Verifies which version of a signed map is current, as TUF's client does; a program of its own.
+
+``python -m shmmap.origin.remote.verify_version CHANNEL_FD PARENT_PID SETTINGS`` answers with one packet, see
+`shmmap.origin.remote.verify_apart`.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from hashlib import sha256
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from shmmap.errors import ConfigError, MapMissing, ShmmapError
+from shmmap.formats.durable_file import writing_errors
+from shmmap.optional_packages import needed_packages
+from shmmap.origin.reading_apart import Outcome
+from shmmap.origin.remote.map_versions import TIMESTAMP
+from shmmap.origin.remote.opened_store import open_store
+from shmmap.origin.remote.verify_apart import (
+    MAX_ROOT_OF_TRUST,
+    Verified,
+    VerifyReply,
+    VerifySettings,
+    memory_directory,
+    read_trusted_root,
+)
+from shmmap.processes.end_with_parent import die_with
+
+if TYPE_CHECKING:
+    from tuf.ngclient import Updater
+
+    from shmmap.origin.remote.store import Store
+
+__all__ = ["verify_version"]
+
+_URL = "map:///"  # the updater's names are URLs; what follows is a path at the store
+_ROLES = ("timestamp", "snapshot", "targets", "root")
+
+
+def verify_version(store: Store, trusted: bytes, state_dir: str) -> Verified:
+    """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`."""
+    from tuf.api.exceptions import DownloadError, RepositoryError
+
+    from shmmap.origin.remote.signed_metadata import ALTERED, current_of, refused
+
+    memory = memory_directory(state_dir, store.url, trusted)
+    with writing_errors(memory):
+        os.makedirs(memory, mode=0o700, exist_ok=True)
+        with _locked(memory):
+            updater, failed = _updater(store, trusted, memory)
+            try:
+                updater.refresh()
+                target = updater.get_targetinfo("root")
+            except (RepositoryError, DownloadError) as error:
+                raise _named(store, trusted, error, failed) from None
+            try:
+                current = current_of(target)
+            except ValueError as error:
+                raise refused(store.url, ALTERED, f"targets: {error}") from None
+            signed_s, expires_s = _times(memory)
+    return Verified(
+        current.version, current.root, current.bytes, sha256(trusted).hexdigest(), signed_s, expires_s
+    )
+
+
+def _updater(store: Store, trusted: bytes, memory: str) -> tuple[Updater, list[ShmmapError]]:
+    """Return TUF's client over a store, and the list of what the store failed with."""
+    from tuf.api.exceptions import DownloadHTTPError, RepositoryError
+    from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
+
+    failed: list[ShmmapError] = []
+
+    class Fetcher(FetcherInterface):
+        def _fetch(self, url: str) -> Iterator[bytes]:
+            path = url.removeprefix(_URL)
+            try:
+                return iter([bytes(store.get(path, MAX_ROOT_OF_TRUST))])
+            except MapMissing as error:
+                failed.append(error)
+                raise DownloadHTTPError(path, 404) from None
+            except ShmmapError as error:
+                failed.append(error)
+                raise
+
+    config = UpdaterConfig(
+        root_max_length=MAX_ROOT_OF_TRUST,
+        timestamp_max_length=MAX_ROOT_OF_TRUST,
+        snapshot_max_length=MAX_ROOT_OF_TRUST,
+        targets_max_length=MAX_ROOT_OF_TRUST,
+    )
+    try:
+        return Updater(memory, _URL, fetcher=Fetcher(), config=config, bootstrap=trusted), failed
+    except RepositoryError as error:
+        raise ConfigError(
+            f"the root of trust is none: {error}",
+            key="trust",
+            hint="it is the ROOT.json that `publish --sign` makes",
+        ) from None
+
+
+def _named(store: Store, trusted: bytes, error: Exception, failed: list[ShmmapError]) -> ShmmapError:
+    """Return the refusal, by name, for what TUF's client raised."""
+    from tuf.api import exceptions
+
+    from shmmap.origin.remote.signed_metadata import (
+        ALTERED,
+        EXPIRED,
+        FOREIGN_ROOT,
+        OLDER,
+        UNSIGNED,
+        is_foreign,
+        refused,
+    )
+
+    if isinstance(error, exceptions.DownloadHTTPError):
+        if str(error) == TIMESTAMP:
+            return refused(
+                store.url,
+                UNSIGNED,
+                f"{TIMESTAMP} is not there",
+                "shmmap publish MAP URL --sign KEYDIR signs it",
+            )
+        return refused(f"{store.url}/{error}", ALTERED, "it is not there")
+    if isinstance(error, exceptions.DownloadError):
+        if failed and not isinstance(failed[-1], MapMissing) and failed[-1].code != "bad_map_data":
+            return failed[-1]
+        return refused(store.url, ALTERED, failed[-1].message if failed else str(error))
+    if is_foreign(store, trusted):
+        return refused(
+            store.url,
+            FOREIGN_ROOT,
+            "it is signed under another root than the one that is trusted",
+            "is it the right URL, and the ROOT.json of the keys that sign it?",
+        )
+    if isinstance(error, exceptions.ExpiredMetadataError):
+        now = datetime.now(timezone.utc)
+        return refused(
+            store.url,
+            EXPIRED,
+            f"{error}; this machine's clock says {now:%Y-%m-%d %H:%M} UTC",
+            "is the clock right? `shmmap versions URL --refresh --sign KEYDIR` signs it again",
+        )
+    if isinstance(error, exceptions.BadVersionNumberError):
+        return refused(
+            store.url, OLDER, f"{error}", "an older state is offered than one that was seen signed here"
+        )
+    return refused(store.url, ALTERED, f"{error}")
+
+
+def _times(memory: str) -> tuple[float, float]:
+    """When the timestamp was signed, and when the first of the metadata runs out."""
+    from tuf.api.metadata import Metadata
+
+    found: list[Any] = [Metadata.from_file(os.path.join(memory, f"{role}.json")) for role in _ROLES]
+    signed = found[0].signed.unrecognized_fields.get("signed")
+    try:
+        signed_s = datetime.fromisoformat(signed.replace("Z", "+00:00")).timestamp()
+    except (AttributeError, ValueError, OverflowError):
+        signed_s = 0.0
+    return signed_s, min(one.signed.expires for one in found).timestamp()
+
+
+@contextmanager
+def _locked(directory: str) -> Iterator[None]:
+    fd = os.open(os.path.join(directory, ".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
+
+
+def main() -> int:
+    """Verify, and answer."""
+    die_with(int(sys.argv[2]))
+    settings = msgspec.json.decode(sys.argv[3], type=VerifySettings)
+    reply = VerifyReply()
+    with socket.socket(fileno=int(sys.argv[1])) as channel:
+        try:
+            with needed_packages("--trust"):
+                import tuf.ngclient  # noqa: F401
+
+                from shmmap.origin.remote import signed_metadata  # noqa: F401
+
+                store = open_store(
+                    settings.url,
+                    insecure_http=settings.insecure_http,
+                    instance_credentials=settings.instance_credentials,
+                )
+            reply.verified = verify_version(store, read_trusted_root(settings.trust), settings.state_dir)
+        except ShmmapError as error:
+            reply.error = Outcome.of(error)
+        channel.sendall(msgspec.json.encode(reply))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

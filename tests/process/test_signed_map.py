@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A signed map: its keys, its metadata, refreshed, killed wherever, by two at a time."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.support.bucket_server import BucketServer
+from tests.support.daemon_process import ROOT
+from tests.support.divided_map import DividedMap, make_map
+from tests.support.publishing_verbs import Shmmap
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+pytest.importorskip("tuf", reason="tuf is not installed")
+
+from tests.support.signed_map import Signed, in_days, read_signed
+
+HOLDING = """
+import fcntl, sys
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def shmmap(tmp_path: Path) -> Shmmap:
+    return Shmmap(tmp_path)
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> DividedMap:
+    return make_map(tmp_path / "town", columns=2, rows=1, points=100)
+
+
+@pytest.fixture(scope="session")
+def _signed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("signed")
+    made = make_map(folder / "town", columns=2, rows=1, points=100)
+    Shmmap(folder)("publish", made.root, folder / "store", "--sign", folder / "keys")
+    return folder
+
+
+@pytest.fixture
+def store(tmp_path: Path, _signed: Path) -> Path:
+    """A directory in which the town is published and signed."""
+    return Path(shutil.copytree(_signed / "store", tmp_path / "store"))
+
+
+@pytest.fixture
+def keys(tmp_path: Path, _signed: Path) -> Path:
+    """Its keys."""
+    return Path(shutil.copytree(_signed / "keys", tmp_path / "keys"))
+
+
+def names(store: Path) -> set[str]:
+    return {path.name for path in store.glob("*.json")}
+
+
+def test_the_first_time_makes_keys_that_nobody_else_reads(store: Path, keys: Path) -> None:
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in keys.iterdir()}
+    assert modes.pop("ROOT.json") & 0o444
+    assert modes == {"root.pem": 0o600, "targets.pem": 0o600, "online.pem": 0o600}
+    signed = read_signed(store, keys)
+    assert signed.version == 1
+    assert names(store) == {"1.root.json", "1.targets.json", "1.snapshot.json", "timestamp.json"}
+    roles = signed.root.signed.roles
+    assert roles["snapshot"].keyids == roles["timestamp"].keyids
+    assert len({roles[role].keyids[0] for role in ("root", "targets", "timestamp")}) == 3
+    assert signed.root.signed.consistent_snapshot
+    for role, days in (("root", 3652), ("targets", 365), ("snapshot", 30), ("timestamp", 7)):
+        expires = getattr(signed, role).signed.expires
+        assert in_days(days - 0.1) < expires <= in_days(days)
+
+
+def test_versions_are_signed_and_what_is_the_same_is_not_signed_again(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    (keys / "root.pem").unlink()  # off line
+    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    assert not shmmap.json("publish", town.root, store, "--sign", keys)["changed"]
+    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+    town.change("0_0.pcd", seed=1)
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
+    signed = read_signed(store, keys)
+    assert (signed.version, signed.timestamp.signed.version) == (2, 2)
+    assert {"1.targets.json", "2.targets.json", "1.snapshot.json", "2.snapshot.json"} < names(store)
+    done = shmmap.json("versions", store, "--rollback", "1", "--sign", keys)
+    assert (done["version"], done["restored"]) == (3, 1)
+    assert read_signed(store, keys).version == 3
+
+
+def test_a_map_that_was_not_signed_becomes_signed(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+    shmmap("publish", town.root, tmp_path / "store")
+    done = shmmap.json("publish", town.root, tmp_path / "store", "--sign", tmp_path / "keys")
+    assert not done["changed"]
+    assert read_signed(tmp_path / "store", tmp_path / "keys").version == 1
+
+
+def test_a_signed_map_is_not_changed_without_its_keys(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+) -> None:
+    town.change("0_0.pcd", seed=1)
+    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    for words in (("publish", town.root, store), ("versions", store, "--rollback", "1")):
+        errors = shmmap(*words, code=2)
+        assert "is signed" in errors
+        assert "--sign KEYDIR" in errors
+    errors = shmmap("publish", town.root, store, "--sign", tmp_path / "none", code=2)
+    assert "ROOT.json is not there" in errors
+    assert not (tmp_path / "none").exists()
+    shmmap("publish", town.root, tmp_path / "elsewhere", "--sign", tmp_path / "others")
+    errors = shmmap("publish", town.root, store, "--sign", tmp_path / "others", code=65)
+    assert "foreign root" in errors
+    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+    assert "--refresh or --rollback" in shmmap("versions", store, "--sign", keys, code=2)
+    assert "--sign KEYDIR" in shmmap("versions", store, "--refresh", code=2)
+    assert "nothing is signed" in shmmap(
+        "versions", tmp_path / "nowhere", "--refresh", "--sign", keys, code=66
+    )
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o622])
+def test_a_key_that_others_can_use_is_refused(
+    mode: int, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    town.change("0_0.pcd", seed=1)
+    (keys / "targets.pem").chmod(mode)
+    errors = shmmap("publish", town.root, store, "--sign", keys, code=78)
+    assert f"mode {mode:04o}" in errors
+    assert f"chmod 600 {keys}/targets.pem" in errors
+    assert "PRIVATE" not in errors
+    assert read_signed(store, keys).version == 1
+
+
+def test_a_key_that_is_none_or_another_one(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> None:
+    town.change("0_0.pcd", seed=1)
+    whole = (keys / "targets.pem").read_bytes()
+    (keys / "targets.pem").write_bytes((keys / "online.pem").read_bytes())
+    errors = shmmap("publish", town.root, store, "--sign", keys, code=78)
+    assert "not the key that the map's root of trust names for targets" in errors
+    for content in (b"", whole[:60], b"\xff" * 100_000):
+        (keys / "targets.pem").write_bytes(content)
+        assert "no private key" in shmmap("publish", town.root, store, "--sign", keys, code=78)
+    (keys / "targets.pem").unlink()
+    assert "No such file" in shmmap("publish", town.root, store, "--sign", keys, code=78)
+    shmmap("versions", store, "--refresh", "--sign", keys)  # which needs the online key alone
+    (keys / "targets.pem").write_bytes(whole)
+    (keys / "targets.pem").chmod(0o600)
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
+    read_signed(store, keys)
+
+
+def test_a_refresh_signs_what_runs_out(shmmap: Shmmap, store: Path, keys: Path) -> None:
+    for name in ("root.pem", "targets.pem"):
+        (keys / name).unlink()
+    done = shmmap.json("versions", store, "--refresh", "--sign", keys)
+    assert done["version"] == 1
+    signed = read_signed(store, keys)
+    assert (signed.timestamp.signed.version, signed.snapshot.signed.version) == (2, 1)
+    assert done["valid_until"]["timestamp"] == signed.timestamp.signed.expires.isoformat()
+    # weeks later: both have run out, and a snapshot was left by a run that was killed
+    signed.write("timestamp", expires=in_days(-20))
+    signed.write("snapshot", expires=in_days(-1))
+    (store / "2.snapshot.json").write_bytes(b"left")
+    assert "version 1 is signed" in shmmap("versions", store, "--refresh", "--sign", keys)
+    signed = read_signed(store, keys)
+    assert (signed.timestamp.signed.version, signed.snapshot.signed.version) == (3, 3)
+    assert signed.timestamp.signed.expires > in_days(6.9)
+    assert signed.snapshot.signed.expires > in_days(29.9)
+
+
+def test_publishing_the_same_signs_targets_again_before_they_run_out(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    Signed(store, keys).write("targets", expires=in_days(100))
+    assert not shmmap.json("publish", town.root, store, "--sign", keys)["changed"]
+    signed = read_signed(store, keys)
+    assert (signed.version, signed.targets.signed.version) == (1, 2)
+    assert signed.targets.signed.expires > in_days(364)
+
+
+def test_damaged_metadata_is_not_built_upon(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    town.change("0_0.pcd", seed=1)
+    for name in ("timestamp.json", "1.snapshot.json", "1.targets.json"):
+        whole = (store / name).read_bytes()
+        for damaged in (b"", b"{", whole.replace(b'"version":1', b'"version":7')):
+            (store / name).write_bytes(damaged)
+            errors = shmmap("publish", town.root, store, "--sign", keys, code=65)
+            assert "refused" in errors
+            assert name in errors
+        (store / name).write_bytes(whole)
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
+
+
+# --- killed, and two at a time ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "label", ["sign.keys", "sign.root", "sign.metadata", "sign.timestamp", "sign.signed"]
+)
+def test_killed_the_first_time_it_goes_on(
+    label: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
+) -> None:
+    words = ("publish", town.root, tmp_path / "store", "--sign", tmp_path / "keys")
+    shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    assert not (tmp_path / "store/CURRENT").exists()
+    shmmap(*words)
+    assert not list((tmp_path / "keys").glob(".*"))
+    assert read_signed(tmp_path / "store", tmp_path / "keys").version == (
+        1 if label in ("sign.keys", "sign.root", "sign.signed") else 2
+    )
+
+
+@pytest.mark.parametrize(
+    ("verb", "label"),
+    [
+        ("publish", "sign.metadata"),
+        ("publish", "sign.metadata:2"),
+        ("publish", "sign.timestamp"),
+        ("publish", "sign.signed"),
+        ("publish", "sign.switched"),
+        ("rollback", "sign.timestamp"),
+        ("rollback", "sign.switch"),
+    ],
+)
+def test_killed_anywhere_one_version_is_signed_and_whole(
+    label: str, verb: str, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+) -> None:
+    before = 1
+    if verb == "rollback":
+        town.change("0_0.pcd", seed=1)
+        shmmap("publish", town.root, store, "--sign", keys)
+        words: tuple[str | Path, ...] = ("versions", store, "--rollback", "1", "--sign", keys)
+        before = 2
+    else:
+        town.change("0_0.pcd", seed=1)
+        words = ("publish", town.root, store, "--sign", keys)
+    shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    is_signed = label in ("sign.signed", "sign.switch", "sign.switched")
+    assert Signed(store, keys).version == before + is_signed
+    if label == "sign.signed":  # what is signed must not be removed as if it had never been served
+        assert "CURRENT says 1" in shmmap("versions", store, "--prune", code=2)
+    shmmap("versions", store, "--refresh", "--sign", keys)  # repairs entry and CURRENT
+    assert read_signed(store, keys).version == before + is_signed
+    shmmap(*words)
+    read_signed(store, keys)
+    shmmap("versions", store, "--prune")
+    shmmap("fetch", store, tmp_path / "back")
+
+
+@pytest.mark.parametrize("label", ["sign.metadata", "sign.timestamp", "sign.repaired"])
+def test_a_refresh_that_is_killed(label: str, shmmap: Shmmap, store: Path, keys: Path) -> None:
+    Signed(store, keys).write("snapshot", expires=in_days(1))
+    (store / "CURRENT").unlink()
+    words = ("versions", store, "--refresh", "--sign", keys)
+    shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    assert Signed(store, keys).version == 1
+    shmmap(*words)
+    assert read_signed(store, keys).snapshot.signed.expires > in_days(29)
+
+
+def test_entry_and_current_are_repaired(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> None:
+    for seed, damage in enumerate(("entry", "other entry", "no current", "later")):
+        town.change("0_0.pcd", seed=seed)
+        shmmap("publish", town.root, store, "--sign", keys)
+        signed = read_signed(store, keys)
+        entry = store / f"versions/{signed.version}.json"
+        if damage == "entry":
+            entry.unlink()
+            (store / "CURRENT").write_text(json.dumps({**signed.current, "version": 1}))
+        elif damage == "other entry":
+            entry.write_text(json.dumps({**json.loads(entry.read_bytes()), "root": "0" * 64}))
+            (store / "CURRENT").unlink()
+        elif damage == "no current":
+            (store / "CURRENT").unlink()
+        else:
+            (store / "CURRENT").write_text(json.dumps({**signed.current, "version": 77}))
+        shmmap("versions", store, "--refresh", "--sign", keys)
+        assert read_signed(store, keys).version == signed.version
+
+
+def test_of_two_publishers_one_wins(
+    shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
+) -> None:
+    url, keys = buckets.url("signed"), tmp_path / "keys"
+    shmmap("publish", town.root, url, "--sign", keys, env=buckets.environment)
+    running = []
+    for seed in (8, 9):
+        other = make_map(tmp_path / f"other{seed}", columns=2, rows=1, points=100, seed=seed)
+        running.append(shmmap.start("publish", other.root, url, "--sign", keys, env=buckets.environment))
+    answers = [process.communicate() for process in running]
+    codes = [process.returncode for process in running]
+    assert 0 in codes, answers
+    for (_, errors), code in zip(answers, codes, strict=True):
+        assert code in (0, 75), errors
+        assert code == 0 or "another publisher has changed" in errors
+    done = shmmap.json("versions", url, "--refresh", "--sign", keys, env=buckets.environment)
+    rows = shmmap.json("versions", url, env=buckets.environment)
+    assert rows["current"] == done["version"] == 1 + codes.count(0)
+
+
+def held_at_the_timestamp(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> tuple[subprocess.Popen[str], subprocess.Popen[str]]:
+    """A publisher that has written its snapshot and waits for the store's lock, and what holds that."""
+    hold = subprocess.Popen(
+        [sys.executable, "-c", HOLDING, str(store / ".lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert hold.stdout is not None
+    assert hold.stdout.readline() == "held\n"
+    slow = shmmap.start("publish", town.root, store, "--sign", keys)
+    while not (store / "2.snapshot.json").exists():
+        assert slow.poll() is None
+        time.sleep(0.01)
+    return slow, hold
+
+
+def test_a_refresh_that_comes_between_costs_nothing(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    town.change("0_0.pcd", seed=1)
+    slow, hold = held_at_the_timestamp(shmmap, town, store, keys)
+    Signed(store, keys).write("timestamp", version=2)
+    hold.communicate("")
+    _, errors = slow.communicate()
+    assert slow.returncode == 0, errors
+    signed = read_signed(store, keys)
+    assert (signed.version, signed.timestamp.signed.version) == (2, 3)
+
+
+def test_the_slower_of_two_publishers_changes_nothing(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    town.change("0_0.pcd", seed=1)
+    slow, hold = held_at_the_timestamp(shmmap, town, store, keys)
+    other = Signed(store, keys)
+    other.target.unrecognized_fields["custom"]["map_version"] = 9
+    other.write("targets", version=5)
+    other.snapshot.signed.meta["targets.json"].version = 5
+    other.write("snapshot", version=5)
+    other.timestamp.signed.snapshot_meta.version = 5
+    other.write("timestamp", version=2)
+    hold.communicate("")
+    _, errors = slow.communicate()
+    assert slow.returncode == 75, errors
+    assert "another publisher has changed" in errors
+    assert Signed(store, keys).version == 9
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 10
+    read_signed(store, keys)
+
+
+@pytest.mark.parametrize("package", ["tuf", "cryptography"])
+def test_without_the_packages_it_says_what_to_install(
+    package: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
+) -> None:
+    (tmp_path / "without").mkdir()
+    (tmp_path / "without" / f"{package}.py").write_text(f"raise ModuleNotFoundError(name={package!r})\n")
+    path = f"{tmp_path / 'without'}:{ROOT}"
+    errors = shmmap(
+        "publish", town.root, tmp_path / "store", "--sign", tmp_path / "keys", code=69,
+        env={"PYTHONPATH": path},
+    )  # fmt: skip
+    assert "a signed map needs the package" in errors
+    assert f"pip install {'tuf' if package == 'tuf' else 'securesystemslib[crypto]'}" in errors
