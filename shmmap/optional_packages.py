@@ -30,13 +30,15 @@ _OURS: Final = ("shmmap", "shmmap_clients")
 
 
 @contextmanager
-def needed_packages(what: str) -> Iterator[None]:
+def needed_packages(what: str, *, together: str = "") -> Iterator[None]:
     """Say which package is missing where something is imported, instead of a traceback.
 
     Parameters
     ----------
     what
         Who needs it: a function, a program.
+    together
+        What to install where one is of little use without others.
 
     Raises
     ------
@@ -62,5 +64,5 @@ def needed_packages(what: str) -> Iterator[None]:
         )
         raise PackageMissing(
             f"{what} needs the package {package}, which is not installed",
-            hint=f"pip install {package}{all_others}",
+            hint=f"pip install {together or package}{all_others}",
         ) from None

@@ -91,6 +91,10 @@ def test_a_package_that_no_ordinary_install_brings_has_to_be_installed_by_name()
     with pytest.raises(PackageMissing) as missing, needed_packages("shmmap-ndt"):
         raise ModuleNotFoundError("No module named 'pyopencl'", name="pyopencl")
     assert missing.value.hint == "pip install pyopencl"
+    with pytest.raises(PackageMissing) as missing, needed_packages("a map", together="obstore zstandard"):
+        raise ModuleNotFoundError("No module named 'zstandard'", name="zstandard")
+    assert "needs the package zstandard" in missing.value.message
+    assert missing.value.hint == "pip install obstore zstandard"
 
 
 def test_a_module_of_ours_that_is_missing_is_a_defect() -> None:

@@ -19,7 +19,7 @@ from shmmap.origin.remote.credentials import azure_settings, google_settings, s3
 from shmmap.origin.remote.store import WEB_SCHEMES, Listed, Patience, StoreUrl, Tag, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
-with needed_packages("a map in a bucket or at a web server"):
+with needed_packages("a map in a bucket or at a web server", together="obstore zstandard"):
     import obstore
     from obstore import exceptions
     from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store

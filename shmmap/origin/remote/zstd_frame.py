@@ -8,7 +8,7 @@ from typing import Final
 from shmmap.errors import MapDataError
 from shmmap.optional_packages import needed_packages
 
-with needed_packages("a published map"):
+with needed_packages("a published map", together="obstore zstandard"):
     import zstandard
 
 __all__ = ["DAMAGED", "pack_frame", "unpack_frame"]
