@@ -9,7 +9,12 @@ from typing import Final
 
 from shmmap.errors import PackageMissing
 
-__all__ = ["needed_packages"]
+__all__ = ["FOR_REMOTE", "TO_SIGN", "needed_packages"]
+
+FOR_REMOTE: Final = "obstore zstandard"
+"""What a published map needs, together: the extra ``remote``."""
+TO_SIGN: Final = "tuf 'securesystemslib[crypto]'"
+"""What a signed map needs: the extra ``sign``."""
 
 _PACKAGES: Final = {
     "securesystemslib": "securesystemslib[crypto]",

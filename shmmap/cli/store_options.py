@@ -58,11 +58,11 @@ def add_sign_option(parser: argparse.ArgumentParser) -> None:
 
 def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False) -> MapSigner | None:
     """Return what signs a map, as the options say; None: it is not signed."""
-    from shmmap.optional_packages import needed_packages
+    from shmmap.optional_packages import TO_SIGN, needed_packages
 
     if args.sign is None:
         return None
-    with needed_packages("a signed map"):
+    with needed_packages("a signed map", together=TO_SIGN):
         from shmmap.publishing.signing import MapSigner
 
     return MapSigner(store, args.sign, make_keys=make_keys)

@@ -607,7 +607,7 @@ def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Shmmap, store: Path, tmp
 def test_urls_that_cannot_be_meant(shmmap: Shmmap, town: DividedMap) -> None:
     for url, says in (
         ("s3://key:hunter2@maps/town", "may hold a secret"),
-        ("ftp://maps/town", "cannot lie at a ftp:// URL"),
+        ("ftp://maps/town", "cannot lie at ftp://"),
         ("http://192.0.2.1/town", "plain http://"),
         ("file://elsewhere/town", "no directory of this machine"),
     ):
@@ -651,4 +651,4 @@ def test_without_the_packages_a_url_says_what_to_install(
     path = f"{tmp_path / 'without'}:{ROOT}"
     errors = shmmap("publish", town.root, "s3://maps/town", code=69, env={"PYTHONPATH": path})
     assert f"needs the package {package}" in errors
-    assert f"pip install {package}" in errors
+    assert "pip install obstore zstandard" in errors

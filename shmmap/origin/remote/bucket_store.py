@@ -14,12 +14,12 @@ from datetime import timedelta
 from typing import Any, Final, TypeVar, cast
 
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
-from shmmap.optional_packages import needed_packages
+from shmmap.optional_packages import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
 from shmmap.origin.remote.store import WEB_SCHEMES, Listed, Patience, StoreUrl, Tag, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
-with needed_packages("a map in a bucket or at a web server", together="obstore zstandard"):
+with needed_packages("a map in a bucket or at a web server", together=FOR_REMOTE):
     import obstore
     from obstore import exceptions
     from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
@@ -35,6 +35,7 @@ _IMMUTABLE: Final = {
 _CHANGES: Final = {"Cache-Control": "no-cache", "Content-Type": "application/json"}
 _STATUS: Final = re.compile(r"\b([45]\d\d)\b (?:[A-Z][A-Za-z ]+)|status(?: code)?:? ([45]\d\d)")
 _AGAIN: Final = "try again later"
+_SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS_ENDPOINT_URL and AWS_REGION)"
 _REGION: Final = "is AWS_REGION that of the bucket?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
@@ -205,7 +206,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
         return Offline(f"{name}: refused, it is somewhere else", hint=_REGION)
     if "certificate" in text.lower():
         return Offline(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
-    return Offline(f"{name}: no answer", hint=_AGAIN)
+    return Offline(f"{name}: no answer", hint=_SILENT)
 
 
 def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bool) -> Any:

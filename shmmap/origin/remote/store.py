@@ -165,7 +165,7 @@ def read_url(text: str) -> StoreUrl:
     scheme = text.partition("://")[0].lower()
     if scheme not in _SCHEMES:
         raise BadRequest(
-            f"a map cannot lie at a {scheme}:// URL",
+            f"a map cannot lie at {scheme}://",
             hint=f"it can at {', '.join(f'{s}://' for s in _SCHEMES)}",
         )
     try:
@@ -175,7 +175,7 @@ def read_url(text: str) -> StoreUrl:
         raise BadRequest(f"no {scheme}:// URL can be read from what was given") from None
     if "@" in parts.netloc or parts.query or parts.fragment or "?" in text or "#" in text:
         raise BadRequest(
-            f"a {scheme}:// URL with a user, a query or a fragment is not taken: it may hold a secret",
+            f"a URL ({scheme}://) with a user, a query or a fragment is not taken: it may hold a secret",
             hint="credentials come from the environment or a credentials file",
         )
     if scheme == "file":

@@ -21,7 +21,7 @@ import msgspec
 
 from shmmap.errors import ConfigError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import writing_errors
-from shmmap.optional_packages import needed_packages
+from shmmap.optional_packages import TO_SIGN, needed_packages
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import TIMESTAMP
 from shmmap.origin.remote.opened_store import open_store
@@ -186,7 +186,7 @@ def main() -> int:
     reply = VerifyReply()
     with socket.socket(fileno=int(sys.argv[1])) as channel:
         try:
-            with needed_packages("--trust"):
+            with needed_packages("--trust", together=TO_SIGN):
                 import tuf.ngclient  # noqa: F401
 
                 from shmmap.origin.remote import signed_metadata  # noqa: F401

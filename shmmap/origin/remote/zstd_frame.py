@@ -6,9 +6,9 @@ from __future__ import annotations
 from typing import Final
 
 from shmmap.errors import MapDataError
-from shmmap.optional_packages import needed_packages
+from shmmap.optional_packages import FOR_REMOTE, needed_packages
 
-with needed_packages("a published map", together="obstore zstandard"):
+with needed_packages("a published map", together=FOR_REMOTE):
     import zstandard
 
 __all__ = ["DAMAGED", "pack_frame", "unpack_frame"]
