@@ -59,6 +59,7 @@ class Paging:
         if self._fd >= 0:
             self.watched.unwatch(self._fd)
             self.cells.map_changed()
+            self.adoption.map_changed(time.monotonic())
         pages = self._pages
         self._fd = pages.fd if pages is not None else -1
         if self._fd >= 0:
@@ -99,7 +100,7 @@ class Paging:
             self.scheduler.loads.forget_failures()
         self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
-            self.adoption.pages_came(time.monotonic())
+            self.adoption.pages_came(news.come, time.monotonic())
             if self.cache.layers.halo_m(self.cache.ledger.layers()):
                 self.map_switch.look_again()
         self.cells.pages_settled(news)
