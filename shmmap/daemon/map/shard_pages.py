@@ -33,6 +33,7 @@ BACKGROUND_AT_ONCE: Final = 8
 BACKGROUND: Final = 1e15
 """Priority of pages that nothing needs yet: behind all that something does."""
 NAMED: Final = 3
+"""Cells of one base name that an error lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
