@@ -47,8 +47,9 @@ class CellSet(Sequence[Cell]):
         comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may
         exist: ask again.
     reason : str
-        Why that is not about to change: ``"offline"``, where the list of cells cannot be reached at present;
-        empty where it is being fetched, where all is covered, and from a daemon older than protocol 1.6.
+        Why what is missing is not on its way: ``"offline"``, where the list of cells cannot be reached at
+        present; empty where it is being fetched, where all is covered, and from a daemon older than protocol
+        1.6.
     """
 
     __slots__ = (

@@ -183,7 +183,7 @@ def run(config: DaemonConfig) -> int:
 
 
 def _published(config: DaemonConfig) -> PublishedOrigin | None:
-    """Open a published map, if it is one; a directory is by what is in it."""
+    """Open a published map: a URL, or a directory with a file CURRENT; None where the map is files."""
     path = config.map_path
     if "://" not in path and not os.path.isfile(os.path.join(path, "CURRENT")):
         return None
@@ -191,7 +191,7 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
         if getattr(config, name):
             raise ConfigError(
                 f"{option_of(name)} is not for a published map", key=name,
-                hint="a new version is taken by --poll" if name == "watch" else "",
+                hint="--poll SECONDS looks for new versions" if name == "watch" else "",
             )  # fmt: skip
     with needed_packages("a published map"):
         from shmmap.daemon.map.published_origin import PublishedOrigin

@@ -12,6 +12,7 @@ from itertools import islice
 from typing import Final
 
 from shmmap.doctor.finding import Finding, fail, ok, warn
+from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.doctor.patient import Patient
 from shmmap.errors import (
     DaemonUnreachable,
@@ -22,7 +23,7 @@ from shmmap.errors import (
     SocketPermission,
 )
 from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
-from shmmap.quantities import counted, format_duration
+from shmmap.quantities import counted
 
 __all__ = [
     "account_name",
@@ -162,7 +163,7 @@ def check_map_access(patient: Patient) -> Finding:
         return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
     if patient.alive:
         if patient.seen is not None and patient.seen.counters.get("origin_out", 0):
-            since = format_duration(patient.seen.counters.get("last_outage_ns", 0) * 1e-9)
+            since = outage_so_far(patient.seen.counters)
             return warn(
                 name,
                 f"{path} is being served from memory: where it comes from has not answered for {since}",

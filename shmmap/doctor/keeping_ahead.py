@@ -9,7 +9,7 @@ from typing import Final, Literal, NamedTuple
 
 from shmmap.quantities import counted, format_bytes, format_duration
 
-__all__ = ["AheadState", "AheadVerdict", "ahead_as_json", "ahead_verdict", "over_fetch"]
+__all__ = ["AheadState", "AheadVerdict", "ahead_as_json", "ahead_verdict", "outage_so_far", "over_fetch"]
 
 AheadState = Literal["off", "standing", "enough", "filling", "out", "slow", "full", "late"]
 
@@ -80,6 +80,12 @@ def over_fetch(counters: Mapping[str, int]) -> float | None:
     return counters.get("bytes_loaded", 0) / used if used else None
 
 
+def outage_so_far(counters: Mapping[str, int]) -> str:
+    """Return how long the origin is out of reach, for a reader: ``"less than a second"``, ``"5.0 s"``."""
+    outage_s = counters.get("last_outage_ns", 0) * 1e-9
+    return "less than a second" if outage_s < 1.0 else format_duration(outage_s)
+
+
 def ahead_verdict(counters: Mapping[str, int]) -> AheadVerdict:
     """Judge whether ride-out, budget and loaders fit the speed that is driven."""
     late = counters.get("cells_late_10min", 0)
@@ -93,7 +99,7 @@ def ahead_verdict(counters: Mapping[str, int]) -> AheadVerdict:
     speed = f"{counters['fastest_mm_per_s'] * 1e-3:.1f} m/s"
     memory = f"what clients need for the next {format_duration(ahead_s)} at {speed} is in memory"
     if counters["origin_out"]:
-        since = format_duration(counters["last_outage_ns"] * 1e-9)
+        since = outage_so_far(counters)
         return AheadVerdict(
             "out", f"no load has succeeded for {since}; {memory}", "`shmmap tail` says why loads fail"
         )

@@ -18,7 +18,7 @@ from shmmap.cli.screens.output import (
     print_pairs,
 )
 from shmmap.doctor.cache_size import cache_verdict
-from shmmap.doctor.keeping_ahead import ahead_as_json, ahead_verdict, over_fetch
+from shmmap.doctor.keeping_ahead import ahead_as_json, ahead_verdict, outage_so_far, over_fetch
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -125,8 +125,7 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
             4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
         )
     if count.get("origin_out", 0):
-        since = format_duration(count.get("last_outage_ns", 0) * 1e-9)
-        lines.append(("origin", f"out of reach for {since}: what is in memory is served"))
+        lines.append(("origin", f"out of reach for {outage_so_far(count)}: what is in memory is served"))
     if problems := count.get("map_problems", 0):
         lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
     if outside := count.get("cells_outside_box", 0):

@@ -81,7 +81,7 @@ class Ledger:
     overhead_bytes
         What the daemon itself keeps in shared memory (its statistics); counts as used.
     aside_bytes
-        Segments of an earlier life that cannot be judged before more of the map is known; counts as used.
+        Segments of an earlier run that cannot be judged before more of the map is known; counts as used.
     prefetched_bytes
         Memory of what was fetched before anybody asked for it, and nobody has asked for yet.
     unchecked_count

@@ -108,8 +108,8 @@ class MapSwitch:
         self._unseen = cache.ledger.segments.walk()
         cache.unentered = cache.ledger.resident_count
 
-    def look_again(self) -> None:
-        """More of the map is known: what was of no known version may be current."""
+    def recheck(self) -> None:
+        """More of the map is known: segments whose current version was not may be current."""
         self._unseen = self._cache.ledger.segments.walk()
         self._cache.unentered = self._cache.ledger.resident_count
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -54,6 +55,7 @@ class Adoption:
     loads: Loads
     misplaced: MisplacedCells
     _aside: dict[str, tuple[Box, int]] = field(default_factory=dict)  # where to look, and the bytes, by name
+    _by_page: dict[int, list[str]] = field(default_factory=dict)  # names by one page that each waits for
 
     def take_over(self, now_s: float) -> None:
         """Look at every name once."""
@@ -66,23 +68,43 @@ class Adoption:
         if any(counts.values()):
             log.info("segments of an earlier daemon", **counts)
 
-    def pages_came(self, now_s: float) -> None:
+    def pages_came(self, pages: Iterable[int], now_s: float) -> None:
         """More of the map is known: judge what was set aside for it."""
-        for name, (area, nbytes) in list(self._aside.items()):
-            if not self._has_absent_pages(area):
+        for page in pages:
+            self._judge(self._by_page.pop(page, ()), now_s)
+
+    def map_changed(self, now_s: float) -> None:
+        """Another state of the map is served, with other pages: judge what these know."""
+        self._by_page.clear()
+        self._judge(list(self._aside), now_s)
+
+    def _judge(self, names: Iterable[str], now_s: float) -> None:
+        for name in names:
+            area, nbytes = self._aside[name]
+            if not self._wait_for_page(name, area):
                 del self._aside[name]
                 self.cache.ledger.aside_bytes -= nbytes
                 self._take(name, now_s)
 
     def close(self, *, keep: bool) -> None:
-        """Take the names of what is still set aside away, or leave them to the next life."""
+        """Take the names of what is still set aside away, or leave them to the next run."""
         if not keep:
             for name in self._aside:
                 self._remove(name, "the daemon ends")
 
-    def _has_absent_pages(self, area: Box) -> bool:
+    def _absent_page(self, area: Box) -> int | None:
+        """Return a page of an area that is not here; None if all are."""
         pages = self.cache.catalogue.pages
-        return pages is not None and not all(map(pages.is_here, pages.of_area(area)))
+        if pages is None:
+            return None
+        return next((page for page in pages.of_area(area) if not pages.is_here(page)), None)
+
+    def _wait_for_page(self, name: str, area: Box) -> bool:
+        """Let a segment wait for one page of its area that is not here; whether there is one."""
+        page = self._absent_page(area)
+        if page is not None:
+            self._by_page.setdefault(page, []).append(name)
+        return page is not None
 
     def _may_become_known(self, resident: Resident) -> Box | None:
         """Where pages of the map are absent that a segment is judged by; None if none are."""
@@ -91,11 +113,12 @@ class Adoption:
         min_x, min_y, max_x, max_y = resident.box
         halo_m = self.cache.layers.halo_m((resident.key.layer,))
         area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
-        return area if self._has_absent_pages(area) else None
+        return area if self._absent_page(area) is not None else None
 
     def _set_aside(self, name: str, area: Box, nbytes: int) -> None:
         self._aside[name] = area, nbytes
         self.cache.ledger.aside_bytes += nbytes
+        self._wait_for_page(name, area)
         pages = self.cache.catalogue.pages
         if pages is not None:
             pages.want(pages.of_area(area), ADOPTED)

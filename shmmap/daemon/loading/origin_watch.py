@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks after an origin elsewhere: loads that it fails are doubted, what it has again is fetched again."""
+"""Watches an origin elsewhere: asks it when loads fail, and what failed is fetched once it answers again."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class OriginWatch:
         if news.back:
             health.failed_in_a_row = 0
             self.scheduler.loads.forget_failures()
-            self.scheduler.prefetcher.look_again()
+            self.scheduler.prefetcher.restart()
             self.try_again()
         if news.changed:
             self.reload()

@@ -141,10 +141,10 @@ class ObjectFetcher:
             frame = LoadFailed(f"{fetch.name.path}: {type(error).__name__}: {error}")
         with self._lock:
             self._under_way -= 1
-            self._over(fetch, frame)
+            self._settle(fetch, frame)
             if isinstance(frame, Offline):
                 while self._queue:
-                    self._over(self._queue.popleft(), frame)
+                    self._settle(self._queue.popleft(), frame)
             self._begin_some()
 
     # --- under the lock ---------------------------------------------------------------------------
@@ -177,7 +177,7 @@ class ObjectFetcher:
             self._held_bytes += fetch.name.size
             self._threads.submit(self._fetch, fetch)
 
-    def _over(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
+    def _settle(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
         fetch.frame = frame
         for number in fetch.jobs:
             lacking = self._lacking.get(number)
@@ -270,11 +270,11 @@ class PublishedReader:
         return header
 
     def named(self, message: str) -> str:
-        """Names of cells are what they are."""
+        """Return the message as it is: it names cells by their ids."""
         return message
 
     def explain(self, source: Source, message: str) -> str:
-        """Say what is wrong as it is."""
+        """Return the message as it is."""
         del source
         return message
 

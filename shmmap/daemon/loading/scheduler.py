@@ -121,7 +121,7 @@ class Scheduler:
         for load in waiting:
             if self.loads.by_key.get(load.key) is load:
                 self.loads.requeue(load)
-        self.prefetcher.look_again()
+        self.prefetcher.restart()
 
     def _waits_for_pages(self, load: Load, now_s: float) -> bool:
         """Whether a load cannot be begun because it is not known yet which cells it looks into."""

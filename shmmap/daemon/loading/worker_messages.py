@@ -57,7 +57,7 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
-    """Compare a source with ``stamp``, and a segment of an earlier life, if named, with its checksums."""
+    """Compare a source with ``stamp``, and a segment of an earlier run, if named, with its checksums."""
 
     number: int
     source: Source

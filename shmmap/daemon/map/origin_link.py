@@ -70,7 +70,7 @@ class OriginLink:
 
     @property
     def is_doubted(self) -> bool:
-        """Whether it is being found out if it answers."""
+        """Whether it may be out of reach, or is: it is being asked."""
         return self._is_out or self._is_doubted
 
     def doubt(self) -> None:
@@ -140,10 +140,10 @@ class OriginLink:
         except Offline:
             changed, answers = False, False
         except ShmmapError as error:
-            log.error("the map's origin gives no version", reason=error)
+            log.error("the map's origin names no usable version", reason=error)
             changed, answers = False, True
         except Exception:  # noqa: BLE001  else it would never be asked again
-            log.exception("the map's origin gives no version", cause="a defect in shmmap")
+            log.exception("the map's origin cannot be asked", cause="a defect in shmmap")
             changed, answers = False, False
         with self._condition:
             if answers:

@@ -148,13 +148,13 @@ class PublishedOrigin:
             return None
         taken = self._state.load()
         if self._state.problem:
-            log.warning("what was taken cannot be read", problem=self._state.problem)
+            log.warning("the version taken last cannot be read", problem=self._state.problem)
         if taken is None:
             return None
         try:
             root = unpack_root(taken.root, name=self._state.path)
         except MapDataError as error:  # of a later version of shmmap, say
-            log.warning("what was taken cannot be served", reason=error)
+            log.warning("the version taken last cannot be served", reason=error)
             return None
         self._taken = self._saved = taken
         return taken, root
@@ -242,7 +242,7 @@ def _save(state: TakenVersionFile, taken: TakenVersion) -> None:
     try:
         state.save(taken)
     except CannotWrite as error:
-        log.warning("what was taken cannot be remembered", reason=error)
+        log.warning("the version taken cannot be remembered for the next start", reason=error)
 
 
 def _same_shards(view: PublishedView, root: Root) -> dict[int, Shard]:

@@ -34,6 +34,8 @@ from shmmap.segment.version import Stamp
 __all__ = ["PublishedView"]
 
 Indices: TypeAlias = NDArray[np.intp]
+_Found: TypeAlias = tuple[Indices, Indices, Indices, Indices]
+"""Cells that were added, removed, changed and moved."""
 _Pair: TypeAlias = tuple[int | None, int | None]
 """Numbers of the shards at one place in an earlier version and in a later one."""
 MM_BYTES: Final = 6
@@ -80,6 +82,7 @@ class PublishedView:
         self.mean_size = root.mean_m
         self._differing: tuple[Root, list[_Pair]] | None = None
         self._compared: dict[_Pair, _Difference] = {}
+        self._changed: _Found | None = None
 
     @cached_property
     def _ready(self) -> dict[str, int]:
@@ -160,11 +163,7 @@ class PublishedView:
 
     def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
         """(K, 4) float64, boxes of these cells."""
-        boxes = np.empty((len(indices), 4))
-        for at, index in enumerate(indices.tolist()):
-            page, row = self.pages.row(index)
-            boxes[at] = page.shard.boxes[row]
-        return boxes
+        return self.pages.boxes_of(indices)
 
     def version(self, index: int) -> int:
         """64-bit version of a cell."""
@@ -216,34 +215,49 @@ class PublishedView:
     # --- what changed -----------------------------------------------------------------------------
 
     def changes_from(self, before: object) -> CatalogueChange:
-        """Find what differs from another version, as far as both know it."""
+        """Find what differs from another version, as far as both know it.
+
+        A shard is compared once, as soon as it is here: asked at each page that comes, this has little to do.
+        """
         if not isinstance(before, PublishedView):
             raise TypeError(f"{type(before).__name__} is no version of a published map")
         unknown = CatalogueChange(before, self, _NOTHING, _NOTHING, _NOTHING, _NOTHING, known=False)
         same_ids = before.id_prefix == self.id_prefix
         if self._differing is None or self._differing[0] is not before.root:
             self._compared.clear()
+            self._changed = None
             self._differing = before.root, _differing_shards(before.root, self.root, same_ids=same_ids)
+        pairs = self._differing[1]
+        theirs = {was: _shard(before, was) for was, _ in pairs if was is not None}
+        ours = {now: _shard(self, now) for _, now in pairs if now is not None}
+        if None in theirs.values():
+            return unknown
+        if self._changed is None:
+            for was, now in pairs:
+                old = theirs[was] if was is not None else None
+                new = ours[now] if now is not None else None
+                if (was, now) not in self._compared and (now is None or new is not None):
+                    self._compared[was, now] = _compare(old, new, same_ids=same_ids)
+        if None in ours.values():
+            return unknown
+        if self._changed is None:
+            self._changed = self._put_together(before, same_ids=same_ids)
+            self._compared.clear()
+        return CatalogueChange(before, self, *self._changed)
+
+    def _put_together(self, before: PublishedView, *, same_ids: bool) -> _Found:
+        """Return what was found in all shards, ascending."""
         found: dict[str, list[int]] = {"added": [], "removed": [], "changed": [], "moved": []}
-        for in_old, in_new in self._differing[1]:
-            theirs = before.pages.page(in_old) if in_old is not None else None
-            ours = self.pages.page(in_new) if in_new is not None else None
-            if (in_old is not None and theirs is None) or (in_new is not None and ours is None):
-                return unknown
-            difference = self._compared.get((in_old, in_new))
-            if difference is None:
-                difference = _compare(
-                    theirs.shard if theirs is not None else None, ours.shard if ours is not None else None,
-                    same_ids=same_ids,
-                )  # fmt: skip
-                self._compared[in_old, in_new] = difference
-            for how, page in (("added", ours), ("removed", theirs), ("changed", ours), ("moved", ours)):
-                if page is not None:
-                    found[how] += [page.first + row for row in getattr(difference, how)]
+        for (was, now), difference in self._compared.items():
+            old_first = before.pages.cells(was).start if was is not None else 0
+            new_first = self.pages.cells(now).start if now is not None else 0
+            for how, rows in found.items():
+                first = old_first if how == "removed" else new_first
+                rows += [first + row for row in getattr(difference, how)]
         if same_ids and found["added"] and found["removed"]:
             self._note_moved(found, before)
         added, removed, changed, moved = (np.sort(np.array(some, np.intp)) for some in found.values())
-        return CatalogueChange(before, self, added, removed, changed, moved)
+        return added, removed, changed, moved
 
     def _note_moved(self, found: dict[str, list[int]], before: PublishedView) -> None:
         """Cells that left one shard and came to another one have only moved."""
@@ -272,6 +286,12 @@ def _differing_shards(old: Root, new: Root, *, same_ids: bool) -> list[_Pair]:
         or now is None
         or old.hashes[was].tobytes() != new.hashes[now].tobytes()
     ]
+
+
+def _shard(view: PublishedView, number: int) -> Shard | None:
+    """Return a shard of a version if it is here."""
+    page = view.pages.page(number)
+    return page.shard if page is not None else None
 
 
 def _compare(old: Shard | None, new: Shard | None, *, same_ids: bool) -> _Difference:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import os
 from collections import deque
@@ -32,6 +33,7 @@ BACKGROUND_AT_ONCE: Final = 8
 BACKGROUND: Final = 1e15
 """Priority of pages that nothing needs yet: behind all that something does."""
 NAMED: Final = 3
+"""Cells of one base name that an error lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +101,7 @@ class ShardPages:
     ) -> None:
         self.root = root
         self._fetcher = fetcher
-        self._first = root.first_indices
+        self._first: list[int] = root.first_indices.tolist()
         self._most_bytes = most_bytes
         self._bytes = 0
         self._here: dict[int, Page] = {}  # least recently needed first
@@ -139,11 +141,11 @@ class ShardPages:
 
     def of_cell(self, index: int) -> int:
         """Return the page of a cell."""
-        return int(np.searchsorted(self._first, index, side="right")) - 1
+        return bisect.bisect_right(self._first, index) - 1
 
     def cells(self, page: int) -> range:
         """Indices of a page's cells."""
-        return range(int(self._first[page]), int(self._first[page + 1]))
+        return range(self._first[page], self._first[page + 1])
 
     def cells_surely_in(self, area: Area) -> int:
         """How many cells the pages have that lie wholly in an area."""
@@ -186,6 +188,15 @@ class ShardPages:
         """Page and row of a cell; `KeyError` if it is not here."""
         page = self._here[self.of_cell(index)]
         return page, index - page.first
+
+    def boxes_of(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(K, 4) float64, boxes of these cells; `KeyError` if one is not here."""
+        boxes = np.empty((len(indices), 4))
+        numbers = np.searchsorted(self.root.first_indices, indices, side="right") - 1
+        for number in np.unique(numbers).tolist():
+            page, inside = self._here[number], numbers == number
+            boxes[inside] = page.shard.boxes[indices[inside] - page.first]
+        return boxes
 
     def find(self, name: bytes) -> int | None:
         """Index of a known cell by what follows the map's prefix in its id."""
@@ -297,7 +308,7 @@ class ShardPages:
                     del self._by_base[base]
 
     def _page(self, number: int, shard: Shard) -> Page:
-        return Page.of(number, shard, int(self._first[number]))
+        return Page.of(number, shard, self._first[number])
 
     def _take(self, page: Page, names: list[dict[bytes, int]]) -> None:
         self._here[page.number] = page

@@ -202,9 +202,8 @@ class MapQueries:
                 return None
         if area is not None:
             touched = touched[touches(area, catalogue.boxes_of(touched))]
-        return touched[start : start + limit].tolist(), start + limit if start + limit < len(
-            touched
-        ) else None
+        end = start + limit
+        return touched[start:end].tolist(), end if end < len(touched) else None
 
     def _have_come(self, pages: Pages, needed: Sequence[int]) -> bool:
         """Whether these pages are here; else they are fetched.

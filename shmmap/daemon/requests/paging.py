@@ -23,7 +23,7 @@ from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 __all__ = ["Paging"]
 
 KEPT_S: Final = 0.02
-"""After a page that has to stay the next one is looked at so much later: that takes about a millisecond."""
+"""Pause after a page that has to stay: to find that out takes about a millisecond."""
 MOST_RETIRED: Final = 20_000
 """Retired segments that are looked through; of more, no page is given up."""
 
@@ -59,6 +59,7 @@ class Paging:
         if self._fd >= 0:
             self.watched.unwatch(self._fd)
             self.cells.map_changed()
+            self.adoption.map_changed(time.monotonic())
         pages = self._pages
         self._fd = pages.fd if pages is not None else -1
         if self._fd >= 0:
@@ -99,9 +100,9 @@ class Paging:
             self.scheduler.loads.forget_failures()
         self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
-            self.adoption.pages_came(time.monotonic())
+            self.adoption.pages_came(news.come, time.monotonic())
             if self.cache.layers.halo_m(self.cache.ledger.layers()):
-                self.map_switch.look_again()
+                self.map_switch.recheck()
         self.cells.pages_settled(news)
         self.scheduler.pages_settled()
         self.queries.pages_settled(news)
@@ -125,11 +126,11 @@ class Paging:
         if pages is None or page is None:
             return
         if self.is_needed(page):
-            pages.want((page,), BACKGROUND)  # it is another one's turn
+            pages.want((page,), BACKGROUND)  # put it last: another one is looked at next
             self._rests_until_s = now_s + KEPT_S
         else:
             pages.drop(page)
-            self.scheduler.prefetcher.look_again()
+            self.scheduler.prefetcher.restart()
 
     def is_needed(self, page: int) -> bool:
         """Whether a page has to stay."""

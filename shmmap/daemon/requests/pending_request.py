@@ -83,7 +83,7 @@ class PendingRequest:
     area
         What was asked about; None for a request by ids.
     message_cells
-        Memory that its message takes, as if it were so many cells.
+        Memory that its message takes, counted in cells.
     cells
         Catalogue index and layer of each handle to send, in reply order.
     catalogue

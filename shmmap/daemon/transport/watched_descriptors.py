@@ -45,7 +45,8 @@ class WatchedDescriptors:
 
     def unwatch(self, fd: int) -> None:
         """Stop watching; before the descriptor is closed."""
-        if self.callbacks.pop(fd, None) is not None:
+        callback = self.callbacks.pop(fd, None)  # it may be the last that has what closes the descriptor
+        if callback is not None:
             del self.kinds[fd]
             self._epoll.unregister(fd)
 

@@ -33,7 +33,7 @@ class MemoryPages:
     needed : list
         Pages that are here, least recently needed first.
     most : int
-        So many pages may be here.
+        How many pages may be here.
     """
 
     def __init__(self, boxes: NDArray[np.float64], counts: Sequence[int], known: Iterable[int]) -> None:

@@ -706,6 +706,22 @@ def test_segments_of_what_is_not_known_yet_are_set_aside(
     assert paged.count("loads_finished") - loaded == int(change)
 
 
+def test_what_is_set_aside_is_judged_by_a_later_version_that_knows_more(
+    paged: Paged, whole: Callable[..., WholeDaemon], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paged.know(WEST, EAST)
+    paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
+    paged.daemon.close(keep=True)
+    paged.origin.known = {WEST}
+    paged.daemon = whole(paged.directory.root, origin=paged.origin)
+    assert paged.count("adopted") == 8
+    monkeypatch.setattr(
+        paged.origin, "load", lambda **_words: PagedView(paged.origin.whole, PAGES, {WEST, EAST})
+    )
+    paged.read_again()
+    assert (paged.count("adopted"), paged.daemon.memory.cache.ledger.aside_bytes) == (16, 0)
+
+
 def test_what_is_set_aside_goes_with_the_daemon(paged: Paged, whole: Callable[..., WholeDaemon]) -> None:
     paged.know(WEST, EAST)
     paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))

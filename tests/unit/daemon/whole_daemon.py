@@ -113,7 +113,7 @@ class WholeDaemon:
         return decode_reply(self._client.recv())
 
     def close(self, *, keep: bool = False) -> None:
-        """End it once; ``keep`` leaves the segments to the next life."""
+        """End it once; ``keep`` leaves the segments to the next run."""
         if self._client.closed:
             return
         self._client.close()

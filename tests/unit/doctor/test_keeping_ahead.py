@@ -78,6 +78,11 @@ def driving(**values: int) -> dict[str, int]:
             "`shmmap tail` says why loads fail",
         ),
         (
+            driving(origin_out=1, last_outage_ns=S - 1),
+            "out", f"OUT OF REACH: no load has succeeded for less than a second; {AHEAD}",
+            "`shmmap tail` says why loads fail",
+        ),
+        (
             driving(cells_late_10min=1, last_outage_ns=13 * S + 1),
             "late",
             "NOT ENOUGH: 1 cell came late in the last 10 min; the map's files were out of reach for 13.0 s",

@@ -118,8 +118,8 @@ class Prefetch:
         self.more = True
         return None
 
-    def look_again(self) -> None:
-        """Begin all ways again: what lies on them is known better now."""
+    def restart(self) -> None:
+        """Begin all paths from the start: what lies on them is known better now."""
         self._catalogue = None
 
     def _compare_some(self, now_s: float) -> bool:

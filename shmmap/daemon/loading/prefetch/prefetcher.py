@@ -73,9 +73,9 @@ class Prefetcher:
         self._full_until_s = self._followed_s = -math.inf
         self._running: dict[Load, int] = {}
 
-    def look_again(self) -> None:
-        """More of the map is known, or less: look over all ways again."""
-        self.prefetch.look_again()
+    def restart(self) -> None:
+        """More of the map is known, or less: look along all paths from the start."""
+        self.prefetch.restart()
         self._next_s = -math.inf
 
     # --- clients ----------------------------------------------------------------------------------

@@ -437,4 +437,5 @@ def test_changes_are_known_only_where_both_are(served: Served) -> None:
     assert new.pages.lacking(old.pages) == [page]
     fetch(new.pages, [page])
     assert new.pages.lacking(old.pages) == []
-    assert new.changes_from(old).known
+    change = new.changes_from(old)
+    assert (change.known, change.ids("changed")) == (True, (f"/map/{name}",))
