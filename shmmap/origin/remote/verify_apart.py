@@ -79,6 +79,10 @@ class VerifyReply(msgspec.Struct):
     error: Outcome = msgspec.field(default_factory=Outcome)
 
 
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_REPLY: Final = msgspec.json.Decoder(VerifyReply)
+
+
 def read_trusted_root(path: str) -> bytes:
     """Return the bytes of a trusted root.
 
@@ -129,7 +133,7 @@ def verify_apart(settings: VerifySettings) -> Verified:
         with channel:
             channel.settimeout(_LONGEST_S)
             data, _ = receive_packet(channel, packet_buffer())
-            reply = msgspec.json.decode(data, type=VerifyReply) if data else None
+            reply = _REPLY.decode(data) if data else None
     except TimeoutError:
         raise Offline(f"{settings.url}: it took more than {_LONGEST_S:.0f} s to verify it") from None
     finally:
