@@ -29,6 +29,7 @@ __all__ = [
     "Tag",
     "is_loopback",
     "is_url",
+    "put_over",
     "read_url",
 ]
 
@@ -114,6 +115,11 @@ class Store(ObjectReader, Protocol):
 
     def delete(self, path: str) -> None:
         """Remove an object; one that is not there is no error."""
+
+
+def put_over(store: Store, path: str, data: bytes, seen: Tag | None) -> bool:
+    """Replace the state of an object that was seen, None: there was none; False if it has another one now."""
+    return store.put_new(path, data) if seen is None else store.put_if(path, data, seen)
 
 
 @dataclass(frozen=True, slots=True)

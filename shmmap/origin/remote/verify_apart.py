@@ -15,13 +15,12 @@ import msgspec
 
 from shmmap.errors import ConfigError, InternalError, Offline
 from shmmap.origin.reading_apart import Outcome
-from shmmap.origin.remote.map_versions import Current
+from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, Current
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import how_ended, start_child
 
 __all__ = ["Verified", "VerifyReply", "VerifySettings", "read_trusted_root", "verify_apart"]
 
-MAX_ROOT_OF_TRUST: Final = 512_000
 _LONGEST_S: Final = 300.0
 
 
@@ -93,12 +92,12 @@ def read_trusted_root(path: str) -> bytes:
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
-            data = file.read(MAX_ROOT_OF_TRUST + 1)
+            data = file.read(MAX_METADATA_BYTES + 1)
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}", key="trust", hint="it is the ROOT.json that `publish --sign` makes"
         ) from None
-    if len(data) > MAX_ROOT_OF_TRUST:
+    if len(data) > MAX_METADATA_BYTES:
         raise ConfigError(f"{path} is too large for a root of trust", key="trust")
     return data
 
