@@ -74,7 +74,11 @@ def add_parser(subparsers: Subparsers) -> None:
         help="sign a signed map's timestamp again, and its snapshot in time; needs --sign",
     )
     parser.add_argument(
-        "--keep", metavar="DAYS", type=_days, default=None, help="with --prune: 7 or more (default: 30)"
+        "--keep",
+        metavar="DAYS",
+        type=_days,
+        default=None,
+        help="with --prune: how many days, 7 or more (default: 30)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_sign_option(parser)
