@@ -64,9 +64,9 @@ def prune_versions(
     Raises
     ------
     BadRequest
-        ``keep_days`` is too few, the store takes nothing, or another version is signed than is current.
+        ``keep_days`` is too few, the store is read-only, or another version is signed than is current.
     MapMissing, MapDataError, Offline
-        Nothing is published there; a version that is kept cannot be read, so that nobody knows what it has.
+        Nothing is published there; a version that is kept cannot be read: its objects are unknown.
     """
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")

@@ -145,7 +145,7 @@ def publish_map(
     Raises
     ------
     BadRequest
-        A layer is unknown, the prefix is not that of the versions before, or the store takes nothing.
+        A layer is unknown, the prefix is not that of the versions before, or the store is read-only.
     Offline, CannotWrite, MapDataError
         The store does not answer or refuses; its current version is damaged; it took longer than a day.
     InstanceBusy

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signing a published map: its keys, and the metadata that names its current version.
 
-Three keys: ``root.pem`` names the others, is needed to make and to rotate them, and belongs off line;
+Three keys: ``root.pem`` names the others, is needed to make and to rotate them, and belongs offline;
 ``targets.pem`` signs versions, where one publishes; ``online.pem`` signs snapshot and timestamp, which is all
 that a refresh needs.  What vehicles trust is ``ROOT.json``.  A version is current as soon as the timestamp
-names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired by the next one who signs.
+names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired when the map is signed next.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class MapSigner:
     ConfigError
         A key can be read by others, is not a key, or is not the one that the root of trust names.
     BadRequest
-        The map is signed, and these are not its keys; or the store takes nothing.
+        The map is signed, and these are not its keys; or the store is read-only.
     MapDataError
         What is signed there is damaged, or signed by other keys.
     """

@@ -53,7 +53,7 @@ class BucketStore:
         self.url = where.text
         self._scheme = where.scheme
         self.read_only = (
-            "a web server takes nothing: publish to its directory, or to the bucket behind it"
+            "a web server cannot be written to: publish to its directory, or to the bucket behind it"
             if where.scheme in WEB_SCHEMES
             else ""
         )
@@ -66,7 +66,7 @@ class BucketStore:
         return self._read(path, max_bytes)[0]
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object of so many bytes."""
+        """Return an object of exactly ``nbytes`` bytes."""
         return self._read(path, nbytes, exact=True)[0]
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
@@ -214,13 +214,13 @@ def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bo
     plain = endpoint.lower().startswith("http://")
     if plain and not insecure and not is_loopback(_host(endpoint)):
         raise BadRequest(
-            f"{where.text}: plain http:// can be read and changed on its way",
+            f"{where.text}: plain http:// can be read and changed in transit",
             hint="use https://, or --insecure-http",
         )
     client: dict[str, Any] = {
         "connect_timeout": timedelta(seconds=patience.connect_s),
         "read_timeout": timedelta(seconds=patience.read_s),
-        "timeout": timedelta(days=1),  # of a whole body, whose length nobody knows beforehand
+        "timeout": timedelta(days=1),  # of a whole body, whose length is not known beforehand
         "allow_http": plain,
         "user_agent": "shmmap",
     }

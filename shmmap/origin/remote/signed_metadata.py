@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The signed metadata of a published map: what names its current version in a way that nobody else can.
+"""The signed metadata of a published map: it names the current version, and only its keys can write it.
 
 It is TUF's (The Update Framework), read and written with python-tuf, whose rules are those of its
 specification; what is of this map is in ORIGIN.md.  Importing this module takes a third of a second and
@@ -129,7 +129,7 @@ def newest_root(store: Store, trusted: bytes) -> Metadata[Root]:
 
 
 def read_signed_state(store: Store, root: Metadata[Root]) -> SignedState | None:
-    """Return what is signed there, for whoever signs the next: signatures are verified, expiry is not judged.
+    """Return what is signed there, before the next is signed: signatures are verified, expiry is not judged.
 
     None: nothing is signed yet.
 

@@ -57,7 +57,7 @@ class ObjectReader(Protocol):
         """Where it is, as a person would name it."""
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object of so many bytes.
+        """Return an object of exactly ``nbytes`` bytes.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Patience:
 
 
 HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
-"""For what somebody waits for: a server that says nothing is asked once more, as is one that falls silent."""
+"""For requests that wait: a server that says nothing is asked once more, as is one that falls silent."""
 PROBE: Final = Patience(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
 """To find out whether a server is back."""
 PATIENT: Final = Patience(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
@@ -178,7 +178,7 @@ def read_url(text: str) -> StoreUrl:
         parts = urlsplit(text)
         host, _ = parts.hostname or "", parts.port
     except ValueError:
-        raise BadRequest(f"no {scheme}:// URL can be read from what was given") from None
+        raise BadRequest(f"this is no valid {scheme}:// URL") from None
     if "@" in parts.netloc or parts.query or parts.fragment or "?" in text or "#" in text:
         raise BadRequest(
             f"a {scheme}:// URL with a user, a query or a fragment is not taken: it may hold a secret",

@@ -34,7 +34,7 @@ class VerifySettings(msgspec.Struct, frozen=True):
     trust
         Path of the trusted root.
     state_dir
-        Where is kept what was seen: what is older is refused from then on.
+        Where what was seen is kept: what is older is refused from then on.
     """
 
     url: str
@@ -103,7 +103,7 @@ def read_trusted_root(path: str) -> bytes:
 
 
 def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
-    """Return where is kept what was seen signed at a URL under a root of trust."""
+    """Return the directory of what was seen signed at a URL under a root of trust."""
     of = msgspec.msgpack.encode([url, sha256(trusted).hexdigest()])
     return os.path.join(state_dir, "trust", sha256(of).hexdigest()[:32])
 
@@ -117,7 +117,7 @@ def verify_apart(settings: VerifySettings) -> Verified:
         What is offered is refused; ``cause`` is ``unsigned``, ``older``, ``expired``, ``altered`` or
         ``foreign_root``.
     ConfigError
-        The trusted root is none.
+        The trusted root cannot be read, or is no root of trust.
     PackageMissing
         Without python-tuf.
     Offline

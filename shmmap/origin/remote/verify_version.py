@@ -100,7 +100,7 @@ def _updater(store: Store, trusted: bytes, memory: str) -> tuple[Updater, list[S
         return Updater(memory, _URL, fetcher=Fetcher(), config=config, bootstrap=trusted), failed
     except RepositoryError as error:
         raise ConfigError(
-            f"the root of trust is none: {error}",
+            f"this is no root of trust: {error}",
             key="trust",
             hint="it is the ROOT.json that `publish --sign` makes",
         ) from None

@@ -111,7 +111,7 @@ def test_a_web_server_reads_a_directory(web: tuple[str, Path]) -> None:
     with pytest.raises(MapMissing):
         store.get("CURRENT", 99)
     for write in (lambda: store.put_new("CURRENT", b""), lambda: list(store.list("versions/"))):
-        with pytest.raises(BadRequest, match="a web server takes nothing"):
+        with pytest.raises(BadRequest, match="a web server cannot be written to"):
             write()
 
 
@@ -147,7 +147,7 @@ def test_a_directory_that_cannot_be_written_is_an_error_with_a_hint(tmp_path: Pa
         open_store(str(tmp_path / "file" / "map")).put("blobs/sha256/aa", b"")
 
 
-def test_what_is_no_file_waits_for_nobody(tmp_path: Path) -> None:
+def test_what_is_no_file_never_blocks(tmp_path: Path) -> None:
     store = open_store(str(tmp_path))
     os.mkfifo(tmp_path / "CURRENT")
     assert bytes(store.get("CURRENT", 9)) == b""
@@ -287,7 +287,7 @@ def test_answers_become_errors_without_secrets(
     assert SECRET not in "".join(traceback.format_exception(error.value))
 
 
-def test_a_certificate_that_nobody_vouches_for(tmp_path: Path) -> None:
+def test_a_certificate_that_no_authority_vouches_for(tmp_path: Path) -> None:
     pytest.importorskip("obstore", reason="obstore is not installed")
     if shutil.which("openssl") is None:
         pytest.skip("openssl is missing")
