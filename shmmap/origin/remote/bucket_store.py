@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar, cast
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
 from shmmap.optional_packages import needed_packages
 from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
-from shmmap.origin.remote.store import WEB_SCHEMES, Listed, Patience, StoreUrl, Tag, is_loopback
+from shmmap.origin.remote.store import WEB_SCHEMES, Listed, StoreUrl, Tag, Timeouts, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 with needed_packages("a map in a bucket or at a web server"):
@@ -48,7 +48,7 @@ class BucketStore:
     """
 
     def __init__(
-        self, where: StoreUrl, *, patience: Patience, insecure_http: bool, instance_credentials: bool
+        self, where: StoreUrl, *, timeouts: Timeouts, insecure_http: bool, instance_credentials: bool
     ) -> None:
         self.url = where.text
         self._scheme = where.scheme
@@ -57,7 +57,7 @@ class BucketStore:
             if where.scheme in WEB_SCHEMES
             else ""
         )
-        self._store = _opened(where, patience, insecure=insecure_http, instance=instance_credentials)
+        self._store = _opened(where, timeouts, insecure=insecure_http, instance=instance_credentials)
 
     # --- reading --------------------------------------------------------------------------------
 
@@ -208,7 +208,7 @@ def _out_of_reach(name: str, text: str) -> Offline:
     return Offline(f"{name}: no answer", hint=_AGAIN)
 
 
-def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bool) -> Any:
+def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Any:
     environment = os.environ
     endpoint = where.text if where.scheme in WEB_SCHEMES else _endpoint(where.scheme)
     plain = endpoint.lower().startswith("http://")
@@ -218,15 +218,15 @@ def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bo
             hint="use https://, or --insecure-http",
         )
     client: dict[str, Any] = {
-        "connect_timeout": timedelta(seconds=patience.connect_s),
-        "read_timeout": timedelta(seconds=patience.read_s),
+        "connect_timeout": timedelta(seconds=timeouts.connect_s),
+        "read_timeout": timedelta(seconds=timeouts.read_s),
         "timeout": timedelta(days=1),  # of a whole body, whose length is not known beforehand
         "allow_http": plain,
         "user_agent": "shmmap",
     }
     retry: dict[str, Any] = {
-        "max_retries": patience.retries,
-        "retry_timeout": timedelta(seconds=patience.retry_s),
+        "max_retries": timeouts.retries,
+        "retry_timeout": timedelta(seconds=timeouts.retry_s),
         "backoff": {
             "init_backoff": timedelta(milliseconds=50),
             "max_backoff": timedelta(seconds=5),

@@ -17,16 +17,16 @@ from shmmap.errors import BadRequest
 
 __all__ = [
     "BUCKET_SCHEMES",
-    "HASTY",
-    "PATIENT",
+    "LONG_RUN",
     "PROBE",
+    "SERVING",
     "WEB_SCHEMES",
     "Listed",
     "ObjectReader",
-    "Patience",
     "Store",
     "StoreUrl",
     "Tag",
+    "Timeouts",
     "is_loopback",
     "is_url",
     "put_over",
@@ -123,8 +123,8 @@ def put_over(store: Store, path: str, data: bytes, seen: Tag | None) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
-    """How long is waited for a server, in seconds: to connect, for more bytes, and with all retries."""
+class Timeouts:
+    """How long to wait for a server, in seconds: to connect, for more bytes, and with all retries."""
 
     connect_s: float
     read_s: float
@@ -132,11 +132,11 @@ class Patience:
     retry_s: float
 
 
-HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
+SERVING: Final = Timeouts(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
 """For requests that wait: a server that says nothing is asked once more, as is one that falls silent."""
-PROBE: Final = Patience(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
+PROBE: Final = Timeouts(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
 """To find out whether a server is back."""
-PATIENT: Final = Patience(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
+LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
 """For long runs."""
 
 
