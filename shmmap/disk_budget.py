@@ -182,7 +182,7 @@ def _order_of_removal(found: list[_Kept], limit_bytes: int) -> list[_Kept]:
 
 
 def mark_used(fd: int, status: os.stat_result) -> None:
-    """Say that a file is used now; costs nothing if that was said within the last minutes."""
+    """Mark a file as used now; costs nothing if that was done within the last minutes."""
     # a clock that was ahead by a day leaves stamps that are ahead
     if abs(time.time() - status.st_mtime) > _USED_AGAIN_S:
         with contextlib.suppress(OSError):

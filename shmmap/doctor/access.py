@@ -22,6 +22,7 @@ from shmmap.errors import (
     ShmmapError,
     SocketPermission,
 )
+from shmmap.origin.remote.store import is_url
 from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.quantities import counted
 
@@ -184,7 +185,7 @@ def check_map_access(patient: Patient) -> Finding:
                 "moved without the metadata? the daemon's log names them, and so does `shmmap inspect`",
             )
         return ok(name, f"{path} is being served")
-    if "://" in path:
+    if is_url(path):
         return ok(name, f"{path} is looked for when the daemon starts")
     if not os.path.exists(path):
         try:

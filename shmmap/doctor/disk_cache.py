@@ -39,7 +39,7 @@ def check_disk_cache(patient: Patient) -> Finding:
     if why := _why_not_used(patient, place, status.st_uid):
         return warn(
             name,
-            f"{why}: objects of published maps are not kept there, so there is no map without a link",
+            f"{why}: objects of published maps are not kept there: no map without a connection",
             f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS}, or name another cache_dir",
         )
     budget = DiskBudget(str(directory), patient.config.cache_bytes, owner=uid)
@@ -53,7 +53,7 @@ def check_disk_cache(patient: Patient) -> Finding:
     if used < budget.limit_bytes and not budget.has_room(1):
         return warn(
             name,
-            f"{fact}: nothing more is kept, a twentieth of the disk is left to others",
+            f"{fact}: nothing more is kept, because 5 % of the disk stay free",
             "free some space, or name a cache_dir on another disk",
         )
     return ok(name, fact)

@@ -134,6 +134,10 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
             raise ValueError("its header makes no sense")
 
 
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_HEADER: Final = msgspec.json.Decoder(Header)
+
+
 def write_catalogue(
     file: IO[bytes],
     key: str,
@@ -207,7 +211,7 @@ def read_catalogue(
         raise ValueError("it is truncated")
     written = memoryview(bytearray(after_header - _START.size))
     columns.fill(written)
-    header = msgspec.json.decode(written[:header_bytes], type=Header)
+    header = _HEADER.decode(written[:header_bytes])
     header.check()
     shapes = header.columns()
     sizes = [dtype.itemsize * math.prod(shape) for dtype, shape in shapes]

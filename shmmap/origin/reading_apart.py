@@ -40,18 +40,22 @@ class Outcome(msgspec.Struct):
 
     @classmethod
     def of(cls, error: ShmmapError) -> Outcome:
-        """What is told of an error."""
+        """Describe an error."""
         found = cls(error.code, error.message, error.hint)
         if isinstance(error, MapDataError):
             found.path, found.offset, found.cause = error.path, error.offset, error.cause
         return found
 
     def raised(self) -> ShmmapError:
-        """Return the error that was told."""
+        """Return the error that is described."""
         error = error_from_wire(self.error, self.message, self.hint)
         if isinstance(error, MapDataError):
             error.path, error.offset, error.cause = self.path, self.offset, self.cause
         return error
+
+
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_OUTCOME: Final = msgspec.json.Decoder(Outcome)
 
 
 def read_apart(
@@ -92,7 +96,7 @@ def read_apart(
     try:
         with cast("IO[bytes]", process.stdout) as pipe:
             if line := pipe.readline():
-                outcome = msgspec.json.decode(line, type=Outcome)
+                outcome = _OUTCOME.decode(line)
                 if outcome.error:
                     raise outcome.raised()
                 return read_catalogue(pipe, before=before)[1]

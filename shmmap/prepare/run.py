@@ -19,7 +19,7 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.prepare import work
 from shmmap.prepare.task_pool import TaskPool
 
-__all__ = ["Failure", "PrepareProgress", "Prepared", "neighbours_of", "prepare_map"]
+__all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map", "task_of"]
 
 
 class PrepareProgress(Protocol):
@@ -64,7 +64,7 @@ class _Count:
         self._progress = progress
         self.result = Prepared(total)
 
-    def finished(self, task: work.CellWork, done: work.CellDone) -> None:
+    def finished(self, task: work.CellTask, done: work.CellDone) -> None:
         result = self.result
         for layer in done.layers:
             result.kept += layer.how == "kept"
@@ -75,7 +75,7 @@ class _Count:
                 result.failures.append(Failure(task.cell_id, layer.layer, layer.message))
         self._progress.advance(1)
 
-    def died(self, task: work.CellWork, how: str) -> None:
+    def died(self, task: work.CellTask, how: str) -> None:
         message = f"{task.source.name}: the worker died of it ({how})"
         self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
         self._progress.advance(1)
@@ -112,29 +112,20 @@ def prepare_map(
     cache = LayerCache(cache_dir, limit_bytes=cache_bytes)
     cache.make()
     versions = LayerVersions(lambda: catalogue)
-    recognise = not cache.is_empty
+    recognise = int(not cache.is_empty)
     crowded: list[Failure] = []
 
-    def tasks() -> Iterator[work.CellWork]:
+    def tasks() -> Iterator[work.CellTask]:
         for index in range(len(catalogue)):
-            around, refused = neighbours_of(catalogue, versions, index, names)
+            task, refused = task_of(catalogue, versions, index, names)
             crowded.extend(refused)
-            yield work.CellWork(
-                index,
-                catalogue.id(index),
-                catalogue.source(index),
-                catalogue.box(index),
-                catalogue.frame_id,
-                tuple(around),
-                tuple(around.values()),
-                recognise,
-            )
+            yield task
 
     progress.stage("prepare", len(catalogue))
     count = _Count(len(catalogue), progress)
     TaskPool(
         "shmmap.prepare.worker",
-        [cache_dir, str(cache_bytes)],
+        [cache_dir, str(cache_bytes), str(recognise)],
         workers=max(1, workers),
         decode=work.decode_done,
         finished=count.finished,
@@ -146,10 +137,10 @@ def prepare_map(
     return count.result
 
 
-def neighbours_of(
+def task_of(
     catalogue: Catalogue, versions: LayerVersions, index: int, layers: Sequence[str]
-) -> tuple[dict[str, tuple[Neighbour, ...]], list[Failure]]:
-    """Return the cells that each of these layers of a cell looks into, and which would look into too many."""
+) -> tuple[work.CellTask, list[Failure]]:
+    """Return the task of making these layers of a cell, without those that would look into too many cells."""
     around: dict[str, tuple[Neighbour, ...]] = {}
     crowded: list[Failure] = []
     for layer in layers:
@@ -161,4 +152,13 @@ def neighbours_of(
             around[layer] = tuple(
                 Neighbour.of(catalogue.id(i), catalogue.source(i), catalogue.box(i)) for i in near
             )
-    return around, crowded
+    task = work.CellTask(
+        index,
+        catalogue.id(index),
+        catalogue.source(index),
+        catalogue.box(index),
+        catalogue.frame_id,
+        tuple(around),
+        tuple(around.values()),
+    )
+    return task, crowded

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the preparing process and its workers say to each other: one packet, one message."""
+"""What the preparing process and its workers say to each other: one packet, one message.
+
+Publishing gives its workers the same tasks.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,11 @@ import msgspec
 from shmmap.layers.derive import Neighbour
 from shmmap.segment.source import Source
 
-__all__ = ["CellDone", "CellWork", "FromWorker", "LayerDone", "Ready", "decode_done", "decode_work", "encode"]
+__all__ = ["CellDone", "CellTask", "FromWorker", "LayerDone", "Ready", "decode_done", "decode_task", "encode"]
 
 
-class CellWork(msgspec.Struct, array_like=True, tag="cell"):
-    """Prepare these layers of a cell; ``around`` are, for each layer, the cells it looks into.
-
-    ``recognise``: the cache may hold them under other states of the same files.
-    """
+class CellTask(msgspec.Struct, array_like=True, tag="cell"):
+    """Make these layers of a cell; ``around`` are, for each layer, the cells it looks into."""
 
     number: int
     cell_id: str
@@ -26,7 +26,6 @@ class CellWork(msgspec.Struct, array_like=True, tag="cell"):
     frame_id: str
     layers: tuple[str, ...]
     around: tuple[tuple[Neighbour, ...], ...]
-    recognise: bool
 
 
 class LayerDone(msgspec.Struct, array_like=True):
@@ -52,13 +51,13 @@ class Ready(msgspec.Struct, array_like=True, tag="ready"):
 FromWorker: TypeAlias = CellDone | Ready
 
 encode: Final = msgspec.msgpack.Encoder().encode
-_work: Final[msgspec.msgpack.Decoder[CellWork]] = msgspec.msgpack.Decoder(CellWork)
+_task: Final[msgspec.msgpack.Decoder[CellTask]] = msgspec.msgpack.Decoder(CellTask)
 _done: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
 
 
-def decode_work(data: bytes) -> CellWork:
+def decode_task(data: bytes) -> CellTask:
     """Return the message for a worker."""
-    return _work.decode(data)
+    return _task.decode(data)
 
 
 def decode_done(data: bytes) -> FromWorker:

@@ -36,8 +36,11 @@ _NICENESS: Final = 5
 _BLOCK_BYTES: Final = 1 << 20
 
 
-def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
-    """Have every layer of a cell in the cache; the file is read once for all computed layers."""
+def _prepare_cell(task: work.CellTask, cache: LayerCache, *, recognise: bool) -> work.CellDone:
+    """Have every layer of a cell in the cache; the file is read once for all computed layers.
+
+    ``recognise``: the cache may hold them under other states of the same files.
+    """
     done: dict[str, work.LayerDone] = {}
     missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []
     for name, around in zip(task.layers, task.around, strict=True):
@@ -50,7 +53,7 @@ def _prepare_cell(task: work.CellWork, cache: LayerCache) -> work.CellDone:
             done[name] = work.LayerDone(name, "kept", cache.size_of(key))
         else:
             missing.append((spec, job, key))
-    if missing and task.recognise:
+    if missing and recognise:
         digests: dict[str, bytes] = {}
         for entry in list(missing):
             spec, job, key = entry
@@ -133,16 +136,18 @@ def _digest(path: str) -> bytes:
 
 
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID CACHE_DIR CACHE_BYTES``."""
+    """Run with ``CHANNEL_FD PARENT_PID CACHE_DIR CACHE_BYTES RECOGNISE``, the last 0 or 1."""
     channel = socket.socket(fileno=int(arguments[0]))
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     os.nice(_NICENESS)
     cache = LayerCache(arguments[2], limit_bytes=int(arguments[3]))
+    recognise = bool(int(arguments[4]))
     try:
         channel.send(work.encode(work.Ready()))
         while data := channel.recv(MAX_PACKET_BYTES):
-            channel.send(work.encode(_prepare_cell(work.decode_work(data), cache)))
+            task = work.decode_task(data)
+            channel.send(work.encode(_prepare_cell(task, cache, recognise=recognise)))
     except (BrokenPipeError, ConnectionResetError):
         pass
     return 0

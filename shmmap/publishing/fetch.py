@@ -196,7 +196,7 @@ class _Fetch:
         corners = dict(entries)
         if any(corners[name] != corner for name, corner in entries):
             raise BadRequest(
-                "two cells have one file name and different places: a divided map cannot say that"
+                "two cells have one file name and different places: a divided map cannot express that"
             )
         text = metadata_text(_number_text(size_x), corners.items(), _number_text(size_y))
         with open(os.path.join(self._directory, METADATA_NAME), "w", encoding="utf-8") as file:
@@ -223,7 +223,7 @@ def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
         if (low + size == high).all():
             return size
     if np.ptp(sizes) > _SAME_M:
-        raise BadRequest("its cells are of different sizes: a divided map cannot say that")
+        raise BadRequest("its cells are of different sizes: a divided map cannot express that")
     return float(np.median(sizes))
 
 

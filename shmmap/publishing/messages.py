@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the publishing process and its workers send each other: one packet, one message."""
+"""What publishing workers are given and answer; their tasks are `shmmap.prepare.work.CellTask`."""
 
 from __future__ import annotations
 
@@ -7,20 +7,15 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from shmmap.layers.derive import Neighbour
 from shmmap.prepare.work import Ready
-from shmmap.segment.source import Source
 
 __all__ = [
     "CellSent",
-    "CellToSend",
     "LayerSent",
     "NotSent",
     "PublishSettings",
     "decode_sent",
     "decode_settings",
-    "decode_task",
-    "encode",
 ]
 
 
@@ -47,18 +42,6 @@ class PublishSettings(msgspec.Struct, array_like=True):
     known: str = ""
     is_first: bool = False
     encoding: str = ""
-
-
-class CellToSend(msgspec.Struct, array_like=True, tag="cell"):
-    """Publish these layers of a cell; ``around`` are, for each layer, the cells it looks into."""
-
-    number: int
-    cell_id: str
-    source: Source
-    box: tuple[float, float, float, float]
-    frame_id: str
-    layers: tuple[str, ...]
-    around: tuple[tuple[Neighbour, ...], ...]
 
 
 class LayerSent(msgspec.Struct, array_like=True):
@@ -93,20 +76,13 @@ class NotSent(msgspec.Struct, array_like=True, tag="not_sent"):
 
 FromWorker: TypeAlias = CellSent | NotSent | Ready
 
-encode: Final = msgspec.msgpack.Encoder().encode
 _settings: Final[msgspec.json.Decoder[PublishSettings]] = msgspec.json.Decoder(PublishSettings)
-_task: Final[msgspec.msgpack.Decoder[CellToSend]] = msgspec.msgpack.Decoder(CellToSend)
 _sent: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
 
 
 def decode_settings(text: str) -> PublishSettings:
     """Read a worker's argument."""
     return _settings.decode(text)
-
-
-def decode_task(data: bytes) -> CellToSend:
-    """Read the message for a worker."""
-    return _task.decode(data)
 
 
 def decode_sent(data: bytes) -> FromWorker:

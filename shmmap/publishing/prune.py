@@ -15,6 +15,7 @@ from typing import Any, Final
 from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import (
+    MAX_METADATA_BYTES,
     TIMESTAMP,
     Current,
     Entry,
@@ -34,7 +35,6 @@ KEEP_DAYS: Final = 30.0
 LEAST_KEEP_DAYS: Final = 7.0
 _DAY_S: Final = 86_400.0
 _BLOBS: Final = "blobs/"
-_MAX_METADATA_BYTES: Final = 512_000
 
 
 @dataclass(slots=True)
@@ -64,9 +64,9 @@ def prune_versions(
     Raises
     ------
     BadRequest
-        ``keep_days`` is too few, the store takes nothing, or another version is signed than is current.
+        ``keep_days`` is too few, the store is read-only, or another version is signed than is current.
     MapMissing, MapDataError, Offline
-        Nothing is published there; a version that is kept cannot be read, so that nobody knows what it has.
+        Nothing is published there; a version that is kept cannot be read: its objects are unknown.
     """
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")
@@ -90,7 +90,7 @@ def _require_signed(store: Store, current: Current) -> None:
     """Refuse where a signed map's metadata, which is not verified for this, names another version."""
 
     def read(path: str) -> dict[str, Any]:
-        signed: dict[str, Any] = json.loads(bytes(store.get(path, _MAX_METADATA_BYTES)))["signed"]
+        signed: dict[str, Any] = json.loads(bytes(store.get(path, MAX_METADATA_BYTES)))["signed"]
         return signed
 
     if store.head(TIMESTAMP) is None:

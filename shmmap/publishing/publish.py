@@ -49,10 +49,11 @@ from shmmap.origin.remote.published_index import (
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
-from shmmap.prepare.run import Failure, PrepareProgress, neighbours_of
+from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import TaskPool
+from shmmap.prepare.work import CellTask
 from shmmap.publishing.known_objects import write_known_objects
-from shmmap.publishing.messages import CellSent, CellToSend, NotSent, PublishSettings, decode_sent
+from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent
 from shmmap.publishing.sending import send_object
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
 from shmmap.publishing.worker import TASKS_AHEAD
@@ -144,7 +145,7 @@ def publish_map(
     Raises
     ------
     BadRequest
-        A layer is unknown, the prefix is not that of the versions before, or the store takes nothing.
+        A layer is unknown, the prefix is not that of the versions before, or the store is read-only.
     Offline, CannotWrite, MapDataError
         The store does not answer or refuses; its current version is damaged; it took longer than a day.
     InstanceBusy
@@ -280,24 +281,16 @@ class _Run:
         objects = CellObjects(len(catalogue), self._names)
         versions = LayerVersions(lambda: catalogue)
 
-        def tasks() -> Iterator[CellToSend]:
+        def tasks() -> Iterator[CellTask]:
             for index in range(len(catalogue)):
-                around, crowded = neighbours_of(catalogue, versions, index, self._names)
+                task, crowded = task_of(catalogue, versions, index, self._names)
                 if crowded:
                     result.failures.extend(crowded)
                     self._progress.advance(1)
-                    continue
-                yield CellToSend(
-                    index,
-                    catalogue.id(index),
-                    catalogue.source(index),
-                    catalogue.box(index),
-                    catalogue.frame_id,
-                    tuple(around),
-                    tuple(around.values()),
-                )
+                else:
+                    yield task
 
-        def finished(task: CellToSend, done: CellSent | NotSent) -> None:
+        def finished(task: CellTask, done: CellSent | NotSent) -> None:
             if isinstance(done, CellSent):
                 objects.set(task.number, done)
                 for layer in done.layers:
@@ -308,13 +301,13 @@ class _Run:
                 result.failures.append(Failure(task.cell_id, done.layer, done.message))
             self._progress.advance(1)
 
-        def died(task: CellToSend, how: str) -> None:
+        def died(task: CellTask, how: str) -> None:
             message = f"{task.source.name}: the worker died of it ({how})"
             result.failures.append(Failure(task.cell_id, ", ".join(task.layers), message))
             self._progress.advance(1)
 
         self._progress.stage("publish", len(catalogue))
-        pool: TaskPool[CellToSend, CellSent | NotSent] = TaskPool(
+        pool: TaskPool[CellTask, CellSent | NotSent] = TaskPool(
             "shmmap.publishing.worker",
             [msgspec.json.encode(settings).decode()],
             workers=workers,

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signing a published map: its keys, and the metadata that names its current version.
 
-Three keys: ``root.pem`` names the others, is needed to make and to rotate them, and belongs off line;
+Three keys: ``root.pem`` names the others, is needed to make and to rotate them, and belongs offline;
 ``targets.pem`` signs versions, where one publishes; ``online.pem`` signs snapshot and timestamp, which is all
 that a refresh needs.  What vehicles trust is ``ROOT.json``.  A version is current as soon as the timestamp
-names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired by the next one who signs.
+names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired when the map is signed next.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from shmmap.failpoints import step
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.origin.remote.map_versions import (
     CURRENT,
+    MAX_METADATA_BYTES,
     TIMESTAMP,
     Current,
     CurrentState,
     Entry,
+    changed_meanwhile,
     entry_path,
     new_entry_now,
     pack_json,
@@ -35,7 +37,7 @@ from shmmap.origin.remote.map_versions import (
 )
 from shmmap.origin.remote.signed_metadata import (
     FOREIGN_ROOT,
-    MAX_BYTES,
+    TARGET,
     SignedState,
     metadata_path,
     newest_root,
@@ -43,7 +45,7 @@ from shmmap.origin.remote.signed_metadata import (
     refused,
     target_of,
 )
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.store import Store, put_over
 
 __all__ = ["LIFETIMES", "ROOT_FILE", "MapSigner", "Refreshed"]
 
@@ -55,8 +57,8 @@ LIFETIMES: Final = {
     Timestamp.type: timedelta(days=7),
 }
 _KEYS: Final = {Root.type: "root", Targets.type: "targets", Snapshot.type: "online", Timestamp.type: "online"}
-_MOST_TRIES: Final = 1000
-_MOST_KEY_BYTES: Final = 1 << 16
+_MAX_TRIES: Final = 1000
+_MAX_KEY_BYTES: Final = 1 << 16
 _Role = TypeVar("_Role", Root, Timestamp, Snapshot, Targets)
 
 
@@ -82,7 +84,7 @@ class MapSigner:
     ConfigError
         A key can be read by others, is not a key, or is not the one that the root of trust names.
     BadRequest
-        The map is signed, and these are not its keys; or the store takes nothing.
+        The map is signed, and these are not its keys; or the store is read-only.
     MapDataError
         What is signed there is damaged, or signed by other keys.
     """
@@ -103,7 +105,7 @@ class MapSigner:
                 )
             self._make_keys()
         with open(root_file, "rb") as file:
-            self.trusted = file.read(MAX_BYTES + 1)
+            self.trusted = file.read(MAX_METADATA_BYTES + 1)
         self._root = newest_root(store, self.trusted)
         self._check_origin()
 
@@ -122,13 +124,13 @@ class MapSigner:
         return self._repaired()
 
     def _repaired(self) -> CurrentState:
-        for _ in range(_MOST_TRIES):
+        for _ in range(_MAX_TRIES):
             seen = read_current(self._store)  # before: so it is never ahead of what is signed
             state = self._state()
             if state is None or state.current == seen.current:
                 return seen
             self._repair(state.current, seen)
-        raise InstanceBusy(f"others change {self._store.url} all the time")
+        raise InstanceBusy(f"other publishers keep changing {self._store.url}", hint="try again later")
 
     def switch(self, entry: Entry) -> None:
         """Sign a new version, whose entry is made, and have ``CURRENT`` follow.
@@ -180,37 +182,27 @@ class MapSigner:
         one stays.
         """
         state, made = self._state(), None
-        for _ in range(_MOST_TRIES):
-            if current is not None and state is not None:
-                is_same = state.current == current
-                if not is_same and state.current.version != before:
-                    raise InstanceBusy(
-                        f"another publisher has changed {self._store.url} meanwhile: its version stays, this"
-                        " one is not served",
-                        hint="run the same command again: what was sent is not sent again",
-                    )
-            else:
-                is_same = state is not None
-            if current is None:
-                assert state is not None  # noqa: S101  a refresh has looked
-            targets = state.targets if state is not None else None
-            if current is not None and (targets is None or not is_same or _is_half_over(targets)):
+        for _ in range(_MAX_TRIES):
+            named = state.current if state is not None else None
+            if current is not None and named is not None and named != current and named.version != before:
+                raise changed_meanwhile(self._store)
+            targets = seen = state.targets if state is not None else None
+            if current is not None and (targets is None or named != current or _is_half_over(targets)):
                 if made is None:
-                    made = self._add(Targets, targets, Targets(targets={"root": target_of(current)}))
+                    made = self._add(Targets, targets, Targets(targets={TARGET: target_of(current)}))
                 targets = made
-            assert targets is not None  # noqa: S101
+            assert targets is not None  # noqa: S101  a refresh has looked
             snapshot = state.snapshot if state is not None else None
-            if snapshot is None or state is None or targets is not state.targets or _is_half_over(snapshot):
+            if snapshot is None or targets is not seen or _is_half_over(snapshot):
                 meta = {f"{Targets.type}.json": MetaFile(targets.signed.version)}
                 snapshot = self._add(Snapshot, snapshot, Snapshot(meta=meta))
-            is_whole = state is not None and snapshot is state.snapshot and current is not None
-            if is_whole and state is not None and not _is_half_over(state.timestamp):
-                return state
+            elif state is not None and current is not None and not _is_half_over(state.timestamp):
+                return state  # a refresh signs the timestamp again in any case
             written = self._write_timestamp(state, snapshot, targets)
             if written is not None:
                 return written
             state = self._state()  # a refresh came between, or another version
-        raise InstanceBusy(f"others sign {self._store.url} all the time", hint="try again later")
+        raise InstanceBusy(f"other publishers keep signing {self._store.url}", hint="try again later")
 
     def _write_timestamp(
         self, state: SignedState | None, snapshot: Metadata[Snapshot], targets: Metadata[Targets]
@@ -225,11 +217,7 @@ class MapSigner:
         )
         data = self._signed_bytes(signed)
         step("sign.timestamp")
-        if state is None:
-            written = self._store.put_new(TIMESTAMP, data)
-        else:
-            written = self._store.put_if(TIMESTAMP, data, state.tag)
-        if not written:
+        if not put_over(self._store, TIMESTAMP, data, state.tag if state is not None else None):
             return None
         return SignedState(Metadata.from_bytes(data), {}, snapshot, targets)
 
@@ -237,7 +225,7 @@ class MapSigner:
         """Write metadata under the next free number: those that were never named are passed over."""
         signed.expires = _now() + LIFETIMES[kind.type]
         first = before.signed.version + 1 if before is not None else 1
-        for number in range(first, first + _MOST_TRIES):
+        for number in range(first, first + _MAX_TRIES):
             signed.version = number
             data = self._signed_bytes(signed)
             step("sign.metadata")
@@ -255,12 +243,12 @@ class MapSigner:
         number = Metadata[Root].from_bytes(self.trusted).signed.version
         path = metadata_path(Root.type, number)
         try:
-            found = bytes(self._store.get(path, MAX_BYTES))
+            found = bytes(self._store.get(path, MAX_METADATA_BYTES))
         except MapMissing:
             step("sign.root")
             if self._store.put_new(path, self.trusted):
                 return
-            found = bytes(self._store.get(path, MAX_BYTES))
+            found = bytes(self._store.get(path, MAX_METADATA_BYTES))
         if found != self.trusted:
             raise refused(
                 f"{self._store.url}/{path}",
@@ -286,25 +274,16 @@ class MapSigner:
             entry = new_entry_now(current, earlier if earlier < current.version else 0)
             store.put_new(entry_path(current.version), pack_json(entry))
         step("sign.repaired")
-        data = pack_json(current)
-        if seen.tag is None:
-            store.put_new(CURRENT, data)
-        else:
-            store.put_if(CURRENT, data, seen.tag)
+        put_over(store, CURRENT, pack_json(current), seen.tag)
 
     def _follow(self, current: Current) -> None:
         """Have ``CURRENT`` say this version, unless a later one is signed already."""
-        for _ in range(_MOST_TRIES):
+        for _ in range(_MAX_TRIES):
             seen = read_current(self._store)
             if seen.current is not None and seen.current.version >= current.version:
                 return
             step("sign.switch")
-            data = pack_json(current)
-            if seen.tag is None:
-                done = self._store.put_new(CURRENT, data)
-            else:
-                done = self._store.put_if(CURRENT, data, seen.tag)
-            if done:
+            if put_over(self._store, CURRENT, pack_json(current), seen.tag):
                 return
 
     # --- keys -----------------------------------------------------------------------------------
@@ -353,7 +332,7 @@ def _read_key(directory: str, name: str) -> CryptoSigner:
     try:
         with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
             status = os.fstat(file.fileno())
-            data = file.read(_MOST_KEY_BYTES)
+            data = file.read(_MAX_KEY_BYTES)
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}", hint="this key is needed here; a refresh needs online.pem alone"

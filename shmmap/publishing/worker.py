@@ -37,19 +37,16 @@ from shmmap.origin.remote.published_object import (
     read_bare_header,
 )
 from shmmap.origin.remote.store import Store
-from shmmap.prepare.work import Ready
+from shmmap.prepare.work import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import (
     CellSent,
-    CellToSend,
     LayerSent,
     NotSent,
     decode_settings,
-    decode_task,
-    encode,
 )
 from shmmap.publishing.rounded_files import RoundedFiles
 from shmmap.publishing.sending import send_object
@@ -94,7 +91,7 @@ class CellMaker:
         self._cache = cache if not millimetres else None  # which was made of exact points
         self._reader = RoundedFiles() if millimetres else FILES
 
-    def make(self, task: CellToSend) -> _Cell:
+    def make(self, task: CellTask) -> _Cell:
         """Make the objects of a cell's layers; `LayerRefused` where one cannot be made."""
         specs = [layer_spec(name) for name in task.layers]
         source = CellPoints(task.source, task.box, specs, self._reader)

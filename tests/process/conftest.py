@@ -16,6 +16,7 @@ from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_daemon import SETTINGS, LiveDaemon
 from tests.support.map_stores import _buckets, buckets, web  # noqa: F401  fixtures
+from tests.support.publishing_verbs import Shmmap
 from tests.support.raw_client import RawClient
 
 RESOLUTION = 0.2  # that of ``live_drive``, which compiles kernels: before pytest has said where they are kept
@@ -48,6 +49,12 @@ def private_tmpfs(tmp_path: Path) -> Iterator[Callable[[str], str]]:
     yield mount
     for path in mounted:
         subprocess.run(["umount", path], check=True)
+
+
+@pytest.fixture
+def shmmap(tmp_path: Path) -> Shmmap:
+    """The command line without a daemon, with a home of its own."""
+    return Shmmap(tmp_path)
 
 
 @pytest.fixture

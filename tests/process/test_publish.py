@@ -10,7 +10,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,17 +22,12 @@ from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.published_map_reader import PublishedMapReader, columns_of
-from tests.support.publishing_verbs import Shmmap
+from tests.support.publishing_verbs import Shmmap, files_of, locked
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 NDT = "ndt(leaf=2.0,min_points=3)"
 DAY_S = 86_400
-
-
-@pytest.fixture
-def shmmap(tmp_path: Path) -> Shmmap:
-    return Shmmap(tmp_path)
 
 
 @pytest.fixture
@@ -81,10 +75,6 @@ def check(store: Path, town: DividedMap, prefix: str = "/store/") -> PublishedMa
         assert cell.points == len(xyz)
         assert cell.z == (xyz[:, 2].min(), xyz[:, 2].max())
     return read
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 # --- what is published --------------------------------------------------------------------------------
@@ -332,36 +322,25 @@ def test_of_two_publishers_one_wins_and_the_other_learns_it(
     assert back in (files_of(town.pcd_dir), files_of(other.pcd_dir))
 
 
-HOLDING = """
-import fcntl, sys
-file = open(sys.argv[1], "w")
-fcntl.flock(file, fcntl.LOCK_EX)
-print("held", flush=True)
-sys.stdin.read()
-"""
+def before_its_switch(shmmap: Shmmap, town: DividedMap, store: Path) -> subprocess.Popen[str]:
+    """A publisher of version 2 that waits for the store's lock."""
+    process = shmmap.start("publish", town.root, store)
+    while not (store / "versions/2.json").exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    return process
 
 
 def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
     """It is stopped before its switch, while the other one publishes."""
     town.change("0_0.pcd", seed=1)
-    hold = subprocess.Popen(
-        [sys.executable, "-c", HOLDING, str(store / ".lock")],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert hold.stdout is not None
-    assert hold.stdout.readline() == "held\n"
-    slow = shmmap.start("publish", town.root, store)
-    while not (store / "versions/2.json").exists():
-        assert slow.poll() is None
-        time.sleep(0.01)
-    # what another publisher would have made current meanwhile
-    faster = json.loads((store / "CURRENT").read_bytes()) | {"version": 3}
-    entry = json.loads((store / "versions/1.json").read_bytes())
-    (store / "versions/3.json").write_text(json.dumps({**entry, "version": 3, "before": 1}))
-    (store / "CURRENT").write_text(json.dumps(faster))
-    hold.communicate("")
+    with locked(store):
+        slow = before_its_switch(shmmap, town, store)
+        # what another publisher would have made current meanwhile
+        faster = json.loads((store / "CURRENT").read_bytes()) | {"version": 3}
+        entry = json.loads((store / "versions/1.json").read_bytes())
+        (store / "versions/3.json").write_text(json.dumps({**entry, "version": 3, "before": 1}))
+        (store / "CURRENT").write_text(json.dumps(faster))
     _, errors = slow.communicate()
     assert slow.returncode == 75, errors
     assert "another publisher has changed" in errors
@@ -373,21 +352,10 @@ def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: Divi
 
 def test_an_interrupted_run_says_how_to_go_on(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
     town.change("0_0.pcd", seed=1)
-    hold = subprocess.Popen(
-        [sys.executable, "-c", HOLDING, str(store / ".lock")],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert hold.stdout is not None
-    assert hold.stdout.readline() == "held\n"
-    process = shmmap.start("publish", town.root, store)
-    while not (store / "versions/2.json").exists():
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate()
-    hold.communicate("")
+    with locked(store):
+        process = before_its_switch(shmmap, town, store)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate()
     assert process.returncode == 130
     assert "the same command continues" in errors
     assert json.loads((store / "CURRENT").read_bytes())["version"] == 1
@@ -547,8 +515,8 @@ def test_fetched_files_have_every_field_bit_by_bit(
     shmmap("fetch", f"{url}/town", tmp_path / "back", "--force")
     assert files_of(tmp_path / "back/pointcloud_map.pcd") == files_of(town.pcd_dir)
     assert [row["version"] for row in shmmap.json("versions", f"{url}/town")["versions"]] == [2, 1]
-    assert "a web server takes nothing" in shmmap("publish", town.root, f"{url}/town", code=2)
-    assert "a web server takes nothing" in shmmap("versions", f"{url}/town", "--prune", code=2)
+    assert "a web server cannot be written to" in shmmap("publish", town.root, f"{url}/town", code=2)
+    assert "a web server cannot be written to" in shmmap("versions", f"{url}/town", "--prune", code=2)
     assert not list(tmp_path.glob(".*fetching*"))
 
 

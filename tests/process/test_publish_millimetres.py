@@ -19,11 +19,6 @@ LAYERS = ("ndt(leaf=2.0,min_points=3)", "voxel(leaf=0.5)", "elevation(resolution
 
 
 @pytest.fixture
-def shmmap(tmp_path: Path) -> Shmmap:
-    return Shmmap(tmp_path)
-
-
-@pytest.fixture
 def town(tmp_path: Path) -> DividedMap:
     return make_map(tmp_path / "town", columns=2, rows=1, points=2000)
 

@@ -8,7 +8,6 @@ import shutil
 import signal
 import stat
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -17,25 +16,12 @@ import pytest
 from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.publishing_verbs import Shmmap
+from tests.support.publishing_verbs import Shmmap, locked
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("tuf", reason="tuf is not installed")
 
 from tests.support.signed_map import Signed, in_days, read_signed
-
-HOLDING = """
-import fcntl, sys
-file = open(sys.argv[1], "w")
-fcntl.flock(file, fcntl.LOCK_EX)
-print("held", flush=True)
-sys.stdin.read()
-"""
-
-
-@pytest.fixture
-def shmmap(tmp_path: Path) -> Shmmap:
-    return Shmmap(tmp_path)
 
 
 @pytest.fixture
@@ -67,7 +53,7 @@ def names(store: Path) -> set[str]:
     return {path.name for path in store.glob("*.json")}
 
 
-def test_the_first_time_makes_keys_that_nobody_else_reads(store: Path, keys: Path) -> None:
+def test_the_first_time_makes_keys_that_no_other_user_reads(store: Path, keys: Path) -> None:
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in keys.iterdir()}
     assert modes.pop("ROOT.json") & 0o444
     assert modes == {"root.pem": 0o600, "targets.pem": 0o600, "online.pem": 0o600}
@@ -312,32 +298,22 @@ def test_of_two_publishers_one_wins(
     assert rows["current"] == done["version"] == 1 + codes.count(0)
 
 
-def held_at_the_timestamp(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
-) -> tuple[subprocess.Popen[str], subprocess.Popen[str]]:
-    """A publisher that has written its snapshot and waits for the store's lock, and what holds that."""
-    hold = subprocess.Popen(
-        [sys.executable, "-c", HOLDING, str(store / ".lock")],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert hold.stdout is not None
-    assert hold.stdout.readline() == "held\n"
+def before_its_timestamp(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> subprocess.Popen[str]:
+    """A publisher that has written its snapshot and waits for the store's lock."""
     slow = shmmap.start("publish", town.root, store, "--sign", keys)
     while not (store / "2.snapshot.json").exists():
         assert slow.poll() is None
         time.sleep(0.01)
-    return slow, hold
+    return slow
 
 
 def test_a_refresh_that_comes_between_costs_nothing(
     shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
 ) -> None:
     town.change("0_0.pcd", seed=1)
-    slow, hold = held_at_the_timestamp(shmmap, town, store, keys)
-    Signed(store, keys).write("timestamp", version=2)
-    hold.communicate("")
+    with locked(store):
+        slow = before_its_timestamp(shmmap, town, store, keys)
+        Signed(store, keys).write("timestamp", version=2)
     _, errors = slow.communicate()
     assert slow.returncode == 0, errors
     signed = read_signed(store, keys)
@@ -348,15 +324,15 @@ def test_the_slower_of_two_publishers_changes_nothing(
     shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
 ) -> None:
     town.change("0_0.pcd", seed=1)
-    slow, hold = held_at_the_timestamp(shmmap, town, store, keys)
-    other = Signed(store, keys)
-    other.target.unrecognized_fields["custom"]["map_version"] = 9
-    other.write("targets", version=5)
-    other.snapshot.signed.meta["targets.json"].version = 5
-    other.write("snapshot", version=5)
-    other.timestamp.signed.snapshot_meta.version = 5
-    other.write("timestamp", version=2)
-    hold.communicate("")
+    with locked(store):
+        slow = before_its_timestamp(shmmap, town, store, keys)
+        other = Signed(store, keys)
+        other.target.unrecognized_fields["custom"]["map_version"] = 9
+        other.write("targets", version=5)
+        other.snapshot.signed.meta["targets.json"].version = 5
+        other.write("snapshot", version=5)
+        other.timestamp.signed.snapshot_meta.version = 5
+        other.write("timestamp", version=2)
     _, errors = slow.communicate()
     assert slow.returncode == 75, errors
     assert "another publisher has changed" in errors

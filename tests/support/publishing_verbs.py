@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tests.support.daemon_process import ROOT
 
-__all__ = ["Shmmap"]
+__all__ = ["Shmmap", "files_of", "locked"]
 
 
 class Shmmap:
@@ -49,3 +51,16 @@ class Shmmap:
         found = json.loads(self(*words, "--json", code=code, env=env))
         assert isinstance(found, dict)
         return found
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """The files of a directory by name."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@contextmanager
+def locked(store: Path) -> Iterator[None]:
+    """Hold the lock of a store in a directory: no other process replaces ``CURRENT`` or the timestamp."""
+    with open(store / ".lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

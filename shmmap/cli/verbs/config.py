@@ -91,13 +91,14 @@ def run_check(args: argparse.Namespace) -> int:
     from shmmap.daemon.config import load_config
     from shmmap.daemon.config_file import installed_config_file
     from shmmap.daemon.prerequisites import access_of_segments
+    from shmmap.origin.remote.store import is_url
 
     file = args.file or installed_config_file()
     config = load_config({}, file=file)
     access_of_segments(config)
     if not config.map_path:
         raise ConfigError("no map is named", key="map_path", hint="set map_path, or give `shmmap serve MAP`")
-    if "://" not in config.map_path and not os.path.exists(config.map_path):
+    if not is_url(config.map_path) and not os.path.exists(config.map_path):
         raise MapMissing(f"there is no map at {config.map_path}", hint="map_path names it")
     if args.json:
         print_json({"file": file or None, "good": True})

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import argparse
 
+from shmmap.cli.map_layers import add_map_options, failure_rows, origin_at, print_failures, worker_count
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
     add_layer_option,
-    add_unit_options,
     add_verb,
-    at_least,
     size_bytes,
 )
 from shmmap.cli.screens.output import (
@@ -24,8 +23,6 @@ from shmmap.cli.screens.output import (
 )
 
 __all__ = ["add_parser", "run"]
-
-_SHOWN_FAILURES = 20
 
 _EPILOG = """\
 Layers computed before are kept; a stopped run, started again, continues where it was.  After a map was
@@ -51,18 +48,7 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
     add_layer_option(parser, "layers, such as 'ndt(leaf=2.0)' or points")
-    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
-    parser.add_argument(
-        "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
-    )
-    add_unit_options(parser)
-    parser.add_argument(
-        "--workers",
-        metavar="N",
-        type=at_least(0),
-        default=0,
-        help="number of processes (default: one for each core)",
-    )
+    add_map_options(parser)
     parser.add_argument("--cache-dir", metavar="DIR", default="", help="where layers are kept")
     parser.add_argument(
         "--cache-size",
@@ -80,7 +66,6 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.dividing.served_cloud import find_origin
     from shmmap.errors import BadRequest
     from shmmap.layers.spec import canonical_layers
     from shmmap.origin.sidecar import default_cache_directory
@@ -92,10 +77,7 @@ def run(args: argparse.Namespace) -> int:
         raise BadRequest("--cache-size 0 keeps no layer", hint="name a size such as 512M or 2G")
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
-    origin = find_origin(
-        args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir,
-        unit=args.unit or "", vertical_unit=args.vertical_unit or "",
-    )  # fmt: skip
+    origin = origin_at(args, cache_dir)
     layers = canonical_layers(args.layer)
     catalogue = origin.load(fresh=True)
     done = prepare_map(
@@ -103,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         layers,
         cache_dir=cache_dir,
         cache_bytes=args.cache_size,
-        workers=args.workers or len(os.sched_getaffinity(0)),
+        workers=worker_count(args),
         progress=StageProgress(quiet=args.json, unit="cells", scale=1.0),
     )
     seconds = time.monotonic() - began_s
@@ -120,16 +102,11 @@ def run(args: argparse.Namespace) -> int:
                 "cache_dir": cache_dir,
                 "cache_bytes": done.cache_bytes,
                 "seconds": seconds,
-                "failed": [
-                    {"id": one.cell_id, "layer": one.layer, "message": one.message} for one in done.failures
-                ],
+                "failed": failure_rows(done.failures),
             }
         )
         return 1 if done.failures else 0
-    for failure in done.failures[:_SHOWN_FAILURES]:
-        print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
-    if len(done.failures) > _SHOWN_FAILURES:
-        print_line(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
+    print_failures(done.failures)
     if done.bytes > args.cache_size:
         print_line("note: the layers are larger than --cache-size: some were removed from the cache again")
     print_pairs(

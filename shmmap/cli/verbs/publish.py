@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import argparse
 
+from shmmap.cli.map_layers import add_map_options, failure_rows, origin_at, print_failures, worker_count
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
     add_layer_option,
-    add_unit_options,
     add_verb,
-    at_least,
 )
 from shmmap.cli.program import complain
 from shmmap.cli.screens.output import (
@@ -26,14 +25,12 @@ from shmmap.cli.store_options import add_sign_option, add_store_options, signer_
 
 __all__ = ["add_parser", "run"]
 
-_SHOWN_FAILURES = 20
-
 _EPILOG = """\
 URL is s3://BUCKET/PATH, gs://BUCKET/PATH, az://CONTAINER/PATH, file:///DIR or a directory, which any web
 server can serve.  Credentials come from the environment, from $CREDENTIALS_DIRECTORY, or from a profile.
 Only what the current version does not have is sent.  The new version becomes current at once, at the end; a
 stopped run, started again, sends only what is missing.
---sign: keys are made in KEYDIR at first; give ROOT.json to vehicles, take root.pem off line, and have the
+--sign: keys are made in KEYDIR at first; give ROOT.json to vehicles, take root.pem offline, and have the
 map signed again within 7 days: `shmmap versions URL --refresh --sign KEYDIR`.
 JSON (fields may be added, none is removed):
   {"map", "url", "changed", "version": the current one, "map_version": hex, "root": hash of its object,
@@ -71,22 +68,11 @@ def add_parser(subparsers: Subparsers) -> None:
         help="mm: points are rounded to millimetres, and take half the bytes (default: as in the version"
         " before, at first exact)",
     )
-    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
-    parser.add_argument(
-        "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
-    )
-    add_unit_options(parser)
+    add_map_options(parser)
     parser.add_argument(
         "--resend",
         action="store_true",
         help="send every object again, also those that should be there: repairs a damaged store",
-    )
-    parser.add_argument(
-        "--workers",
-        metavar="N",
-        type=at_least(0),
-        default=0,
-        help="number of processes (default: one for each core)",
     )
     parser.add_argument(
         "--cache-dir", metavar="DIR", default="", help="where layers made by `shmmap prepare` are kept"
@@ -103,7 +89,6 @@ def run(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.dividing.served_cloud import find_origin
     from shmmap.layers.spec import canonical_layers
     from shmmap.origin.sidecar import default_cache_directory
 
@@ -114,10 +99,7 @@ def run(args: argparse.Namespace) -> int:
     layers = canonical_layers(args.layer) if args.layer else ()
     cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
     began_s = time.monotonic()
-    origin = find_origin(
-        args.map_path, metadata=args.metadata or "", strict=args.strict, cache_dir=cache_dir,
-        unit=args.unit or "", vertical_unit=args.vertical_unit or "",
-    )  # fmt: skip
+    origin = origin_at(args, cache_dir)
     catalogue = origin.load(fresh=True)
     signer = signer_at(store, args, make_keys=True)
     try:
@@ -133,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
                 encoding=args.encoding,
             ),
             id_prefix=args.id_prefix,
-            workers=args.workers or len(os.sched_getaffinity(0)),
+            workers=worker_count(args),
             resend=args.resend,
             signer=signer,
             progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
@@ -160,20 +142,15 @@ def run(args: argparse.Namespace) -> int:
                 "sent_objects": done.sent_objects,
                 "sent_bytes": done.sent_bytes,
                 "seconds": seconds,
-                "failed": [
-                    {"id": one.cell_id, "layer": one.layer, "message": one.message} for one in done.failures
-                ],
+                "failed": failure_rows(done.failures),
                 "notes": list(catalogue.problems),
             }
         )
         return 1 if done.failures else 0
     for problem in catalogue.problems:
         print_line(f"note: {problem}")
-    for failure in done.failures[:_SHOWN_FAILURES]:
-        print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
+    print_failures(done.failures)
     if done.failures:
-        if len(done.failures) > _SHOWN_FAILURES:
-            print_line(f"failed: {len(done.failures) - _SHOWN_FAILURES:,} more")
         print_line("nothing is published: the current version stays as it was")
         return 1
     changed = "" if done.version is not None else ": nothing has changed"

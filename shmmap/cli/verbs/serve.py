@@ -7,6 +7,7 @@ import argparse
 import os
 
 from shmmap.cli.options import Subparsers, add_unit_options, add_verb
+from shmmap.cli.store_options import add_access_options
 
 __all__ = ["add_parser", "run"]
 
@@ -98,31 +99,19 @@ def add_parser(subparsers: Subparsers) -> None:
         "--poll",
         metavar="SECONDS",
         dest="poll_s",
-        help="how often it is asked whether there is another version; 0: only when a reload is asked for "
-        "(default: 60)",
+        help="how often to look for a new version; 0: only on `shmmap reload` (default: 60)",
     )
     published.add_argument(
         "--catalogue-budget",
         metavar="BYTES",
-        help="most of the daemon's memory for the list of cells (default: 256M, a million cells)",
+        help="most memory for the list of cells (default: 256M, a million cells)",
     )
     published.add_argument(
         "--accept-version",
         metavar="N",
-        help="take version N although a later one was taken before",
+        help="accept version N although a later one was served before",
     )
-    published.add_argument(
-        "--insecure-http",
-        action="store_true",
-        default=None,
-        help="take plain http:// from beyond this machine: it can be read and changed on its way",
-    )
-    published.add_argument(
-        "--instance-credentials",
-        action="store_true",
-        default=None,
-        help="ask the cloud's metadata address for credentials if none are given",
-    )
+    add_access_options(published, default=None)  # the configuration file may say
     limits = parser.add_argument_group("limits")
     limits.add_argument(
         "--budget",

@@ -29,6 +29,8 @@ from shmmap.cli.store_options import (
 if TYPE_CHECKING:
     from shmmap.origin.remote.store import Store
     from shmmap.origin.remote.verify_apart import Verified
+    from shmmap.prepare.run import PrepareProgress
+    from shmmap.publishing.signing import MapSigner
 
 __all__ = ["add_parser", "run"]
 
@@ -71,10 +73,14 @@ def add_parser(subparsers: Subparsers) -> None:
     what.add_argument(
         "--refresh",
         action="store_true",
-        help="sign a signed map's timestamp again, and its snapshot in time; needs --sign",
+        help="renew a signed map's timestamp, and its snapshot when due; needs --sign",
     )
     parser.add_argument(
-        "--keep", metavar="DAYS", type=_days, default=None, help="with --prune: 7 or more (default: 30)"
+        "--keep",
+        metavar="DAYS",
+        type=_days,
+        default=None,
+        help="with --prune: how many days, 7 or more (default: 30)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_sign_option(parser)
@@ -94,7 +100,7 @@ def _days(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List, restore or prune."""
+    """List, roll back, refresh or prune."""
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
 
@@ -111,65 +117,75 @@ def run(args: argparse.Namespace) -> int:
     unit = "objects" if args.prune else "cells"
     progress = StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
     if args.rollback is not None:
-        from shmmap.publishing.restore import restore_version
-
-        restored = restore_version(store, args.rollback, progress, signer)
-        if args.json:
-            print_json(
-                {
-                    "url": store.url,
-                    "changed": restored.version is not None,
-                    "version": restored.current,
-                    "restored": restored.restored,
-                    "objects": restored.objects,
-                }
-            )
-        elif restored.version is None:
-            print_line(f"version {restored.current} has that content: nothing has changed")
-        else:
-            print_line(f"version {restored.version} is current: the content of version {restored.restored}")
-        return 0
-    if signer is not None:
-        refreshed = signer.refresh()
-        valid = {
-            "timestamp": refreshed.timestamp,
-            "snapshot": refreshed.snapshot,
-            "targets": refreshed.targets,
-        }
-        if args.json:
-            print_json(
-                {
-                    "url": store.url,
-                    "version": refreshed.current.version,
-                    "valid_until": {role: until.isoformat() for role, until in valid.items()},
-                }
-            )
-        else:
-            print_line(f"version {refreshed.current.version} is signed")
-            print_pairs([(role, f"until {until:%Y-%m-%d %H:%M} UTC") for role, until in valid.items()])
-        return 0
-    if args.prune:
-        from shmmap.publishing.prune import KEEP_DAYS, prune_versions
-
-        pruned = prune_versions(
-            store, keep_days=KEEP_DAYS if args.keep is None else args.keep, progress=progress
-        )
-        if args.json:
-            from dataclasses import asdict
-
-            print_json({"url": store.url, **asdict(pruned)})
-            return 0
-        removed = f"{counted(pruned.objects, 'object')}, {format_bytes(pruned.bytes)}"
-        kept = f"{counted(pruned.kept_objects, 'object')}, {format_bytes(pruned.kept_bytes)}"
-        print_pairs(
-            [
-                ("removed", f"{_numbers(pruned.versions)}; {removed}"),
-                ("kept", f"{_numbers(pruned.kept_versions)}; {kept}"),
-            ]
-        )
-        return 0
-    _list(store, verified_at(store, args), as_json=args.json)
+        _roll_back(store, args.rollback, progress, signer, as_json=args.json)
+    elif signer is not None:
+        _refresh(store, signer, as_json=args.json)
+    elif args.prune:
+        _prune(store, args.keep, progress, as_json=args.json)
+    else:
+        _list(store, verified_at(store, args), as_json=args.json)
     return 0
+
+
+def _roll_back(
+    store: Store, version: int, progress: PrepareProgress, signer: MapSigner | None, *, as_json: bool
+) -> None:
+    from shmmap.publishing.restore import restore_version
+
+    restored = restore_version(store, version, progress, signer)
+    if as_json:
+        print_json(
+            {
+                "url": store.url,
+                "changed": restored.version is not None,
+                "version": restored.current,
+                "restored": restored.restored,
+                "objects": restored.objects,
+            }
+        )
+    elif restored.version is None:
+        print_line(f"version {restored.current} has that content: nothing has changed")
+    else:
+        print_line(f"version {restored.version} is current: the content of version {restored.restored}")
+
+
+def _refresh(store: Store, signer: MapSigner, *, as_json: bool) -> None:
+    refreshed = signer.refresh()
+    valid = {
+        "timestamp": refreshed.timestamp,
+        "snapshot": refreshed.snapshot,
+        "targets": refreshed.targets,
+    }
+    if as_json:
+        print_json(
+            {
+                "url": store.url,
+                "version": refreshed.current.version,
+                "valid_until": {role: until.isoformat() for role, until in valid.items()},
+            }
+        )
+        return
+    print_line(f"version {refreshed.current.version} is signed")
+    print_pairs([(role, f"until {until:%Y-%m-%d %H:%M} UTC") for role, until in valid.items()])
+
+
+def _prune(store: Store, keep_days: float | None, progress: PrepareProgress, *, as_json: bool) -> None:
+    from shmmap.publishing.prune import KEEP_DAYS, prune_versions
+
+    pruned = prune_versions(store, keep_days=KEEP_DAYS if keep_days is None else keep_days, progress=progress)
+    if as_json:
+        from dataclasses import asdict
+
+        print_json({"url": store.url, **asdict(pruned)})
+        return
+    removed = f"{counted(pruned.objects, 'object')}, {format_bytes(pruned.bytes)}"
+    kept = f"{counted(pruned.kept_objects, 'object')}, {format_bytes(pruned.kept_bytes)}"
+    print_pairs(
+        [
+            ("removed", f"{_numbers(pruned.versions)}; {removed}"),
+            ("kept", f"{_numbers(pruned.kept_versions)}; {kept}"),
+        ]
+    )
 
 
 def _numbers(versions: list[int]) -> str:

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar, cast
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
 from shmmap.optional_packages import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
-from shmmap.origin.remote.store import WEB_SCHEMES, Listed, Patience, StoreUrl, Tag, is_loopback
+from shmmap.origin.remote.store import WEB_SCHEMES, Listed, StoreUrl, Tag, Timeouts, is_loopback
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 with needed_packages("a map in a bucket or at a web server", together=FOR_REMOTE):
@@ -49,16 +49,16 @@ class BucketStore:
     """
 
     def __init__(
-        self, where: StoreUrl, *, patience: Patience, insecure_http: bool, instance_credentials: bool
+        self, where: StoreUrl, *, timeouts: Timeouts, insecure_http: bool, instance_credentials: bool
     ) -> None:
         self.url = where.text
         self._scheme = where.scheme
         self.read_only = (
-            "a web server takes nothing: publish to its directory, or to the bucket behind it"
+            "a web server cannot be written to: publish to its directory, or to the bucket behind it"
             if where.scheme in WEB_SCHEMES
             else ""
         )
-        self._store = _opened(where, patience, insecure=insecure_http, instance=instance_credentials)
+        self._store = _opened(where, timeouts, insecure=insecure_http, instance=instance_credentials)
 
     # --- reading --------------------------------------------------------------------------------
 
@@ -67,7 +67,7 @@ class BucketStore:
         return self._read(path, max_bytes)[0]
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object of so many bytes."""
+        """Return an object of exactly ``nbytes`` bytes."""
         return self._read(path, nbytes, exact=True)[0]
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
@@ -209,25 +209,25 @@ def _out_of_reach(name: str, text: str) -> Offline:
     return Offline(f"{name}: no answer", hint=_SILENT)
 
 
-def _opened(where: StoreUrl, patience: Patience, *, insecure: bool, instance: bool) -> Any:
+def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Any:
     environment = os.environ
     endpoint = where.text if where.scheme in WEB_SCHEMES else _endpoint(where.scheme)
     plain = endpoint.lower().startswith("http://")
     if plain and not insecure and not is_loopback(_host(endpoint)):
         raise BadRequest(
-            f"{where.text}: plain http:// can be read and changed on its way",
+            f"{where.text}: plain http:// can be read and changed in transit",
             hint="use https://, or --insecure-http",
         )
     client: dict[str, Any] = {
-        "connect_timeout": timedelta(seconds=patience.connect_s),
-        "read_timeout": timedelta(seconds=patience.read_s),
-        "timeout": timedelta(days=1),  # of a whole body, whose length nobody knows beforehand
+        "connect_timeout": timedelta(seconds=timeouts.connect_s),
+        "read_timeout": timedelta(seconds=timeouts.read_s),
+        "timeout": timedelta(days=1),  # of a whole body, whose length is not known beforehand
         "allow_http": plain,
         "user_agent": "shmmap",
     }
     retry: dict[str, Any] = {
-        "max_retries": patience.retries,
-        "retry_timeout": timedelta(seconds=patience.retry_s),
+        "max_retries": timeouts.retries,
+        "retry_timeout": timedelta(seconds=timeouts.retry_s),
         "backoff": {
             "init_backoff": timedelta(milliseconds=50),
             "max_backoff": timedelta(seconds=5),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Credentials for buckets: from the environment, the service manager or a profile, never from the network.
 
-obstore reads the environment itself.  What it would do without any is ask the cloud's metadata address, which
-on a vehicle is a wait for nobody, or for somebody else: so that is done only where it was configured.
+obstore reads the environment itself.  Without any it would ask the cloud's metadata address, where on a
+vehicle nothing answers, or a stranger does: so that is done only where it was configured.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class DirectoryStore:
         return self._read(path, max_bytes)
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return a file of so many bytes."""
+        """Return a file of exactly ``nbytes`` bytes."""
         return self._read(path, nbytes, exact=True)
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:

@@ -22,16 +22,18 @@ from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES, Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.published_object import blob_path
-from shmmap.origin.remote.store import ObjectReader, Store, Tag
+from shmmap.origin.remote.store import ObjectReader, Store, Tag, put_over
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 __all__ = [
     "CURRENT",
+    "MAX_METADATA_BYTES",
     "TIMESTAMP",
     "Current",
     "CurrentState",
     "Entry",
     "add_version",
+    "changed_meanwhile",
     "earlier_versions",
     "entry_path",
     "list_entries",
@@ -54,11 +56,13 @@ __all__ = [
 CURRENT: Final = "CURRENT"
 TIMESTAMP: Final = "timestamp.json"
 """Of a signed map: `shmmap.origin.remote.signed_metadata`."""
+MAX_METADATA_BYTES: Final = 512_000
+"""Most bytes of each object of a signed map's metadata."""
 ENTRIES: Final = "versions/"
 _ENTRY: Final = re.compile(r"versions/([1-9]\d{0,18})\.json")
 _MAX_JSON_BYTES: Final = 64 << 10
 _READ_AT_ONCE: Final = 32
-_MOST_VERSIONS: Final = 1_000_000
+_MAX_VERSIONS: Final = 1_000_000
 _Named = TypeVar("_Named", bound=msgspec.Struct)
 
 
@@ -200,7 +204,7 @@ def list_entries(store: Store) -> list[int]:
 def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
     """The entries of what is and was current, the latest first; ends where the one before has no entry."""
     version = current.version
-    for _ in range(_MOST_VERSIONS):
+    for _ in range(_MAX_VERSIONS):
         try:
             entry = read_entry(store, version)
         except MapMissing:
@@ -300,13 +304,17 @@ def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:
     """
     data = pack_json(entry.current)
     step("version.switch")
-    switched = store.put_new(CURRENT, data) if seen.tag is None else store.put_if(CURRENT, data, seen.tag)
-    if not switched:
-        raise InstanceBusy(
-            f"another publisher has changed {store.url} meanwhile: its version stays, this one is not served",
-            hint="run the same command again: what was sent is not sent again",
-        )
+    if not put_over(store, CURRENT, data, seen.tag):
+        raise changed_meanwhile(store)
     step("version.switched")
+
+
+def changed_meanwhile(store: Store) -> InstanceBusy:
+    """Return the error of a publisher whose version is not served: another one has made its own current."""
+    return InstanceBusy(
+        f"another publisher has changed {store.url} meanwhile: its version stays, this one is not served",
+        hint="run the same command again: what was sent is not sent again",
+    )
 
 
 def pack_json(value: Current | Entry) -> bytes:

@@ -141,7 +141,7 @@ class ObjectTier:
                     self._trimmer = trimmer
 
     def mark_index_used(self, digests: Iterable[bytes]) -> None:
-        """Say that index pages are those of the version in use: they are kept before others."""
+        """Mark the index pages of the version in use: they are kept before others."""
         with contextlib.suppress(OSError), self._opened() as place:
             for digest in digests:
                 with contextlib.suppress(OSError):
@@ -197,7 +197,7 @@ def _path(digest: bytes, is_index: bool) -> str:
 
 
 def _read(place: int, path: str, nbytes: int) -> bytes:
-    """Read a file of so many bytes into memory; whatever else is there gives other bytes, and never waits."""
+    """Read a file of ``nbytes`` bytes into memory; anything else gives other bytes, and never waits."""
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=place)
     try:
         status = os.fstat(fd)

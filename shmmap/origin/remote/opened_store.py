@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from shmmap.origin.remote.directory_store import DirectoryStore
-from shmmap.origin.remote.store import PATIENT, Patience, Store, read_url
+from shmmap.origin.remote.store import LONG_RUN, Store, Timeouts, read_url
 
 __all__ = ["open_store"]
 
@@ -12,7 +12,7 @@ __all__ = ["open_store"]
 def open_store(
     url: str,
     *,
-    patience: Patience = PATIENT,
+    timeouts: Timeouts = LONG_RUN,
     insecure_http: bool = False,
     instance_credentials: bool = False,
 ) -> Store:
@@ -40,5 +40,5 @@ def open_store(
     from shmmap.origin.remote.bucket_store import BucketStore
 
     return BucketStore(
-        where, patience=patience, insecure_http=insecure_http, instance_credentials=instance_credentials
+        where, timeouts=timeouts, insecure_http=insecure_http, instance_credentials=instance_credentials
     )

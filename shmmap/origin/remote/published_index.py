@@ -119,7 +119,7 @@ class ShardFields(msgspec.Struct, frozen=True):
 
 # made here, once: msgspec ends the process if threads are the first to decode a type at the same time
 _DECODERS: Final[dict[Any, Any]] = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in (_Head, RootFields, LayerFields, ShardFields)
+    kind: msgspec.msgpack.Decoder(kind) for kind in (_Head, RootFields, ShardFields)
 }
 
 

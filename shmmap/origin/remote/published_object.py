@@ -2,7 +2,7 @@
 """A layer of a cell as it is published: a segment without its identity, its columns as planes of bytes.
 
 What names the cell (id, box, frame, source) is left out: so the same points give the same object wherever
-and whenever they are published.  Whoever loads it puts it back.  ``ORIGIN.md`` is the byte-exact document.
+and whenever they are published.  A reader puts it back.  ``ORIGIN.md`` is the byte-exact document.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def pack_object(unpacked: bytes | bytearray, content: bytes) -> tuple[ObjectName
 
 
 def _moved(header: SegmentHeader, shift: int) -> SegmentHeader:
-    """Make the header longer by so many bytes: the columns move."""
+    """Make the header longer by ``shift`` bytes: the columns move."""
     return msgspec.structs.replace(
         header,
         header_bytes=header.header_bytes + shift,
@@ -182,7 +182,7 @@ def _flagged(page: bytes, flags: int, mm_origin: bytes) -> bytearray:
 
 
 def _plane_count(column: Column) -> int:
-    """Bytes of what counts as one row of a column: so many planes it is split into."""
+    """Bytes of what counts as one row of a column, which is also the number of planes it is split into."""
     itemsize = column.dtype.itemsize
     if len(column.shape) == 2 and 0 < column.shape[1] <= MAX_PLANED_COMPONENTS:
         return itemsize * column.shape[1]

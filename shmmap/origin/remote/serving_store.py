@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import HASTY, Patience, Store
+from shmmap.origin.remote.store import SERVING, Store, Timeouts
 
 __all__ = ["ServedFrom", "kept_objects", "open_for_serving"]
 
@@ -29,11 +29,11 @@ class ServedFrom(NamedTuple):
         return cls(url, *map(bool, flags))
 
 
-def open_for_serving(served: ServedFrom, patience: Patience = HASTY) -> Store:
+def open_for_serving(served: ServedFrom, timeouts: Timeouts = SERVING) -> Store:
     """Return the store, opened for requests that wait.  Errors are those of `open_store`."""
     return open_store(
         served.url,
-        patience=patience,
+        timeouts=timeouts,
         insecure_http=served.insecure_http,
         instance_credentials=served.instance_credentials,
     )

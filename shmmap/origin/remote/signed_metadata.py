@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The signed metadata of a published map: what names its current version in a way that nobody else can.
+"""The signed metadata of a published map: it names the current version, and only its keys can write it.
 
 It is TUF's (The Update Framework), read and written with python-tuf, whose rules are those of its
 specification; what is of this map is in ORIGIN.md.  Importing this module takes a third of a second and
@@ -15,7 +15,7 @@ from tuf.api.metadata import Metadata, Root, Snapshot, TargetFile, Targets, Time
 from tuf.api.serialization import DeserializationError
 
 from shmmap.errors import MapDataError, MapMissing
-from shmmap.origin.remote.map_versions import TIMESTAMP, Current
+from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP, Current
 from shmmap.origin.remote.published_index import MAX_ROOT_BYTES
 from shmmap.origin.remote.store import Store, Tag
 
@@ -23,7 +23,6 @@ __all__ = [
     "ALTERED",
     "EXPIRED",
     "FOREIGN_ROOT",
-    "MAX_BYTES",
     "OLDER",
     "TARGET",
     "UNSIGNED",
@@ -38,7 +37,6 @@ __all__ = [
 ]
 
 TARGET: Final = "root"
-MAX_BYTES: Final = 512_000  # of any of these objects
 _MAX_ROTATIONS: Final = 256
 _NUMBER: Final = "map_version"
 
@@ -118,7 +116,7 @@ def newest_root(store: Store, trusted: bytes) -> Metadata[Root]:
     for _ in range(_MAX_ROTATIONS):
         path = metadata_path(Root.type, root.signed.version + 1)
         try:
-            data = bytes(store.get(path, MAX_BYTES))
+            data = bytes(store.get(path, MAX_METADATA_BYTES))
         except MapMissing:
             break
         name = f"{store.url}/{path}"
@@ -131,7 +129,7 @@ def newest_root(store: Store, trusted: bytes) -> Metadata[Root]:
 
 
 def read_signed_state(store: Store, root: Metadata[Root]) -> SignedState | None:
-    """Return what is signed there, for whoever signs the next: signatures are verified, expiry is not judged.
+    """Return what is signed there, before the next is signed: signatures are verified, expiry is not judged.
 
     None: nothing is signed yet.
 
@@ -141,7 +139,7 @@ def read_signed_state(store: Store, root: Metadata[Root]) -> SignedState | None:
         Some of it is gone, damaged, or signed by other keys.
     """
     try:
-        data, tag = store.get_tagged(TIMESTAMP, MAX_BYTES)
+        data, tag = store.get_tagged(TIMESTAMP, MAX_METADATA_BYTES)
     except MapMissing:
         return None
     timestamp = _parse(Timestamp, bytes(data), f"{store.url}/{TIMESTAMP}", root)
@@ -161,7 +159,7 @@ def is_foreign(store: Store, trusted: bytes) -> bool:
     """Whether the root that a store has under the number of the trusted one is another one."""
     root: Metadata[Root] = Metadata.from_bytes(trusted)
     try:
-        found = store.get(metadata_path(Root.type, root.signed.version), MAX_BYTES)
+        found = store.get(metadata_path(Root.type, root.signed.version), MAX_METADATA_BYTES)
     except (MapMissing, MapDataError):
         return False
     return bytes(found) != trusted
@@ -171,7 +169,7 @@ def _read_numbered(store: Store, kind: type[_Role], number: int, root: Metadata[
     path = metadata_path(kind.type, number)
     name = f"{store.url}/{path}"
     try:
-        data = bytes(store.get(path, MAX_BYTES))
+        data = bytes(store.get(path, MAX_METADATA_BYTES))
     except MapMissing:
         raise refused(name, ALTERED, "it is not there") from None
     found = _parse(kind, data, name, root)

@@ -17,18 +17,19 @@ from shmmap.errors import BadRequest
 
 __all__ = [
     "BUCKET_SCHEMES",
-    "HASTY",
-    "PATIENT",
+    "LONG_RUN",
     "PROBE",
+    "SERVING",
     "WEB_SCHEMES",
     "Listed",
     "ObjectReader",
-    "Patience",
     "Store",
     "StoreUrl",
     "Tag",
+    "Timeouts",
     "is_loopback",
     "is_url",
+    "put_over",
     "read_url",
 ]
 
@@ -56,7 +57,7 @@ class ObjectReader(Protocol):
         """Where it is, as a person would name it."""
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object of so many bytes.
+        """Return an object of exactly ``nbytes`` bytes.
 
         Raises
         ------
@@ -116,9 +117,14 @@ class Store(ObjectReader, Protocol):
         """Remove an object; one that is not there is no error."""
 
 
+def put_over(store: Store, path: str, data: bytes, seen: Tag | None) -> bool:
+    """Replace the state of an object that was seen, None: there was none; False if it has another one now."""
+    return store.put_new(path, data) if seen is None else store.put_if(path, data, seen)
+
+
 @dataclass(frozen=True, slots=True)
-class Patience:
-    """How long is waited for a server, in seconds: to connect, for more bytes, and with all retries."""
+class Timeouts:
+    """How long to wait for a server, in seconds: to connect, for more bytes, and with all retries."""
 
     connect_s: float
     read_s: float
@@ -126,11 +132,11 @@ class Patience:
     retry_s: float
 
 
-HASTY: Final = Patience(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
-"""For what somebody waits for: a server that says nothing is asked once more, as is one that falls silent."""
-PROBE: Final = Patience(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
+SERVING: Final = Timeouts(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
+"""For requests that wait: a server that says nothing is asked once more, as is one that falls silent."""
+PROBE: Final = Timeouts(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
 """To find out whether a server is back."""
-PATIENT: Final = Patience(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
+LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
 """For long runs."""
 
 
@@ -172,7 +178,7 @@ def read_url(text: str) -> StoreUrl:
         parts = urlsplit(text)
         host, _ = parts.hostname or "", parts.port
     except ValueError:
-        raise BadRequest(f"no {scheme}:// URL can be read from what was given") from None
+        raise BadRequest(f"this is no valid {scheme}:// URL") from None
     if "@" in parts.netloc or parts.query or parts.fragment or "?" in text or "#" in text:
         raise BadRequest(
             f"a URL ({scheme}://) with a user, a query or a fragment is not taken: it may hold a secret",

@@ -68,6 +68,10 @@ class TakenVersion(msgspec.Struct, frozen=True):
         return Current(self.version, sha256(self.root).hexdigest(), len(self.root))
 
 
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_DECODER: Final = msgspec.msgpack.Decoder(TakenVersion)
+
+
 class TakenVersionFile:
     """Where the taken version of one instance, URL and root of trust is kept.
 
@@ -144,7 +148,7 @@ class TakenVersionFile:
         if version != _FORMAT:
             raise ValueError(f"its format is {version}, this program reads {_FORMAT}")
         try:
-            taken = msgspec.msgpack.decode(body[_HEAD.size :], type=TakenVersion)
+            taken = _DECODER.decode(body[_HEAD.size :])
         except msgspec.MsgspecError as error:
             raise ValueError(f"it is not what it should be: {error}") from None
         if (taken.instance, taken.url, taken.trust) != self._of:

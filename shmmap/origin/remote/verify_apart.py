@@ -15,13 +15,12 @@ import msgspec
 
 from shmmap.errors import ConfigError, InternalError, Offline
 from shmmap.origin.reading_apart import Outcome
-from shmmap.origin.remote.map_versions import Current
+from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, Current
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import how_ended, start_child
 
 __all__ = ["Verified", "VerifyReply", "VerifySettings", "read_trusted_root", "verify_apart"]
 
-MAX_ROOT_OF_TRUST: Final = 512_000
 _LONGEST_S: Final = 300.0
 
 
@@ -35,7 +34,7 @@ class VerifySettings(msgspec.Struct, frozen=True):
     trust
         Path of the trusted root.
     state_dir
-        Where is kept what was seen: what is older is refused from then on.
+        Where what was seen is kept: what is older is refused from then on.
     """
 
     url: str
@@ -79,6 +78,10 @@ class VerifyReply(msgspec.Struct):
     error: Outcome = msgspec.field(default_factory=Outcome)
 
 
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_REPLY: Final = msgspec.json.Decoder(VerifyReply)
+
+
 def read_trusted_root(path: str) -> bytes:
     """Return the bytes of a trusted root.
 
@@ -89,18 +92,18 @@ def read_trusted_root(path: str) -> bytes:
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
-            data = file.read(MAX_ROOT_OF_TRUST + 1)
+            data = file.read(MAX_METADATA_BYTES + 1)
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}", key="trust", hint="it is the ROOT.json that `publish --sign` makes"
         ) from None
-    if len(data) > MAX_ROOT_OF_TRUST:
+    if len(data) > MAX_METADATA_BYTES:
         raise ConfigError(f"{path} is too large for a root of trust", key="trust")
     return data
 
 
 def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
-    """Return where is kept what was seen signed at a URL under a root of trust."""
+    """Return the directory of what was seen signed at a URL under a root of trust."""
     of = msgspec.msgpack.encode([url, sha256(trusted).hexdigest()])
     return os.path.join(state_dir, "trust", sha256(of).hexdigest()[:32])
 
@@ -114,7 +117,7 @@ def verify_apart(settings: VerifySettings) -> Verified:
         What is offered is refused; ``cause`` is ``unsigned``, ``older``, ``expired``, ``altered`` or
         ``foreign_root``.
     ConfigError
-        The trusted root is none.
+        The trusted root cannot be read, or is no root of trust.
     PackageMissing
         Without python-tuf.
     Offline
@@ -129,7 +132,7 @@ def verify_apart(settings: VerifySettings) -> Verified:
         with channel:
             channel.settimeout(_LONGEST_S)
             data, _ = receive_packet(channel, packet_buffer())
-            reply = msgspec.json.decode(data, type=VerifyReply) if data else None
+            reply = _REPLY.decode(data) if data else None
     except TimeoutError:
         raise Offline(f"{settings.url}: it took more than {_LONGEST_S:.0f} s to verify it") from None
     finally:

@@ -23,10 +23,9 @@ from shmmap.errors import ConfigError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import writing_errors
 from shmmap.optional_packages import TO_SIGN, needed_packages
 from shmmap.origin.reading_apart import Outcome
-from shmmap.origin.remote.map_versions import TIMESTAMP
+from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.verify_apart import (
-    MAX_ROOT_OF_TRUST,
     Verified,
     VerifyReply,
     VerifySettings,
@@ -50,7 +49,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str) -> Verified:
     """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`."""
     from tuf.api.exceptions import DownloadError, RepositoryError
 
-    from shmmap.origin.remote.signed_metadata import ALTERED, current_of, refused
+    from shmmap.origin.remote.signed_metadata import ALTERED, TARGET, current_of, refused
 
     memory = memory_directory(state_dir, store.url, trusted)
     with writing_errors(memory):
@@ -59,7 +58,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str) -> Verified:
             updater, failed = _updater(store, trusted, memory)
             try:
                 updater.refresh()
-                target = updater.get_targetinfo("root")
+                target = updater.get_targetinfo(TARGET)
             except (RepositoryError, DownloadError) as error:
                 raise _named(store, trusted, error, failed) from None
             try:
@@ -83,7 +82,7 @@ def _updater(store: Store, trusted: bytes, memory: str) -> tuple[Updater, list[S
         def _fetch(self, url: str) -> Iterator[bytes]:
             path = url.removeprefix(_URL)
             try:
-                return iter([bytes(store.get(path, MAX_ROOT_OF_TRUST))])
+                return iter([bytes(store.get(path, MAX_METADATA_BYTES))])
             except MapMissing as error:
                 failed.append(error)
                 raise DownloadHTTPError(path, 404) from None
@@ -92,16 +91,16 @@ def _updater(store: Store, trusted: bytes, memory: str) -> tuple[Updater, list[S
                 raise
 
     config = UpdaterConfig(
-        root_max_length=MAX_ROOT_OF_TRUST,
-        timestamp_max_length=MAX_ROOT_OF_TRUST,
-        snapshot_max_length=MAX_ROOT_OF_TRUST,
-        targets_max_length=MAX_ROOT_OF_TRUST,
+        root_max_length=MAX_METADATA_BYTES,
+        timestamp_max_length=MAX_METADATA_BYTES,
+        snapshot_max_length=MAX_METADATA_BYTES,
+        targets_max_length=MAX_METADATA_BYTES,
     )
     try:
         return Updater(memory, _URL, fetcher=Fetcher(), config=config, bootstrap=trusted), failed
     except RepositoryError as error:
         raise ConfigError(
-            f"the root of trust is none: {error}",
+            f"this is no root of trust: {error}",
             key="trust",
             hint="it is the ROOT.json that `publish --sign` makes",
         ) from None

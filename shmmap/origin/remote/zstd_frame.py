@@ -29,7 +29,7 @@ def unpack_frame(frame: bytes | memoryview, max_bytes: int, *, name: str, exact:
     Parameters
     ----------
     max_bytes
-        At most so much is unpacked, and room made for it: the frame says beforehand how much it will be.
+        Limit of what is unpacked and of the memory for it: the frame says its size beforehand.
     name
         Of the object, for messages.
     exact

@@ -14,13 +14,13 @@ from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
 from shmmap.layers.source_reader import Files
 from shmmap.layers.spec import layer_spec
+from shmmap.prepare.work import CellTask
 from tests.support.divided_map import DividedMap, make_map
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.publishing import worker
 from shmmap.publishing.known_objects import KnownObjects
-from shmmap.publishing.messages import CellToSend
 from shmmap.publishing.worker import CellMaker, LayerRefused
 from shmmap.segment.source import Source
 
@@ -32,10 +32,10 @@ def town(tmp_path: Path) -> DividedMap:
     return make_map(tmp_path / "town", columns=1, rows=1, points=200)
 
 
-def task_of(town: DividedMap, layers: tuple[str, ...] = LAYERS) -> CellToSend:
+def task_of(town: DividedMap, layers: tuple[str, ...] = LAYERS) -> CellTask:
     (name,) = town.corners
     specs = tuple(str(layer_spec(layer)) for layer in layers)
-    return CellToSend(
+    return CellTask(
         0, town.id(name), Source(town.id(name)), town.box(name), "map", specs, tuple(() for _ in specs)
     )
 

@@ -27,7 +27,7 @@ def profile(path: Path, name: str = "default", key: str = "k", **more: str) -> N
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_without_any_nobody_is_asked_for_some(home: Path) -> None:
+def test_without_any_the_network_is_not_asked(home: Path) -> None:
     del home
     assert s3_settings({}) == (ANONYMOUS, None)
     assert s3_settings({}, instance=True) == ({"region": "us-east-1"}, None)

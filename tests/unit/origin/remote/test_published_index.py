@@ -202,7 +202,6 @@ def test_shards_near_an_area_have_all_cells_that_touch_it() -> None:
             needed = {tuple(key) for key in keys[touches].astype(int).tolist()}
             found = root.shards_near(area)
             assert needed <= {tuple(key) for key in root.keys[found].tolist()}
-            assert len(found) <= len(present)
 
 
 def test_only_neighbours_are_asked_below_and_left() -> None:
@@ -327,7 +326,7 @@ def test_another_shard_is_refused_before_it_is_unpacked(monkeypatch: pytest.Monk
     root = root_of(ONE_FRAME)
     monkeypatch.setattr(zstandard, "ZstdDecompressor", None)
     with pytest.raises(MapDataError, match="its SHA-256 is not its name"):
-        unpack_shard(framed(pack_shard(ONE) + b""[:0]) + b"\0", root, 0)
+        unpack_shard(ONE_FRAME + b"\0", root, 0)
 
 
 def test_bombs_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:

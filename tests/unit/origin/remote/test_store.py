@@ -25,10 +25,10 @@ from tests.support.bucket_server import BucketServer
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import Patience, Store, read_url
+from shmmap.origin.remote.store import Store, Timeouts, read_url
 
-SOON = Patience(connect_s=0.5, read_s=0.3, retries=0, retry_s=0.5)
-ONCE = Patience(connect_s=30.0, read_s=30.0, retries=0, retry_s=30.0)
+SOON = Timeouts(connect_s=0.5, read_s=0.3, retries=0, retry_s=0.5)
+ONCE = Timeouts(connect_s=30.0, read_s=30.0, retries=0, retry_s=30.0)
 """For servers that answer, however busy the machine is."""
 
 
@@ -36,7 +36,7 @@ ONCE = Patience(connect_s=30.0, read_s=30.0, retries=0, retry_s=30.0)
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
     if request.param == "s3":
         server: BucketServer = request.getfixturevalue("buckets")
-        return open_store(server.url(re.sub(r"\W", "-", request.node.name)), patience=ONCE)
+        return open_store(server.url(re.sub(r"\W", "-", request.node.name)), timeouts=ONCE)
     path = tmp_path / "map"
     return open_store(f"file://{path}" if request.param == "file" else str(path))
 
@@ -104,14 +104,14 @@ def test_of_many_at_once_one_wins(store: Store) -> None:
 def test_a_web_server_reads_a_directory(web: tuple[str, Path]) -> None:
     url, folder = web
     open_store(str(folder / "town")).put("blobs/sha256/ef", b"123")
-    store = open_store(f"{url}/town", patience=ONCE)
+    store = open_store(f"{url}/town", timeouts=ONCE)
     assert bytes(store.get_exactly("blobs/sha256/ef", 3)) == b"123"
     assert store.head("blobs/sha256/ef") is not None
     assert store.head("blobs/sha256/aa") is None
     with pytest.raises(MapMissing):
         store.get("CURRENT", 99)
     for write in (lambda: store.put_new("CURRENT", b""), lambda: list(store.list("versions/"))):
-        with pytest.raises(BadRequest, match="a web server takes nothing"):
+        with pytest.raises(BadRequest, match="a web server cannot be written to"):
             write()
 
 
@@ -130,7 +130,7 @@ def test_objects_in_buckets_say_how_long_they_may_be_kept(buckets: BucketServer)
 
 
 def test_a_bucket_that_is_not_there(buckets: BucketServer) -> None:
-    store = open_store("s3://no-such-bucket/map", patience=ONCE)
+    store = open_store("s3://no-such-bucket/map", timeouts=ONCE)
     with pytest.raises(MapMissing, match="there is no such bucket"):
         store.put("blobs/sha256/aa", b"")
     with pytest.raises(MapMissing, match="there is no such bucket"):
@@ -147,7 +147,7 @@ def test_a_directory_that_cannot_be_written_is_an_error_with_a_hint(tmp_path: Pa
         open_store(str(tmp_path / "file" / "map")).put("blobs/sha256/aa", b"")
 
 
-def test_what_is_no_file_waits_for_nobody(tmp_path: Path) -> None:
+def test_what_is_no_file_never_blocks(tmp_path: Path) -> None:
     store = open_store(str(tmp_path))
     os.mkfifo(tmp_path / "CURRENT")
     assert bytes(store.get("CURRENT", 9)) == b""
@@ -279,7 +279,7 @@ def test_answers_become_errors_without_secrets(
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{answering.port}")
     url = "s3://maps/m" if scheme == "s3" else f"http://127.0.0.1:{answering.port}/m"
     with pytest.raises(kind) as error:
-        open_store(url, patience=ONCE if answering.answers else SOON).get("CURRENT", 99)
+        open_store(url, timeouts=ONCE if answering.answers else SOON).get("CURRENT", 99)
     assert says in str(error.value)
     assert f"{url}/CURRENT" in str(error.value)
     import traceback
@@ -287,7 +287,7 @@ def test_answers_become_errors_without_secrets(
     assert SECRET not in "".join(traceback.format_exception(error.value))
 
 
-def test_a_certificate_that_nobody_vouches_for(tmp_path: Path) -> None:
+def test_a_certificate_that_no_authority_vouches_for(tmp_path: Path) -> None:
     pytest.importorskip("obstore", reason="obstore is not installed")
     if shutil.which("openssl") is None:
         pytest.skip("openssl is missing")
@@ -311,7 +311,7 @@ def test_a_certificate_that_nobody_vouches_for(tmp_path: Path) -> None:
     try:
         url = f"https://127.0.0.1:{listener.getsockname()[1]}/m"
         with pytest.raises(Offline, match="certificate is not accepted") as error:
-            open_store(url, patience=ONCE).get("CURRENT", 9)
+            open_store(url, timeouts=ONCE).get("CURRENT", 9)
     finally:
         thread.join()
         listener.close()
@@ -322,10 +322,10 @@ GUARDED = """
 import json, socket, sys
 from shmmap.errors import ShmmapError
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import Patience
-soon = Patience(connect_s=0.3, read_s=0.3, retries=0, retry_s=0.3)
+from shmmap.origin.remote.store import Timeouts
+soon = Timeouts(connect_s=0.3, read_s=0.3, retries=0, retry_s=0.3)
 for url in sys.argv[1:]:
-    store = open_store(url, patience=soon)
+    store = open_store(url, timeouts=soon)
     try:
         store.get("CURRENT", 99)
     except ShmmapError as error:
