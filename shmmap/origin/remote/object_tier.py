@@ -64,6 +64,7 @@ class ObjectTier:
         self._quiet = quiet
         self._lock = threading.Lock()
         self._trimmer: threading.Thread | None = None
+        self._trim_again = False
         self._said: set[str] = set()
         self._damaged = 0
 
@@ -132,13 +133,24 @@ class ObjectTier:
         return True
 
     def _begin_to_trim(self) -> None:
-        """Trim beside: what was fetched is waited for."""
+        """Trim in a thread: fetching does not wait for it."""
         with self._lock:
+            self._trim_again = True
             if self._trimmer is None or not self._trimmer.is_alive():
-                trimmer = threading.Thread(target=self._budget.trim, name="trim", daemon=True)
+                trimmer = threading.Thread(target=self._trim, name="trim", daemon=True)
                 with contextlib.suppress(RuntimeError):  # there are as many threads as there may be
                     trimmer.start()
                     self._trimmer = trimmer
+
+    def _trim(self) -> None:
+        """Trim until nothing was added that needs it: what comes meanwhile may not have been looked at."""
+        while True:
+            with self._lock:
+                if not self._trim_again:
+                    self._trimmer = None
+                    return
+                self._trim_again = False
+            self._budget.trim()
 
     def mark_index_used(self, digests: Iterable[bytes]) -> None:
         """Mark the index pages of the version in use: they are kept before others."""

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.disk_budget import DiskBudget
 from shmmap.errors import MapDataError, MapMissing, Offline
 from shmmap.origin.remote.directory_store import DirectoryStore
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
@@ -440,6 +441,28 @@ def test_many_threads(origin: Origin, cache: Path) -> None:
     counts = [sum(both) for both in zip(cells.counts, pages.counts, strict=True)]
     assert counts[0] + counts[2] == 1500
     assert counts[0] > 300
+
+
+def test_what_is_kept_while_the_directory_is_trimmed_is_trimmed_too(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tier = ObjectTier(str(cache), limit_bytes=100_000)
+    trim = DiskBudget.trim
+    random_ = random.Random(11)
+    later = [random_.randbytes(5000) for _ in range(40)]
+
+    def trim_then_keep(budget: DiskBudget) -> int:
+        left_bytes = trim(budget)
+        while later:
+            data = later.pop()
+            tier.put(hashlib.sha256(data).digest(), data)
+        return left_bytes
+
+    monkeypatch.setattr(DiskBudget, "trim", trim_then_keep)
+    tier.put(NAME, DATA)
+    wait_for_trimming()
+    assert not later
+    assert sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) <= 100_000
 
 
 def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
