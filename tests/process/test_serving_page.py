@@ -52,7 +52,8 @@ def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFact
     assert serve == f"shmmap serve {buckets.url('town')}"
     serve = serve.replace("maps/", "maps/vehicle/")  # the bucket has what other tests have published
     exports = [line.removeprefix("export ").split("=", 1) for line in PAGE.commands("credentials")]
-    environment = {**dict(exports), "AWS_ENDPOINT_URL": buckets.endpoint}
+    assert dict(exports).keys() <= buckets.environment.keys()
+    environment = buckets.environment
     one = daemon(serve.split()[2], environment=environment)
 
     def run(line: str) -> str:

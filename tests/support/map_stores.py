@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import http.server
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.bucket_server import BucketServer, bucket_server
+from tests.support.ceph import ceph_server
 
 __all__ = ["_buckets", "buckets", "web"]
 
@@ -20,6 +22,10 @@ __all__ = ["_buckets", "buckets", "web"]
 def _buckets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BucketServer]:
     pytest.importorskip("obstore", reason="obstore is not installed")
     pytest.importorskip("moto", reason="moto is not installed")
+    if os.environ.get("SHMMAP_TEST_CEPH"):
+        with ceph_server() as cluster:
+            yield cluster
+        return
     with bucket_server(tmp_path_factory.mktemp("buckets")) as server:
         yield server
 

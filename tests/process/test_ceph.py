@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A published map on a real Ceph whose daemons are killed; run with ``SHMMAP_TEST_CEPH=1`` as root."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import shmmap
+from tests.process.conftest import DaemonFactory
+from tests.support.bucket_server import BucketServer
+from tests.support.ceph import CEPH_PROGRAMS, CephServer
+from tests.support.divided_map import DividedMap, make_map
+from tests.support.patience import Patience
+from tests.support.publishing import publish
+
+if not os.environ.get("SHMMAP_TEST_CEPH"):
+    pytest.skip("SHMMAP_TEST_CEPH is not set", allow_module_level=True)
+if missing := [name for name in CEPH_PROGRAMS if shutil.which(name) is None]:
+    pytest.skip(f"Ceph is not installed: {', '.join(missing)}", allow_module_level=True)
+
+ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
+WARM = "0_0.pcd"
+
+
+@pytest.fixture
+def ceph(buckets: BucketServer) -> Iterator[CephServer]:
+    """The cluster, whole again after the test."""
+    assert isinstance(buckets, CephServer)
+    yield buckets
+    buckets.repair()
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> DividedMap:
+    """Of thirty-six cells."""
+    return make_map(tmp_path / "town", columns=6, rows=6, points=2000)
+
+
+def columns_of(cells: shmmap.CellSet) -> dict[str, dict[str, bytes]]:
+    found = {}
+    for cell in cells:
+        cell.verify()
+        found[cell.id.rsplit("/", 1)[1]] = {name: cell[name].tobytes() for name in cell.columns}
+    return found
+
+
+def of_files(daemon: DaemonFactory, town: DividedMap) -> dict[str, dict[str, bytes]]:
+    with shmmap.connect(daemon(town.root).endpoint) as client:
+        return columns_of(client.area(ALL, wait=120.0))
+
+
+@pytest.mark.parametrize("killed", [["osd.1"], ["osd.1", "osd.2"], ["client.rgw"]])
+def test_daemons_of_the_store_are_killed_while_cells_are_fetched(
+    ceph: CephServer, daemon: DaemonFactory, town: DividedMap, killed: list[str]
+) -> None:
+    """One disk of three is not missed; without two, or the gateway, only what is here is served meanwhile."""
+    url = ceph.url(f"killed-{'-'.join(killed)}/town")
+    publish(town.root, url)
+    right = of_files(daemon, town)
+    one = daemon(url, environment=ceph.environment)
+    with shmmap.connect(one.endpoint) as client:
+        (warm,) = client.selected([WARM], wait=60.0)
+        client.area(ALL, wait=None)
+        for name in killed:
+            ceph.kill(name)
+        found = client.area(ALL, wait=30.0)
+        assert {failure.code for failure in found.failed} <= {"offline"}
+        assert columns_of(found).items() <= right.items()
+        again = client.selected([WARM], wait=0.0)
+        assert [cell.version for cell in again] == [warm.version]
+        if len(killed) > 1 or killed == ["client.rgw"]:
+            ceph.repair()
+        waiting = Patience()
+        while waiting(not (found := client.area(ALL, wait=5.0)).complete):
+            pass
+        assert columns_of(found) == right
+
+
+def test_a_disk_is_killed_while_a_map_is_published(
+    ceph: CephServer, daemon: DaemonFactory, town: DividedMap
+) -> None:
+    url = ceph.url("published-meanwhile/town")
+    publish(town.root, url)
+    for seed, name in enumerate(sorted(town.corners)[:12]):
+        town.change(name, seed=seed)
+    ceph.kill("osd.0")
+    assert "\nversion  2\n" in publish(town.root, url)
+    with shmmap.connect(daemon(url, environment=ceph.environment).endpoint) as client:
+        found = client.area(ALL, wait=120.0)
+    assert columns_of(found) == of_files(daemon, town)
