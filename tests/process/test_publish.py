@@ -22,6 +22,7 @@ from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.published_map_reader import PublishedMapReader, columns_of
+from tests.support.publishing import make_older
 from tests.support.publishing_verbs import Shmmap, files_of, locked
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -417,18 +418,6 @@ def test_a_version_that_is_not_whole_does_not_come_back(
     check(three, town)
 
 
-def aged(store: Path, days: float, *versions: int) -> None:
-    """Let entries and all objects be so old."""
-    then = time.time() - days * DAY_S
-    for version in versions:
-        path = store / f"versions/{version}.json"
-        entry = json.loads(path.read_bytes())
-        entry["created"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(then))
-        path.write_text(json.dumps(entry))
-    for path in (store / "blobs/sha256").iterdir():
-        os.utime(path, (then, then))
-
-
 @pytest.mark.parametrize("label", ["", "prune.entry", "prune.listed", "prune.object"])
 def test_pruning_takes_what_only_old_versions_have(
     label: str, shmmap: Shmmap, town: DividedMap, three: Path, tmp_path: Path
@@ -437,9 +426,9 @@ def test_pruning_takes_what_only_old_versions_have(
     if not label:
         kept = shmmap.json("versions", three, "--prune")
         assert (kept["versions"], kept["objects"], kept["kept_versions"]) == ([], 0, [1, 2, 3])
-    aged(three, 40, 1, 2)
-    aged(three, 20, 3)  # since then 2 is not current
-    aged(three, 40)
+    make_older(three, 40, 1, 2)
+    make_older(three, 20, 3)  # since then 2 is not current
+    make_older(three, 40)
     if label:
         shmmap("versions", three, "--prune", code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
         check(three, town)
@@ -460,13 +449,13 @@ def test_pruning_takes_what_only_old_versions_have(
 def test_pruning_spares_what_is_young_and_what_is_being_published(
     shmmap: Shmmap, town: DividedMap, store: Path
 ) -> None:
-    aged(store, 99, 1)
+    make_older(store, 99, 1)
     town.change("0_0.pcd", seed=1)
     shmmap("publish", town.root, store, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": "version.switch"})
     done = shmmap.json("versions", store, "--prune", "--keep", "7")
     assert (done["versions"], done["objects"], done["kept_versions"]) == ([], 0, [1, 2])
-    aged(store, 8, 2)
-    aged(store, 99, 1)
+    make_older(store, 8, 2)
+    make_older(store, 99, 1)
     done = shmmap.json("versions", store, "--prune", "--keep", "7")
     assert (done["versions"], done["objects"]) == ([2], 3)
     assert "7 or more" in shmmap("versions", store, "--prune", "--keep", "6", code=2)

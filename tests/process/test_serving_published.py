@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -25,7 +26,7 @@ from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
-from tests.support.publishing import publish
+from tests.support.publishing import make_older, publish
 from tests.support.raw_client import DaemonError, RawClient, circle
 from tests.support.served_cells import names
 
@@ -435,6 +436,37 @@ def test_a_link_lost_half_way_keeps_the_old_version_whole(
         waiting = Patience()
         while waiting({(cell.id, cell.version) for cell in client.area(ALL, wait=30.0)} == before):
             time.sleep(0.05)
+
+
+def test_a_version_that_was_pruned_is_served_as_far_as_it_is_here(
+    daemon: DaemonFactory, web: FaultyWeb, town: DividedMap
+) -> None:
+    """A vehicle still serves a version of which the store has nothing left."""
+    one = daemon(web.url, "--poll", "0")
+    with shmmap.connect(one.endpoint) as client:
+        (warm,) = client.selected(["0_0.pcd"], wait=60.0)
+        for seed, name in enumerate(town.corners):
+            town.change(name, seed=seed)
+        publish(town.root, web.folder, "--layer", NDT)
+        make_older(web.folder, 40, 1, 2)
+        prune = [sys.executable, "-m", "shmmap.cli", "versions", str(web.folder), "--prune", "--json"]
+        done = subprocess.run(
+            prune, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, capture_output=True
+        )
+        assert json.loads(done.stdout)["versions"] == [1]
+        cells = client.area(ALL, wait=60.0)
+        assert [(cell.id, cell.version) for cell in cells] == [(warm.id, warm.version)]
+        assert offline_codes(cells) == {"load_failed"}
+        assert len(cells.failed) == 8
+        assert all("is not there" in failure.message for failure in cells.failed)
+        client.reload()
+        waiting = Patience()
+        while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
+            pass
+        assert len(cells) == 9
+        for cell in cells:
+            name = cell.id.rsplit("/", 1)[1]
+            assert cell.xyz[:, 0].tobytes() == town.points(name)["x"].tobytes()
 
 
 def test_polls_are_conditional(daemon: DaemonFactory, web: FaultyWeb) -> None:

@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
 from tests.support.daemon_process import ROOT
 
-__all__ = ["publish"]
+__all__ = ["make_older", "publish"]
 
 
 def publish(source: Path, url: str | Path, *words: str, environment: Mapping[str, str] | None = None) -> str:
@@ -24,3 +26,15 @@ def publish(source: Path, url: str | Path, *words: str, environment: Mapping[str
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def make_older(store: Path, days: float, *versions: int) -> None:
+    """Date these versions, and all objects, that many days back."""
+    then = time.time() - days * 86_400
+    for version in versions:
+        path = store / f"versions/{version}.json"
+        entry = json.loads(path.read_bytes())
+        entry["created"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(then))
+        path.write_text(json.dumps(entry))
+    for path in (store / "blobs/sha256").iterdir():
+        os.utime(path, (then, then))
