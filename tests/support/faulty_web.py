@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["FaultyWeb", "faulty_web"]
+__all__ = ["Fault", "FaultyWeb", "faulty_web"]
 
 Fault = Callable[[str], str]
 """What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
