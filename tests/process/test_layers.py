@@ -121,7 +121,7 @@ def test_a_differential_request_holds_layers_apart(
 def test_a_window_of_two_layers(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as client:
-        found = client.around(0.0, 0.0, 5.0, layers=["points", "ndt(2)"])
+        found = client.around(0.0, 0.0, 5.0, layers=["points", "ndt(2)"], wait=60.0)
         layers = {cell.layer for cell in found}
         assert layers == {"points", "ndt(leaf=2.0)"}
         for cell in found:

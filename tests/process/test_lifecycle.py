@@ -249,7 +249,7 @@ def test_directories_are_named_from_where_the_daemon_was_started(
     one.start()
     with shmmap.connect(one.endpoint) as client:
         assert client.welcome.shm_dir == one.shm_dir
-        assert len(client.around(0, 0, 5, layers="voxel(leaf=1.0)")) == 4
+        assert len(client.around(0, 0, 5, layers="voxel(leaf=1.0)", wait=60.0)) == 4
     assert list((tmp_path / "cache" / "layers").iterdir())
 
 

@@ -549,22 +549,22 @@ def test_another_version_is_served_when_it_knows_what_is_known_of_this_one(paged
 def test_a_version_that_is_held_back_gives_way_to_a_later_one(paged: Paged) -> None:
     paged.know(WEST, EAST)
     paged.origin.sharing = {WEST}
+    held: list[PagedView] = []
+
+    def another() -> bool:
+        last = paged.origin.last
+        return last is not None and last not in held and bool(last.pages.wanted)
+
     for _ in range(2):
         paged.requests += 1
         paged.daemon.send(m.Reload(paged.requests))
-    first: list[PagedView] = []
-
-    def second() -> bool:
-        last = paged.origin.last
-        if last is not None and last.pages.wanted and last not in first:
-            first.append(last)
-        return len(first) == 2
-
-    paged.daemon.turn_until(second)
-    first[0].pages.come(EAST)
-    first[1].pages.come(EAST)
+        paged.daemon.turn_until(another)
+        assert paged.origin.last is not None
+        held.append(paged.origin.last)
+    held[0].pages.come(EAST)
+    held[1].pages.come(EAST)
     assert [type(paged.answer()), type(paged.answer())] == [m.Reloaded] * 2
-    assert paged.view is first[1]
+    assert paged.view is held[1]
 
 
 def test_what_changed_in_a_page_that_has_gone_comes_with_it(paged: Paged) -> None:
