@@ -299,7 +299,7 @@ class _Join:
     # --- objects --------------------------------------------------------------------------------
 
     def _look_for_objects(self, root: Root, layers: Collection[str]) -> int:
-        """Look for every object of a root, whose shards must differ from the current ones in these layers alone."""
+        """Look for every object of a root, which may differ from the current one in these layers alone."""
         base = self._base.root
         belongs = slice_of_shards(base, self._run.slices).tolist()
         since_s = time.time() - _OLD_S

@@ -94,9 +94,9 @@ class PublishedPoints:
         fd = os.memfd_create("points", os.MFD_CLOEXEC)
         try:
             unpacked = unpack_frame(self._frame(name), name.raw, name=path, exact=True)
-            write_segment(unpacked, fd, identity, LAYER, name=path)
+            header = write_segment(unpacked, fd, identity, LAYER, name=path)
             del unpacked
-            return read_segment(fd, box, needs)
+            return read_segment(fd, box, needs, header)
         except MapDataError as error:
             raise LoadFailed(str(error), cell_id=source.name) from None
         finally:

@@ -34,9 +34,9 @@ _EPILOG = """\
 Layers computed before are kept; a stopped run, started again, continues where it was.  After a map was
 copied or its files touched, its layers are recognised by the files' contents.
 Give `serve` the same --cache-dir.
-With --shards MAP is the URL of a published map: the layers of slice I of N are computed and sent there, on any
-machine, in any order; 1/1 is all of it.  When all slices are made, `shmmap publish URL --join RUN` makes them
-the current version.
+With --shards MAP is the URL of a published map: the layers of slice I of N are computed and sent there, on
+any machine, in any order; 1/1 is all of it.  When all slices are made, `shmmap publish URL --join RUN` adds
+the layers to the map.
 JSON (fields may be added, none is removed):
   {"map", "cells", "layers": [spec], "kept", "recognised": by contents, "built": layers of cells, "bytes",
    "cache_dir", "cache_bytes": disk space of the whole cache, "seconds",

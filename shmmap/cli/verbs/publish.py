@@ -47,8 +47,9 @@ JSON (fields may be added, none is removed):
   --join: {"url", "run", "slices", "changed", "version": the current one, "map_version": hex, "root", "cells",
    "layers": [spec], "objects": that were looked for, "seconds"}
 Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
-or damaged version, 66 no map or bucket, or slices are missing, 69 a package is missing, 73 cannot write, 75 the store does not
-answer or refuses, or another publisher was quicker, 78 unusable credentials or keys."""
+or damaged version, 66 no map or bucket, or slices are missing, 69 a package is missing, 73 cannot write,
+75 the store does not answer or refuses, or another publisher was quicker, 78 unusable credentials or
+keys."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -141,7 +142,7 @@ def _join(args: argparse.Namespace) -> int:
     done = join_slices(
         store,
         args.join,
-        signer=signer_at(store, args),
+        signer=signer_at(store, args, make_keys=True),
         progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
     )
     seconds = time.monotonic() - began_s
