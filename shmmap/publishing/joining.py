@@ -214,17 +214,12 @@ class _Join:
                 error.hint = error.hint or f"make slice {number} again, which replaces it"
                 raise
 
-        self._progress.stage("read slices", len(numbers))
-        parts: dict[int, Part] = {}
         try:
             with ThreadPoolExecutor(_READ_AT_ONCE, "part") as threads:
-                for part in threads.map(read, numbers):
-                    parts[part.slice] = part
-                    self._progress.advance(1)
+                return {part.slice: part for part in threads.map(read, numbers)}
         except MapMissing:
             self._refuse_if_changed()  # another join has removed it
             raise
-        return parts
 
     def _refuse_if_changed(self) -> None:
         if read_current(self._store).current != self._base.current:
