@@ -28,7 +28,7 @@ from shmmap.origin.remote.map_versions import (
     read_shards,
     refuse_if_signed,
 )
-from shmmap.origin.remote.published_index import Root, Shard, map_version_of, pack_root
+from shmmap.origin.remote.published_index import Root, map_version_of, pack_root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.slice_part import (
     MAX_PART_BYTES,
@@ -41,12 +41,12 @@ from shmmap.origin.remote.slice_part import (
     with_parts,
 )
 from shmmap.origin.remote.store import Store
-from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame
+from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.publish import LONGEST_S, packed_root
 from shmmap.publishing.restore import object_sizes
 from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
-from shmmap.publishing.slicing import BaseVersion, read_base
+from shmmap.publishing.slicing import BaseVersion, changed_layers, read_base
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -272,15 +272,14 @@ class _Join:
     def _check_builders(self, parts: Mapping[int, Part]) -> None:
         first = next(iter(parts.values()))
         for layer, built in first.layers.items():
-            others = {
-                part.slice: part.layers[layer] for part in parts.values() if part.layers[layer] != built
-            }
+            others = [part for part in parts.values() if part.layers[layer] != built]
             if others:
-                number, other = next(iter(others.items()))
+                other = others[0].layers[layer]
+                slices = numbers_text(part.slice for part in others if part.layers[layer] == other)
                 raise MapDataError(
-                    f"{layer} of slices {numbers_text(sorted(others))} of {self._run.slices} was built by"
-                    f" version {other}, of slice {first.slice} by version {built}",
-                    path=f"{self._store.url}/{self._run.part_path(number)}",
+                    f"{layer} of slices {slices} of {self._run.slices} is of builder version {other},"
+                    f" of slice {first.slice} of {built}",
+                    path=self._store.url,
                     cause="other_builder",
                     hint="use one version of shmmap on all machines, and make those slices again",
                 )
@@ -304,7 +303,8 @@ class _Join:
         shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)
         with ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads:
             for number, (of_slice, before, after) in enumerate(shards):
-                changed = self._changed_layers(before, after, of_slice, layers)
+                path = f"{self._store.url}/{self._run.part_path(of_slice)}"
+                changed = changed_layers(before, after, layers, name=path)
                 named = {name: set(object_sizes(layer)) for name, layer in after.layers.items()}
                 old = {one for name, objects in named.items() if name not in changed for one in objects}
                 new = {one for name in changed for one in named[name]} - old
@@ -318,32 +318,6 @@ class _Join:
                 self._progress.advance(len(after))
         self._refuse_absent(absent)
         return looked
-
-    def _changed_layers(
-        self, before: Shard, after: Shard, of_slice: int, allowed: Collection[str]
-    ) -> list[str]:
-        """Layers that are new or others than before; `MapDataError` where anything else differs."""
-        run = self._run
-        path = f"{self._store.url}/{run.part_path(of_slice)}"
-        same = before.names == after.names and all(
-            getattr(before, column).tobytes() == getattr(after, column).tobytes()
-            for column in ("boxes", "z", "points")
-        )
-        if not same:
-            raise MapDataError("a shard has other cells than the version has", path=path, cause=DAMAGED)
-        changed = []
-        for layer, objects in after.layers.items():
-            old = before.layers.get(layer)
-            is_same = old is not None and all(
-                getattr(old, column).tobytes() == getattr(objects, column).tobytes()
-                for column in ("sizes", "raws", "hashes", "contents")
-            )
-            if not is_same:
-                changed.append(layer)
-        foreign = sorted(set(changed).difference(allowed))
-        if foreign:
-            raise MapDataError(f"a shard has another layer {foreign[0]}", path=path, cause=DAMAGED)
-        return changed
 
     def _refuse_absent(self, absent: Mapping[int, int]) -> None:
         slices = sorted(absent.keys() - {0})

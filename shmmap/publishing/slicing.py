@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -53,7 +53,7 @@ from shmmap.origin.remote.slice_part import (
     with_parts,
 )
 from shmmap.origin.remote.store import Store, Tag, put_over
-from shmmap.origin.remote.zstd_frame import pack_frame, unpack_frame
+from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import TaskPool
 from shmmap.prepare.work import CellTask
@@ -64,7 +64,7 @@ from shmmap.publishing.shards import CellObjects
 from shmmap.publishing.worker import TASKS_AHEAD
 from shmmap.segment.source import Source
 
-__all__ = ["BaseVersion", "Sliced", "prepare_slice", "read_base"]
+__all__ = ["BaseVersion", "Sliced", "changed_layers", "prepare_slice", "read_base"]
 
 _SHARDS_HELD: Final = 16
 _STRIP_CELLS: Final = 4
@@ -84,6 +84,41 @@ def read_base(store: Store, current: Current) -> BaseVersion:
     frame = read_root_object(store, current)
     root = unpack_root(frame, name=f"{store.url}: root of version {current.version}")
     return BaseVersion(current, root, sha256(unpack_frame(frame, MAX_ROOT_BYTES, name="root")).digest())
+
+
+def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, name: str) -> list[str]:
+    """Return which layers of a shard are new, or others than before.
+
+    Parameters
+    ----------
+    allowed
+        Those that may be.
+    name
+        Of the part that has the later shard, for messages.
+
+    Raises
+    ------
+    MapDataError
+        Its cells or another layer differ (cause ``damaged``).
+    """
+    same = before.names == after.names and _are_equal(before, after, ("boxes", "z", "points"))
+    if not same:
+        raise MapDataError("a shard has other cells than the version has", path=name, cause=DAMAGED)
+    changed = [
+        layer
+        for layer, objects in after.layers.items()
+        if layer not in before.layers
+        or not _are_equal(before.layers[layer], objects, ("sizes", "raws", "hashes", "contents"))
+    ]
+    foreign = sorted(set(changed).difference(allowed))
+    if foreign:
+        raise MapDataError(f"a shard has another layer {foreign[0]}", path=name, cause=DAMAGED)
+    return changed
+
+
+def _are_equal(one: object, other: object, columns: Sequence[str]) -> bool:
+    """Whether columns have the same bytes: heights may be no numbers."""
+    return all(getattr(one, column).tobytes() == getattr(other, column).tobytes() for column in columns)
 
 
 @dataclass(slots=True)
@@ -309,8 +344,11 @@ class _Slice:
             root = with_parts(self._root, [part])
             for number in self._numbers.tolist():
                 shard = unpack_shard(read_shard_object(self._store, root, number), root, number)
-                new = {one for name in self._lacking for one in object_sizes(shard.layers[name])}
-                if self._lacking:
+                changed = changed_layers(self._shard(number), shard, self._lacking, name="")
+                if sorted(changed) != sorted(self._lacking):
+                    return False
+                new = {one for name in changed for one in object_sizes(shard.layers[name])}
+                if changed:
                     new.add((root.shard_sha256(number), int(root.sizes[number])))
                 if absent_objects(self._store, sorted(new), threads, since_s=since_s):
                     return False
