@@ -60,7 +60,7 @@ class Town:
             "publish", self.made.root, self.url, "--id-prefix", "/t/", *named(layers), env=self.environment
         )
 
-    def slice(self, which: str, *words: str, code: int = 0, **environment: str) -> dict[str, Any]:
+    def slice(self, which: str, *words: str, code: int = 0, **environment: Any) -> dict[str, Any]:
         return self.shmmap.json(
             "prepare", self.url, "--shards", which, *(words or named(LAYERS)),
             code=code, env={**self.environment, **environment},

@@ -22,6 +22,7 @@ from shmmap.origin.remote.published_index import Root  # noqa: E402
 from shmmap.origin.remote.slice_part import (  # noqa: E402
     MAX_PART_BYTES,
     Part,
+    PartFields,
     RunName,
     pack_part,
     part_number,
@@ -93,6 +94,15 @@ def test_golden_bytes() -> None:
     assert pack_part(read) == frame
 
 
+def test_the_fields_are_those_of_the_document() -> None:
+    from importlib.resources import files
+
+    page = files("shmmap.origin.remote").joinpath("ORIGIN.md").read_text(encoding="utf-8")
+    section = page[page.index("## A part of a slice") : page.index("## A signed map")]
+    documented = [line.split("`")[1] for line in section.splitlines() if line.startswith("| `")]
+    assert documented == list(PartFields.__struct_fields__)
+
+
 def test_a_slice_without_shards_has_a_part() -> None:
     none = replace(
         PART, keys=PART.keys[:0], counts=PART.counts[:0], sizes=PART.sizes[:0], hashes=PART.hashes[:0]
@@ -159,7 +169,7 @@ def test_parts_change_the_shards_of_their_slices_alone() -> None:
     assert root.sizes.tolist() == [9, 9, 9]
     for changes in ({"slice": 1}, {"counts": np.array([5], np.uint32)}, {"keys": root.keys[2:]}):
         with pytest.raises(MapDataError, match="its shards are not those of slice"):
-            with_parts(root, [replace(part, **changes)])  # type: ignore[arg-type]
+            with_parts(root, [replace(part, **changes)])
 
 
 # --- what is refused ----------------------------------------------------------------------------------
