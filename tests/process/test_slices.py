@@ -60,7 +60,7 @@ class Town:
             "publish", self.made.root, self.url, "--id-prefix", "/t/", *named(layers), env=self.environment
         )
 
-    def slice(self, which: str, *words: str, code: int = 0, **environment: Any) -> dict[str, Any]:
+    def slice(self, which: str, *words: str, code: int = 0, **environment: str) -> dict[str, Any]:
         return self.shmmap.json(
             "prepare", self.url, "--shards", which, *(words or named(LAYERS)),
             code=code, env={**self.environment, **environment},
@@ -594,7 +594,7 @@ def test_a_signed_map_is_joined_with_its_keys(town: Town, root: str) -> None:
     town.shmmap("publish", town.made.root, town.url, "--sign", keys)
     state = {"XDG_STATE_HOME": str(town.folder / "state")}
     trusted = ("--trust", str(keys / "ROOT.json"), *named(LAYERS))
-    run = town.slice("1/2", *trusted, **state)["run"]
+    run = town.slice("1/2", *trusted, XDG_STATE_HOME=state["XDG_STATE_HOME"])["run"]
     assert town.slice("2/2")["run"] == run
     assert "is signed" in town.refused(run, 2)
     done = town.join(run, "--sign", keys)
