@@ -2,8 +2,8 @@
 """Compute layers of a published map on a dask cluster, slice by slice, and join them.
 
 A slice is the command ``shmmap prepare URL --layer ... --shards I/N``, run by the worker that is free next;
-if a worker is lost, another one makes its slice.  Workers need shmmap with its extra ``remote``, and the store's
-credentials in their environment.
+if a worker is lost, another one makes its slice.  Workers need shmmap with its extra ``remote``, and the
+store's credentials in their environment.
 
     python3 slices_with_dask.py s3://maps/town --layer 'ndt(leaf=2.0)' --slices 64 --scheduler tcp://HOST:8786
 """
