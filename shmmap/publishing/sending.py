@@ -13,10 +13,10 @@ from shmmap.failpoints import step
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 
-__all__ = ["ASKED_AT_ONCE", "YOUNG_S", "absent_objects", "send_object"]
+__all__ = ["ASKED_AT_ONCE", "absent_objects", "send_object"]
 
 ASKED_AT_ONCE: Final = 32
-YOUNG_S: Final = 86_400.0
+_YOUNG_S: Final = 86_400.0
 """An object that no version has is used again if it is younger: pruning spares it for much longer."""
 
 
@@ -30,7 +30,7 @@ def send_object(store: Store, path: str, frame: bytes, *, look: bool = True) -> 
     """
     if look:
         found = store.head(path)
-        if found is not None and found.size == len(frame) and abs(time.time() - found.modified_s) < YOUNG_S:
+        if found is not None and found.size == len(frame) and abs(time.time() - found.modified_s) < _YOUNG_S:
             return False
     step("publish.send")
     store.put(path, frame)

@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
+from itertools import pairwise
 from time import time
 from typing import Final, NamedTuple
 
@@ -59,13 +60,14 @@ from shmmap.prepare.task_pool import TaskPool
 from shmmap.prepare.work import CellTask
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings, decode_sent
 from shmmap.publishing.restore import object_sizes
-from shmmap.publishing.sending import ASKED_AT_ONCE, YOUNG_S, absent_objects, send_object
+from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
 from shmmap.publishing.shards import CellObjects
 from shmmap.publishing.worker import TASKS_AHEAD
 from shmmap.segment.source import Source
 
 __all__ = ["BaseVersion", "Sliced", "changed_layers", "prepare_slice", "read_base"]
 
+_THERE_S: Final = 4 * 86_400.0  # of a slice that was made before: joining takes what is up to six days old
 _SHARDS_HELD: Final = 16
 _STRIP_CELLS: Final = 4
 _MAX_TRIES: Final = 100
@@ -230,6 +232,8 @@ class _Cells(Catalogue):
     def __init__(self, root: Root, shards: Sequence[Shard]) -> None:
         places = [(name, shard, row) for shard in shards for row, name in enumerate(shard.names)]
         places.sort(key=lambda place: place[0])
+        if any(one == other for (one, *_), (other, *_) in pairwise(places)):
+            raise MapDataError("two shards have a cell of one name", cause=DAMAGED)
         self._places = [(shard, row) for _, shard, row in places]
         self._builder_version = root.layers[POINTS]
         self.frame_id = root.frame_id
@@ -332,10 +336,10 @@ class _Slice:
             return None, tag
 
     def _is_whole(self, part: Part) -> bool:
-        """Whether a part is what would be made now, and all that it names is there, and young."""
+        """Whether a part is what would be made now, and all that it names is there and not old."""
         if part.layers != self._layers:
             return False
-        since_s = time() - YOUNG_S
+        since_s = time() - _THERE_S
         self._progress.stage("look for objects", self._result.cells)
         with (
             ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads,

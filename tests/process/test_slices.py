@@ -644,6 +644,7 @@ def test_wrong_usage_says_what_is_right(town: Town, tmp_path: Path) -> None:
     assert "is no name of a run" in says("publish", town.url, "--join", "../../etc")
     assert "--join takes no MAP" in says("publish", town.made.root, town.url, "--join", f"{'0' * 16}-2")
     assert "--layer does not go" in says("publish", town.url, "--join", f"{'0' * 16}-2", *layer)
+    assert "--unit does not go" in says("prepare", town.url, "--shards", "1/2", "--unit", "ft", *layer)
     assert "URL" in says("publish", town.made.root)
 
 

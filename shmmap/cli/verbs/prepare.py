@@ -9,7 +9,14 @@ from __future__ import annotations
 import argparse
 import re
 
-from shmmap.cli.map_layers import add_map_options, failure_rows, origin_at, print_failures, worker_count
+from shmmap.cli.map_layers import (
+    add_map_options,
+    failure_rows,
+    origin_at,
+    print_failures,
+    refuse_map_options,
+    worker_count,
+)
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
@@ -100,6 +107,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.layer:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
     if args.shards is not None:
+        refuse_map_options(args, "--shards: the map is published already")
         return _prepare_slice(args)
     if is_url(args.map_path):
         raise BadRequest(

@@ -10,7 +10,14 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from shmmap.cli.map_layers import add_map_options, failure_rows, origin_at, print_failures, worker_count
+from shmmap.cli.map_layers import (
+    add_map_options,
+    failure_rows,
+    origin_at,
+    print_failures,
+    refuse_map_options,
+    worker_count,
+)
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
@@ -132,9 +139,7 @@ def _join(args: argparse.Namespace) -> int:
 
     if args.url is not None:
         raise BadRequest("--join takes no MAP", hint="shmmap publish URL --join RUN")
-    for option in ("layer", "id_prefix", "encoding", "resend"):
-        if getattr(args, option):
-            raise BadRequest(f"--{option.replace('_', '-')} does not go with --join: its slices say it")
+    refuse_map_options(args, "--join: its slices say all that", ("layer", "id_prefix", "encoding", "resend"))
     store = store_at(args.map_path, args)
     from shmmap.publishing.joining import join_slices
 
