@@ -441,6 +441,22 @@ def test_of_two_joins_one_wins_and_the_other_learns_it(
     assert town.parts() == []
 
 
+def test_of_two_joins_in_a_bucket_one_wins(
+    town: Town, root: str, buckets: BucketServer, meanwhile: Meanwhile
+) -> None:
+    town.url, town.environment = buckets.url("joined"), buckets.environment
+    town.publish()
+    run = town.slice("1/1")["run"]
+    outcome = meanwhile("join.looked", lambda: town.join_here(run))
+    with pytest.raises(InstanceBusy, match="another publisher has changed"):
+        town.join_here(run)
+    (other,) = outcome
+    assert isinstance(other, joining.Joined)
+    current = map_versions.require_current(open_store(town.url))
+    assert (other.version, current.version, current.root) == (3, 3, root)  # the loser made entry 2
+    assert list(open_store(town.url).list("parts/")) == []
+
+
 @pytest.mark.parametrize("label", JOIN_STEPS[:5])
 def test_of_a_join_and_a_publisher_one_wins(label: str, town: Town, root: str, meanwhile: Meanwhile) -> None:
     run = town.slices(2)
@@ -611,6 +627,23 @@ def test_a_signed_map_is_joined_with_its_keys(town: Town, root: str) -> None:
     (town.store / "timestamp.json").write_bytes(b"{}")
     errors = town.shmmap("prepare", town.url, "--shards", "1/2", *trusted, code=65, env=state)
     assert str(town.url) in errors
+
+
+@pytest.mark.parametrize("label", ["sign.metadata", "sign.timestamp", "sign.signed", "sign.switch"])
+def test_a_join_that_is_killed_while_it_signs_is_finished(label: str, town: Town, root: str) -> None:
+    pytest.importorskip("tuf", reason="tuf is not installed")
+    from tests.support.signed_map import read_signed
+
+    run, keys = town.slices(2), town.folder / "keys"
+    town.shmmap("publish", town.made.root, town.url, "--sign", keys)
+    words = ("publish", town.url, "--join", run, "--sign", keys)
+    town.shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    assert PublishedMapReader(town.store).current["version"] == 1
+    done = town.join(run, "--sign", keys)
+    assert done["changed"] == (label in ("sign.metadata", "sign.timestamp"))
+    assert (done["root"], PublishedMapReader(town.store).current["root"]) == (root, root)
+    assert read_signed(town.store, keys).version == done["version"]
+    assert town.parts() == []
 
 
 def test_pruning_removes_parts_that_are_old(town: Town) -> None:
