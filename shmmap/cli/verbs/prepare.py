@@ -84,7 +84,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SIZE",
         type=size_bytes,
         default="8G",
-        help="most disk space of kept layers (default: 8G); with --shards 0 keeps none",
+        help="most disk space of kept layers (default: 8G; with --shards, 0 keeps none)",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     add_trust_option(parser)

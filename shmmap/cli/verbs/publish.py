@@ -66,7 +66,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "publish",
         run,
         help="publish a map in a bucket or a directory",
-        description="Publish a map in a bucket or a directory, from where vehicles fetch what they need.",
+        description="Publish a map in a bucket or a directory, from where vehicles fetch what they need.\n"
+        "With --join and without MAP, add layers that slices have made.",
         epilog=_EPILOG,
     )
     parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
