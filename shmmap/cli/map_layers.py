@@ -14,7 +14,14 @@ if TYPE_CHECKING:
     from shmmap.origin.map_origin import MapOrigin
     from shmmap.prepare.run import Failure
 
-__all__ = ["add_map_options", "failure_rows", "origin_at", "print_failures", "worker_count"]
+__all__ = [
+    "add_map_options",
+    "failure_rows",
+    "origin_at",
+    "print_failures",
+    "refuse_map_options",
+    "worker_count",
+]
 
 _SHOWN_FAILURES: Final = 20
 
@@ -33,6 +40,15 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
         default=0,
         help="number of processes (default: one for each core)",
     )
+
+
+def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str] = ()) -> None:
+    """Refuse options about how files are read, and others, where none are; ``what`` says why."""
+    from shmmap.errors import BadRequest
+
+    for option in ("metadata", "strict", "unit", "vertical_unit", *others):
+        if getattr(args, option):
+            raise BadRequest(f"--{option.replace('_', '-')} does not go with {what}")
 
 
 def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:

@@ -17,7 +17,7 @@ from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers.contract import Box, PointTable
 from shmmap.layers.outside import OutsideBox
 from shmmap.quantities import format_bytes
-from shmmap.segment.layout import SourceStamp
+from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.verify import read_header
 
 __all__ = ["MOST_SOURCE_BYTES", "CellSource", "read_segment", "read_source"]
@@ -90,8 +90,15 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
         )
 
 
-def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
+def read_segment(
+    fd: int, box: Box, needs: Sequence[str] | None, header: SegmentHeader | None = None
+) -> CellSource:
     """Read them from an open ``points`` segment; nothing of it stays mapped.
+
+    Parameters
+    ----------
+    header
+        Of a segment that was not published; None: it was, and is read.
 
     Raises
     ------
@@ -102,7 +109,8 @@ def read_segment(fd: int, box: Box, needs: Sequence[str] | None) -> CellSource:
     OSError
         If it cannot be read.
     """
-    header, _ = read_header(fd)
+    if header is None:
+        header, _ = read_header(fd)
     _check_size(sum(column.nbytes for column in header.columns), header.cell_id)
     columns: dict[str, NDArray[Any]] = {}
     for column in header.columns:

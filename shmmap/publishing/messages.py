@@ -14,8 +14,10 @@ __all__ = [
     "LayerSent",
     "NotSent",
     "PublishSettings",
+    "SliceSettings",
     "decode_sent",
     "decode_settings",
+    "decode_slice_settings",
 ]
 
 
@@ -42,6 +44,25 @@ class PublishSettings(msgspec.Struct, array_like=True):
     known: str = ""
     is_first: bool = False
     encoding: str = ""
+
+
+class SliceSettings(msgspec.Struct, array_like=True):
+    """What all workers of a slice need.
+
+    Attributes
+    ----------
+    cache_dir, cache_bytes
+        Where computed layers are kept, and how much of that; 0: nothing.
+    keep_points
+        Points that were fetched are kept there, too: several cells need them.
+    """
+
+    url: str
+    insecure_http: bool = False
+    instance_credentials: bool = False
+    cache_dir: str = ""
+    cache_bytes: int = 0
+    keep_points: bool = False
 
 
 class LayerSent(msgspec.Struct, array_like=True):
@@ -77,12 +98,18 @@ class NotSent(msgspec.Struct, array_like=True, tag="not_sent"):
 FromWorker: TypeAlias = CellSent | NotSent | Ready
 
 _settings: Final[msgspec.json.Decoder[PublishSettings]] = msgspec.json.Decoder(PublishSettings)
+_slice_settings: Final[msgspec.json.Decoder[SliceSettings]] = msgspec.json.Decoder(SliceSettings)
 _sent: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
 
 
 def decode_settings(text: str) -> PublishSettings:
     """Read a worker's argument."""
     return _settings.decode(text)
+
+
+def decode_slice_settings(text: str) -> SliceSettings:
+    """Read the argument of a slice's worker."""
+    return _slice_settings.decode(text)
 
 
 def decode_sent(data: bytes) -> FromWorker:

@@ -2,7 +2,8 @@
 """Removing versions that have not been current for long, and the objects that no version has.
 
 Entries go first; then the entries are listed again, and only objects that none of these has, and that are as
-old, are removed.  So whatever is being published, restored or read meanwhile keeps its objects.
+old, are removed.  So whatever is being published, restored or read meanwhile keeps its objects.  Parts of
+slices that are as old were never joined, and go as well.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from shmmap.origin.remote.map_versions import (
     read_entry,
     require_current,
 )
+from shmmap.origin.remote.slice_part import PARTS
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.restore import objects_of
@@ -39,11 +41,12 @@ _BLOBS: Final = "blobs/"
 
 @dataclass(slots=True)
 class Pruned:
-    """What was removed: the numbers of versions, objects and their bytes; and what is kept."""
+    """What was removed: numbers of versions, objects and their bytes, parts of slices; and what is kept."""
 
     versions: list[int] = field(default_factory=list)
     objects: int = 0
     bytes: int = 0
+    parts: int = 0
     kept_versions: list[int] = field(default_factory=list)
     kept_objects: int = 0
     kept_bytes: int = 0
@@ -82,6 +85,7 @@ def prune_versions(
         result.versions.append(version)
     step("prune.listed")
     needed = _needed(store, progress, result)
+    result.parts = _remove_parts(store, old_s)
     _remove_objects(store, needed, old_s, progress, result)
     return result
 
@@ -153,6 +157,16 @@ def _needed(store: Store, progress: PrepareProgress, result: Pruned) -> set[byte
                 raise
         progress.advance(1)
     return needed
+
+
+def _remove_parts(store: Store, old_s: float) -> int:
+    """Remove old parts of slices; returns how many."""
+    old = [found.path for found in store.list(PARTS) if found.modified_s < old_s]
+    removed = 0
+    for path in old:
+        step("prune.part")
+        removed += _remove_if_old(store, path, old_s)
+    return removed
 
 
 def _remove_objects(

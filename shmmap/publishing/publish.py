@@ -61,9 +61,9 @@ from shmmap.publishing.worker import TASKS_AHEAD
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["Published", "publish_map"]
+__all__ = ["LONGEST_S", "Published", "packed_root", "publish_map"]
 
-_LONGEST_S: Final = 86_400.0  # what a run reuses must not be as old as what pruning removes
+LONGEST_S: Final = 86_400.0  # what a run reuses must not be as old as what pruning removes
 _SENT_AT_ONCE: Final = 16
 
 
@@ -160,6 +160,19 @@ def publish_map(
     )
 
 
+def packed_root(root: Root, url: str) -> bytes:
+    """Return what is in a root's frame; `MapDataError` where that is too large to be read."""
+    unpacked = pack_root(root)
+    if len(unpacked) > MAX_ROOT_BYTES:
+        raise MapDataError(
+            f"its index has {len(unpacked):,} bytes, more than {MAX_ROOT_BYTES:,}",
+            path=url,
+            cause="too_large",
+            hint="publish it as several maps",
+        )
+    return unpacked
+
+
 class _Run:
     """One run: what it publishes, and what was current when it began."""
 
@@ -205,14 +218,7 @@ class _Run:
             return result
         result.objects = len(self._catalogue) * len(self._names)
         result.bytes = objects.nbytes
-        unpacked = pack_root(self._root(side, self._send_shards(objects, side)))
-        if len(unpacked) > MAX_ROOT_BYTES:
-            raise MapDataError(
-                f"its index has {len(unpacked):,} bytes, more than {MAX_ROOT_BYTES:,}",
-                path=self._store.url,
-                cause="too_large",
-                hint="publish it as several maps",
-            )
+        unpacked = packed_root(self._root(side, self._send_shards(objects, side)), self._store.url)
         result.map_version = map_version_of(unpacked)
         is_same = before is not None and unpacked == pack_root(before)
         if seen.current is not None and is_same and not self._resend:
@@ -379,7 +385,7 @@ class _Run:
         self._result.root = digest.hex()
         step("publish.root")
         self._count(len(frame) * send_object(self._store, blob_path(digest), frame, look=self._look))
-        if time.monotonic() - self._began_s > _LONGEST_S:
+        if time.monotonic() - self._began_s > LONGEST_S:
             raise CannotWrite(
                 f"publishing to {self._store.url} took longer than a day: the version is not made current",
                 hint="run the same command again: what was sent within a day is not sent again",

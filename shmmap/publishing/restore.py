@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -26,13 +25,13 @@ from shmmap.origin.remote.published_index import LayerObjects, Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
+from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
 __all__ = ["Restored", "object_sizes", "objects_of", "restore_version"]
 
-_ASKED_AT_ONCE: Final = 32
 _NAMED: Final = 3
 
 
@@ -107,17 +106,11 @@ def _look_for_objects(store: Store, current: Current, progress: PrepareProgress)
     missing: list[str] = []
     looked = 0
 
-    def is_missing(named: tuple[bytes, int]) -> bool:
-        found = store.head(blob_path(named[0]))
-        return found is None or found.size != named[1]
-
-    with ThreadPoolExecutor(_ASKED_AT_ONCE, "head") as pool:
+    with ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads:
         for shard in read_shards(store, root):  # which reads the shards themselves
             objects = {named for layer in shard.layers.values() for named in object_sizes(layer)}
-            ordered = sorted(objects)
-            gone = pool.map(is_missing, ordered)
-            missing += itertools.compress((blob_path(digest) for digest, _ in ordered), gone)
-            looked += len(ordered)
+            missing += map(blob_path, absent_objects(store, sorted(objects), threads))
+            looked += len(objects)
             progress.advance(len(shard))
     progress.done(root.cells)
     if missing:

@@ -25,7 +25,7 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES
+from shmmap.layers.source_reader import FILES, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import MILLIMETRES
@@ -53,7 +53,7 @@ from shmmap.publishing.sending import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 
-__all__ = ["TASKS_AHEAD", "CellMaker", "LayerRefused", "main"]
+__all__ = ["TASKS_AHEAD", "CellMaker", "LayerRefused", "MadeCell", "Sender", "main", "run_worker"]
 
 _NICENESS: Final = 5
 TASKS_AHEAD: Final = 8
@@ -69,8 +69,10 @@ class _Layer:
 
 
 @dataclass(frozen=True, slots=True)
-class _Cell:
-    points: SegmentHeader
+class MadeCell:
+    """The objects of a cell's layers; ``points`` is the header of layer ``points``, None without it."""
+
+    points: SegmentHeader | None
     layers: tuple[_Layer, ...]
 
 
@@ -83,15 +85,36 @@ class LayerRefused(Exception):
 
 
 class CellMaker:
-    """Makes the objects of cells, in one thread."""
+    """Makes the objects of cells, in one thread.
 
-    def __init__(self, known: KnownObjects, cache: LayerCache | None, *, millimetres: bool = False) -> None:
+    Parameters
+    ----------
+    known
+        Objects that need not be made again.
+    cache, keep
+        Where layers may be made already, and whether to keep there what is made.
+    millimetres
+        Points are rounded.
+    reader
+        Reads the cells' points; None: they are files.
+    """
+
+    def __init__(
+        self,
+        known: KnownObjects,
+        cache: LayerCache | None,
+        *,
+        keep: bool = False,
+        millimetres: bool = False,
+        reader: SourceReader | None = None,
+    ) -> None:
         self._known = known
         self._millimetres = millimetres
         self._cache = cache if not millimetres else None  # which was made of exact points
-        self._reader = RoundedFiles() if millimetres else FILES
+        self._keep = keep
+        self._reader = reader or (RoundedFiles() if millimetres else FILES)
 
-    def make(self, task: CellTask) -> _Cell:
+    def make(self, task: CellTask) -> MadeCell:
         """Make the objects of a cell's layers; `LayerRefused` where one cannot be made."""
         specs = [layer_spec(name) for name in task.layers]
         source = CellPoints(task.source, task.box, specs, self._reader)
@@ -106,14 +129,17 @@ class CellMaker:
             raise LayerRefused(
                 str(specs[0]), MapDataError.code, f"{task.source.name}: the file changed while it was read"
             )
-        return _Cell(headers[task.layers.index(LAYER)], tuple(layers))
+        points = headers[task.layers.index(LAYER)] if LAYER in task.layers else None
+        return MadeCell(points, tuple(layers))
 
     def _layer(self, spec: LayerSpec, job: CellJob, source: CellPoints) -> tuple[SegmentHeader, _Layer]:
         name = str(spec)
         try:
             fd = os.memfd_create("layer", os.MFD_CLOEXEC)
             try:
-                made = make_layer(spec, job, fd, cache=self._cache, source=lambda: source.points(spec))
+                made = make_layer(
+                    spec, job, fd, cache=self._cache, keep=self._keep, source=lambda: source.points(spec)
+                )
                 header = made.header
                 if header.total_bytes > MAX_OBJECT_BYTES:
                     raise MapDataError(
@@ -163,7 +189,7 @@ def _contents(fd: int, nbytes: int) -> memoryview:
     return view
 
 
-class _Sender:
+class Sender:
     """Sends objects, in threads."""
 
     def __init__(self, store: Store, send: Callable[[CellSent | NotSent], None], *, is_first: bool) -> None:
@@ -173,14 +199,15 @@ class _Sender:
         self._lock = threading.Lock()
         self._there: set[bytes] = set()
 
-    def send(self, number: int, cell: _Cell) -> None:
+    def send(self, number: int, cell: MadeCell) -> None:
         """Send what is not there, and report it."""
         try:
             layers = tuple(
                 LayerSent(*layer.name, self._sent(layer.name, layer.frame)) for layer in cell.layers
             )
             header = cell.points
-            self._send(CellSent(number, header.rows, header.z_min, header.z_max, layers))
+            described = (header.rows, header.z_min, header.z_max) if header is not None else (0, 0.0, 0.0)
+            self._send(CellSent(number, *described, layers))
         except ShmmapError as error:
             self._send(NotSent(number, "", error.code, error.message, error.hint))
         except Exception as error:  # noqa: BLE001  reported, the run ends
@@ -211,7 +238,7 @@ def _work(channel: socket.socket, argument: str) -> None:
     def send(message: CellSent | NotSent) -> None:
         channel.send(encode(message))
 
-    sender = _Sender(store, send, is_first=settings.is_first)
+    sender = Sender(store, send, is_first=settings.is_first)
     channel.send(encode(Ready()))
     with ThreadPoolExecutor(TASKS_AHEAD, "send") as pool:
         while data := channel.recv(MAX_PACKET_BYTES):
@@ -224,15 +251,20 @@ def _work(channel: socket.socket, argument: str) -> None:
                 pool.submit(sender.send, task.number, cell)
 
 
-def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID SETTINGS``, the settings as JSON."""
+def run_worker(arguments: list[str], work: Callable[[socket.socket, str], None]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SETTINGS``: ``work`` takes the channel and the settings."""
     channel = socket.socket(fileno=int(arguments[0]))
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     os.nice(_NICENESS)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        _work(channel, arguments[2])
+        work(channel, arguments[2])
     return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SETTINGS``, the settings as JSON."""
+    return run_worker(arguments, _work)
 
 
 if __name__ == "__main__":

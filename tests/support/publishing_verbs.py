@@ -31,7 +31,7 @@ class Shmmap:
 
     def start(self, *words: str | Path, env: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
         """Start a verb; one worker is enough for these maps."""
-        if words[0] == "publish":
+        if words[0] in ("publish", "prepare"):
             words = (*words, "--workers", "1")
         return subprocess.Popen(
             [sys.executable, "-m", "shmmap.cli", *map(str, words)],

@@ -1,11 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap publish MAP URL``: a map into a bucket or a directory, for vehicles to fetch."""
+"""``shmmap publish MAP URL``: a map into a bucket or a directory, for vehicles to fetch.
+
+``shmmap publish URL --join RUN`` makes a version of what the slices of a run have made.
+"""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from typing import Any
 
-from shmmap.cli.map_layers import add_map_options, failure_rows, origin_at, print_failures, worker_count
+from shmmap.cli.map_layers import (
+    add_map_options,
+    failure_rows,
+    origin_at,
+    print_failures,
+    refuse_map_options,
+    worker_count,
+)
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
@@ -32,14 +44,19 @@ Only what the current version does not have is sent.  The new version becomes cu
 stopped run, started again, sends only what is missing.
 --sign: keys are made in KEYDIR at first; give ROOT.json to vehicles, take root.pem offline, and have the
 map signed again within 7 days: `shmmap versions URL --refresh --sign KEYDIR`.
+`shmmap publish URL --join RUN` adds the layers that `shmmap prepare URL --shards I/N` has made to the current
+version; all slices have to be there.
 JSON (fields may be added, none is removed):
   {"map", "url", "changed", "version": the current one, "map_version": hex, "root": hash of its object,
    "cells", "layers": [spec], "id_prefix", "objects": layers of cells, "bytes": of their objects,
    "sent_objects", "sent_bytes", "seconds", "failed": [{"id", "layer", "message"}],
    "notes": [text], oddities of the map}
+  --join: {"url", "run", "slices", "changed", "version": the current one, "map_version": hex, "root", "cells",
+   "layers": [spec], "objects": that were looked for, "seconds"}
 Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
-or damaged version, 66 no map or bucket, 69 a package is missing, 73 cannot write, 75 the store does not
-answer or refuses, or another publisher was quicker, 78 unusable credentials or keys."""
+or damaged version, 66 no map or bucket, or slices are missing, 69 a package is missing, 73 cannot write,
+75 the store does not answer or refuses, or another publisher was quicker, 78 unusable credentials or
+keys."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -49,11 +66,19 @@ def add_parser(subparsers: Subparsers) -> None:
         "publish",
         run,
         help="publish a map in a bucket or a directory",
-        description="Publish a map in a bucket or a directory, from where vehicles fetch what they need.",
+        description="Publish a map in a bucket or a directory, from where vehicles fetch what they need.\n"
+        "With --join and without MAP, add layers that slices have made.",
         epilog=_EPILOG,
     )
     parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
-    parser.add_argument("url", metavar="URL", help="where to publish it")
+    url = parser.add_argument("url", metavar="URL", help="where to publish it")
+    parser.add_argument(
+        "--join",
+        metavar="RUN",
+        action=_Join,
+        url=url,
+        help="add the layers that the slices of this run have made to the map published at URL; without MAP",
+    )
     add_layer_option(parser, "layers to publish besides points, such as 'ndt(leaf=2.0)'")
     parser.add_argument(
         "--id-prefix",
@@ -83,8 +108,82 @@ def add_parser(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
+class _Join(argparse.Action):
+    """Takes the name of a run; the URL is then the one argument, which argparse takes for MAP."""
+
+    def __init__(self, *, url: argparse.Action, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._url = url
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        del parser, option_string
+        self._url.required = False
+        setattr(namespace, self.dest, values)
+
+
 def run(args: argparse.Namespace) -> int:
-    """Publish, with progress on stderr."""
+    """Publish, or join, with progress on stderr."""
+    return _publish(args) if args.join is None else _join(args)
+
+
+def _join(args: argparse.Namespace) -> int:
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.errors import BadRequest
+
+    if args.url is not None:
+        raise BadRequest("--join takes no MAP", hint="shmmap publish URL --join RUN")
+    refuse_map_options(args, "--join: its slices say all that", ("layer", "id_prefix", "encoding", "resend"))
+    store = store_at(args.map_path, args)
+    from shmmap.publishing.joining import join_slices
+
+    began_s = time.monotonic()
+    done = join_slices(
+        store,
+        args.join,
+        signer=signer_at(store, args, make_keys=True),
+        progress=StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0),
+    )
+    seconds = time.monotonic() - began_s
+    if args.json:
+        print_json(
+            {
+                "url": store.url,
+                "run": str(done.run),
+                "slices": done.run.slices,
+                "changed": done.version is not None,
+                "version": done.current,
+                "map_version": f"{done.map_version:016x}",
+                "root": done.root,
+                "cells": done.cells,
+                "layers": list(done.layers),
+                "objects": done.objects,
+                "seconds": seconds,
+            }
+        )
+        return 0
+    changed = "" if done.version is not None else ": nothing has changed, it has these layers"
+    print_pairs(
+        [
+            ("url", f"{store.url}, {counted(done.cells, 'cell')}"),
+            ("version", f"{done.current}{changed}"),
+            ("layers", " ".join(done.layers)),
+            ("joined", counted(done.run.slices, "slice")),
+            ("found", counted(done.objects, "object")),
+            ("time", format_duration(seconds)),
+        ]
+    )
+    return 0
+
+
+def _publish(args: argparse.Namespace) -> int:
     import os
     import time
 

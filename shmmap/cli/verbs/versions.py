@@ -43,8 +43,8 @@ JSON (fields may be added, none is removed):
    content it has again, or 0}]}, the latest first; a web server cannot list those that were never served
   --rollback: {"url", "changed", "version": the current one, "restored", "objects": that were looked for}
   --refresh: {"url", "version", "valid_until": {"timestamp", "snapshot", "targets": RFC 3339}}
-  --prune: {"url", "versions": [number], "objects", "bytes", "kept_versions": [number], "kept_objects",
-   "kept_bytes"}
+  --prune: {"url", "versions": [number], "objects", "bytes", "parts": of slices, "kept_versions": [number],
+   "kept_objects", "kept_bytes"}
 Exit code: 0, 2 wrong usage, 65 damaged or --trust refuses, 66 no such map or version, 69 a package is
 missing, 75 the store does not answer or refuses, or another publisher was quicker, 78 unusable
 credentials or keys."""
@@ -179,6 +179,8 @@ def _prune(store: Store, keep_days: float | None, progress: PrepareProgress, *, 
         print_json({"url": store.url, **asdict(pruned)})
         return
     removed = f"{counted(pruned.objects, 'object')}, {format_bytes(pruned.bytes)}"
+    if pruned.parts:
+        removed += f"; {counted(pruned.parts, 'part')} of slices that were never joined"
     kept = f"{counted(pruned.kept_objects, 'object')}, {format_bytes(pruned.kept_bytes)}"
     print_pairs(
         [

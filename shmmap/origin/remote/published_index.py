@@ -28,20 +28,27 @@ from shmmap.segment.version import cell_version
 __all__ = [
     "ENCODINGS",
     "EXACT",
+    "MAX_LAYERS",
     "MAX_ROOT_BYTES",
     "MAX_SHARD_BYTES",
     "MILLIMETRES",
     "POINTS",
+    "Damage",
     "LayerObjects",
     "Root",
     "Shard",
+    "check_layers",
+    "check_shards",
+    "decode_map",
     "is_id_prefix",
     "is_relative_path",
     "map_version_of",
+    "pack_column",
     "pack_root",
     "pack_shard",
     "published_layer_version",
     "shard_keys",
+    "unpack_column",
     "unpack_root",
     "unpack_shard",
 ]
@@ -57,7 +64,7 @@ MILLIMETRES: Final = "mm"
 ENCODINGS: Final = (EXACT, MILLIMETRES)
 """How points may be published; of those in millimetres some cells are exact."""
 
-_MAX_LAYERS: Final = 64
+MAX_LAYERS: Final = 64
 _MAX_SPEC_CHARACTERS: Final = 200
 _MAX_TEXT_CHARACTERS: Final = 4096
 _ROUNDING: Final = 2.0**-22  # an area test on values rounded to float32 may move a border by half of it
@@ -118,9 +125,9 @@ class ShardFields(msgspec.Struct, frozen=True):
 
 
 # made here, once: msgspec ends the process if threads are the first to decode a type at the same time
-_DECODERS: Final[dict[Any, Any]] = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in (_Head, RootFields, ShardFields)
-}
+_HEAD: Final = msgspec.msgpack.Decoder(_Head)
+_ROOT: Final = msgspec.msgpack.Decoder(RootFields)
+_SHARD: Final = msgspec.msgpack.Decoder(ShardFields)
 
 
 # --- the root -----------------------------------------------------------------------------------------
@@ -221,10 +228,10 @@ def pack_root(root: Root) -> bytes:
             largest_m=root.largest_m,
             mean_m=root.mean_m,
             layers=dict(sorted(root.layers.items())),
-            shard_keys=_packed(root.keys, "<i4"),
-            shard_cells=_packed(root.counts, "<u4"),
-            shard_bytes=_packed(root.sizes, "<u4"),
-            shard_sha256=_packed(root.hashes, "u1"),
+            shard_keys=pack_column(root.keys, "<i4"),
+            shard_cells=pack_column(root.counts, "<u4"),
+            shard_bytes=pack_column(root.sizes, "<u4"),
+            shard_sha256=pack_column(root.hashes, "u1"),
         )
     )
 
@@ -243,8 +250,8 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
         If it is no sound root (cause ``damaged``), or one that needs a later reader (``newer``).
     """
     unpacked = unpack_frame(frame, MAX_ROOT_BYTES, name=name)
-    wrong = _Wrong(name)
-    head = _decode(unpacked, _Head, wrong)
+    wrong = Damage(name)
+    head = decode_map(unpacked, _HEAD, wrong)
     if head.format != FORMAT:
         raise wrong(f"its format is {head.format[:40]!r}, not {FORMAT!r}")
     if head.min_reader > READER or head.encoding not in ENCODINGS:
@@ -255,7 +262,7 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
             cause="newer",
             hint="update shmmap",
         )
-    found = _decode(unpacked, RootFields, wrong)
+    found = decode_map(unpacked, _ROOT, wrong)
     texts = (found.id_prefix, found.frame_id, found.crs)
     if any(len(text) > _MAX_TEXT_CHARACTERS or "\0" in text for text in texts):
         raise wrong("a text is too long")
@@ -266,12 +273,9 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
         raise wrong("a number is not finite, or the bounds are no rectangle")
     if found.shard_m <= 0 or min(*found.unit_m) <= 0 or min(*found.largest_m, *found.mean_m) < 0:
         raise wrong("a length is not positive")
-    if POINTS not in found.layers or len(found.layers) > _MAX_LAYERS:
-        raise wrong("its layers are too many, or have no points")
-    if any(
-        len(spec) > _MAX_SPEC_CHARACTERS or not 0 <= built < 1 << 32 for spec, built in found.layers.items()
-    ):
-        raise wrong("a layer is no spec with its builder version")
+    if POINTS not in found.layers:
+        raise wrong("its layers have no points")
+    check_layers(found.layers, wrong)
     count = len(found.shard_cells) // 4
     root = Root(
         id_prefix=found.id_prefix,
@@ -286,20 +290,35 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
         largest_m=found.largest_m,
         mean_m=found.mean_m,
         layers=found.layers,
-        keys=_column(found.shard_keys, "<i4", count, 2, wrong),
-        counts=_column(found.shard_cells, "<u4", count, 1, wrong),
-        sizes=_column(found.shard_bytes, "<u4", count, 1, wrong),
-        hashes=_column(found.shard_sha256, "u1", count, 32, wrong),
+        keys=unpack_column(found.shard_keys, "<i4", count, 2, wrong),
+        counts=unpack_column(found.shard_cells, "<u4", count, 1, wrong),
+        sizes=unpack_column(found.shard_bytes, "<u4", count, 1, wrong),
+        hashes=unpack_column(found.shard_sha256, "u1", count, 32, wrong),
         map_version=map_version_of(unpacked),
     )
-    order = (root.keys[:, 0].astype(np.int64) << 32) + root.keys[:, 1]
-    if not count or (np.diff(order) <= 0).any():
-        raise wrong("its shards do not ascend")
+    if not count:
+        raise wrong("it has no shard")
+    check_shards(root.keys, root.sizes, wrong)
     if int(root.counts.sum(dtype=np.uint64)) != root.cells or not root.counts.all():
         raise wrong(f"its shards do not have {root.cells:,} cells")
-    if not root.sizes.all() or int(root.sizes.max()) > MAX_SHARD_BYTES:
-        raise wrong(f"a shard is empty, or larger than {MAX_SHARD_BYTES:,} bytes")
     return root
+
+
+def check_layers(layers: Mapping[str, int], wrong: Damage) -> None:
+    """Refuse what are no specs with their builder versions."""
+    if len(layers) > MAX_LAYERS:
+        raise wrong("its layers are too many")
+    if any(len(spec) > _MAX_SPEC_CHARACTERS or not 0 <= built < 1 << 32 for spec, built in layers.items()):
+        raise wrong("a layer is no spec with its builder version")
+
+
+def check_shards(keys: NDArray[np.int32], sizes: NDArray[np.uint32], wrong: Damage) -> None:
+    """Refuse shards that do not ascend, or whose objects are empty or too large."""
+    order = (keys[:, 0].astype(np.int64) << 32) + keys[:, 1]
+    if (np.diff(order) <= 0).any():
+        raise wrong("its shards do not ascend")
+    if not sizes.all() or int(sizes.max(initial=0)) > MAX_SHARD_BYTES:
+        raise wrong(f"a shard is empty, or larger than {MAX_SHARD_BYTES:,} bytes")
 
 
 def is_id_prefix(text: str) -> bool:
@@ -405,15 +424,15 @@ def pack_shard(shard: Shard) -> bytes:
     return msgspec.msgpack.encode(
         ShardFields(
             names=b"\0".join(shard.names),
-            boxes=_packed(shard.boxes, "<f8"),
-            z=_packed(shard.z, "<f8"),
-            points=_packed(shard.points, "<u4"),
+            boxes=pack_column(shard.boxes, "<f8"),
+            z=pack_column(shard.z, "<f8"),
+            points=pack_column(shard.points, "<u4"),
             layers={
                 spec: LayerFields(
-                    size=_packed(layer.sizes, "<u4"),
-                    raw_size=_packed(layer.raws, "<u4"),
-                    sha256=_packed(layer.hashes, "u1"),
-                    content_sha256=_packed(layer.contents, "u1"),
+                    size=pack_column(layer.sizes, "<u4"),
+                    raw_size=pack_column(layer.raws, "<u4"),
+                    sha256=pack_column(layer.hashes, "u1"),
+                    content_sha256=pack_column(layer.contents, "u1"),
                 )
                 for spec, layer in sorted(shard.layers.items())
             },
@@ -430,11 +449,11 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int, *, name: st
         If it is not that object, or no sound shard of this root (cause ``damaged``).
     """
     name = name or f"shard {root.keys[number].tolist()}"
-    wrong = _Wrong(name)
+    wrong = Damage(name)
     if sha256(frame).digest() != root.shard_sha256(number):
         raise wrong("its SHA-256 is not its name")
     unpacked = unpack_frame(frame, MAX_SHARD_BYTES, name=name)
-    found = _decode(unpacked, ShardFields, wrong)
+    found = decode_map(unpacked, _SHARD, wrong)
     count = int(root.counts[number])
     names = tuple(found.names.split(b"\0"))
     if len(names) != count or any(not is_relative_path(one) for one in names):
@@ -445,15 +464,15 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int, *, name: st
         raise wrong("its layers are not the root's")
     shard = Shard(
         names=names,
-        boxes=_column(found.boxes, "<f8", count, 4, wrong),
-        z=_column(found.z, "<f8", count, 2, wrong),
-        points=_column(found.points, "<u4", count, 1, wrong),
+        boxes=unpack_column(found.boxes, "<f8", count, 4, wrong),
+        z=unpack_column(found.z, "<f8", count, 2, wrong),
+        points=unpack_column(found.points, "<u4", count, 1, wrong),
         layers={
             spec: LayerObjects(
-                sizes=_column(layer.size, "<u4", count, 1, wrong),
-                raws=_column(layer.raw_size, "<u4", count, 1, wrong),
-                hashes=_column(layer.sha256, "u1", count, 32, wrong),
-                contents=_column(layer.content_sha256, "u1", count, 32, wrong),
+                sizes=unpack_column(layer.size, "<u4", count, 1, wrong),
+                raws=unpack_column(layer.raw_size, "<u4", count, 1, wrong),
+                hashes=unpack_column(layer.sha256, "u1", count, 32, wrong),
+                contents=unpack_column(layer.content_sha256, "u1", count, 32, wrong),
             )
             for spec, layer in found.layers.items()
         },
@@ -496,7 +515,7 @@ def is_relative_path(name: bytes) -> bool:
 # --- columns ------------------------------------------------------------------------------------------
 
 
-class _Wrong:
+class Damage:
     """Makes the error of one object."""
 
     def __init__(self, name: str) -> None:
@@ -506,19 +525,22 @@ class _Wrong:
         return MapDataError(message, path=self._name, cause=DAMAGED)
 
 
-def _decode(unpacked: bytes, kind: type[_Struct], wrong: _Wrong) -> _Struct:
+def decode_map(unpacked: bytes, decoder: msgspec.msgpack.Decoder[_Struct], wrong: Damage) -> _Struct:
+    """Read what is in a frame; the error is ``wrong``'s."""
     try:
-        found: _Struct = _DECODERS[kind].decode(unpacked)
+        found: _Struct = decoder.decode(unpacked)
         return found
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise wrong(f"no MessagePack map of its kind: {error}") from None
 
 
-def _packed(column: NDArray[Any], dtype: str) -> bytes:
+def pack_column(column: NDArray[Any], dtype: str) -> bytes:
+    """Return a column's rows, one after the other."""
     return np.ascontiguousarray(column, np.dtype(dtype)).tobytes()
 
 
-def _column(data: bytes, dtype: str, count: int, width: int, wrong: _Wrong) -> NDArray[Any]:
+def unpack_column(data: bytes, dtype: str, count: int, width: int, wrong: Damage) -> NDArray[Any]:
+    """Read a column of ``count`` rows of ``width`` numbers."""
     kind = np.dtype(dtype)
     if len(data) != count * width * kind.itemsize:
         raise wrong("its columns are not of one length")

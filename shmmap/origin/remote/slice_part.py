@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one slice of a run has made: shards of a published map to which layers were added.
+
+A *run* adds layers to one version of a map.  Its slices are made each by itself, anywhere and in any order;
+what a slice has made is its *part*.  The name of a run follows from the version's content, the layers and the
+number of slices: so programs that make slices of the same run need not know of each other.  ``ORIGIN.md`` is
+the byte-exact document.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import BadRequest, MapDataError
+from shmmap.origin.remote.published_index import (
+    POINTS,
+    Damage,
+    Root,
+    check_layers,
+    check_shards,
+    decode_map,
+    pack_column,
+    unpack_column,
+)
+from shmmap.origin.remote.zstd_frame import pack_frame, unpack_frame
+
+__all__ = [
+    "MAX_PART_BYTES",
+    "MAX_SLICES",
+    "PARTS",
+    "Part",
+    "RunName",
+    "pack_part",
+    "part_number",
+    "read_run",
+    "run_of",
+    "slice_of_shards",
+    "unpack_part",
+    "with_parts",
+]
+
+PARTS: Final = "parts/"
+MAX_PART_BYTES: Final = 16 << 20
+"""Of the object, and of what is in it."""
+MAX_SLICES: Final = 100_000
+FORMAT: Final = "shmmap slice"
+READER: Final = 1
+_RUN: Final = re.compile(r"([0-9a-f]{16})-([1-9]\d{0,5})")
+_DIGEST_BYTES: Final = 32
+
+
+class RunName(NamedTuple):
+    """Name of a run: 16 hex digits, and how many slices it has."""
+
+    digest: str
+    slices: int
+
+    def __str__(self) -> str:
+        return f"{self.digest}-{self.slices}"
+
+    @property
+    def path(self) -> str:
+        """Where its parts lie, from the map's URL."""
+        return f"{PARTS}{self}/"
+
+    def part_path(self, number: int) -> str:
+        """Where the part of a slice lies; the first is 1."""
+        return f"{self.path}{number}"
+
+
+def run_of(content: bytes, layers: Iterable[str], slices: int) -> RunName:
+    """Return the name of a run.
+
+    Parameters
+    ----------
+    content
+        Content digest of the version's root, 32 bytes.
+    layers
+        Specs in canonical form, in any order.
+    """
+    named = content + struct.pack("<I", slices)
+    for layer in sorted(layers):
+        spec = layer.encode()
+        named += struct.pack("<I", len(spec)) + spec
+    return RunName(sha256(named).digest()[:8].hex(), slices)
+
+
+def read_run(text: str) -> RunName:
+    """Read the name of a run; `BadRequest` if it is none."""
+    found = _RUN.fullmatch(text)
+    if found is None or int(found[2]) > MAX_SLICES:
+        raise BadRequest(
+            f"{text!r} is no name of a run", hint="`shmmap prepare URL --layer ... --shards I/N` prints it"
+        )
+    return RunName(found[1], int(found[2]))
+
+
+def part_number(run: RunName, path: str) -> int | None:
+    """Return the slice whose part lies there; None: something else does."""
+    name = path.removeprefix(run.path)
+    is_one = path.startswith(run.path) and re.fullmatch(r"[1-9]\d{0,5}", name) is not None
+    return int(name) if is_one and int(name) <= run.slices else None
+
+
+def slice_of_shards(root: Root, slices: int) -> NDArray[np.int64]:
+    """(S,) int64, ascending: which slice each shard of a root is in; the first slice is 1.
+
+    Each slice has about as many cells as the others; one may have no shard.
+    """
+    found: NDArray[np.int64] = root.first_indices[:-1] * slices // root.cells + 1
+    return found
+
+
+class PartFields(msgspec.Struct, frozen=True):
+    """The MessagePack map of a part, in this order of keys."""
+
+    format: str
+    min_reader: int
+    version: int
+    root_content: bytes
+    slice: int
+    slices: int
+    layers: dict[str, int]
+    shard_keys: bytes
+    shard_cells: bytes
+    shard_bytes: bytes
+    shard_sha256: bytes
+
+
+class _Head(msgspec.Struct, frozen=True):
+    """What says whether the rest can be read."""
+
+    format: str
+    min_reader: int
+
+
+# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+_HEAD: Final = msgspec.msgpack.Decoder(_Head)
+_PART: Final = msgspec.msgpack.Decoder(PartFields)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """What a slice has made.
+
+    Attributes
+    ----------
+    version
+        Number of the version that it was made from.
+    root_content
+        Content digest of that version's root, 32 bytes.
+    slice, slices
+        Which one of how many; the first is 1.
+    layers
+        Builder version of each layer of the run, by spec.
+    keys
+        (S, 2) int32, row and column of each shard of the slice, ascending.
+    counts, sizes
+        (S,) uint32, cells of each shard, bytes of its object with the layers of the run in it.
+    hashes
+        (S, 32) uint8, SHA-256 of that object, its name.
+    """
+
+    version: int
+    root_content: bytes
+    slice: int
+    slices: int
+    layers: Mapping[str, int]
+    keys: NDArray[np.int32]
+    counts: NDArray[np.uint32]
+    sizes: NDArray[np.uint32]
+    hashes: NDArray[np.uint8]
+
+    @property
+    def run(self) -> RunName:
+        """The run that it belongs to."""
+        return run_of(self.root_content, self.layers, self.slices)
+
+
+def pack_part(part: Part) -> bytes:
+    """Return the object of a part."""
+    return pack_frame(
+        msgspec.msgpack.encode(
+            PartFields(
+                format=FORMAT,
+                min_reader=READER,
+                version=part.version,
+                root_content=part.root_content,
+                slice=part.slice,
+                slices=part.slices,
+                layers=dict(sorted(part.layers.items())),
+                shard_keys=pack_column(part.keys, "<i4"),
+                shard_cells=pack_column(part.counts, "<u4"),
+                shard_bytes=pack_column(part.sizes, "<u4"),
+                shard_sha256=pack_column(part.hashes, "u1"),
+            )
+        )
+    )
+
+
+def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: str = "") -> Part:
+    """Read and check the object of a slice's part.
+
+    Parameters
+    ----------
+    run, number
+        Where it lies: the run and the slice that it has to be of.
+    name
+        Of the object, for messages.
+
+    Raises
+    ------
+    MapDataError
+        It is no sound part of that slice (cause ``damaged``), or one that needs a later reader (``newer``).
+    """
+    name = name or run.part_path(number)
+    wrong = Damage(name)
+    unpacked = unpack_frame(frame, MAX_PART_BYTES, name=name)
+    head = decode_map(unpacked, _HEAD, wrong)
+    if head.format != FORMAT:
+        raise wrong(f"its format is {head.format[:40]!r}, not {FORMAT!r}")
+    if head.min_reader > READER:
+        raise MapDataError(
+            f"it needs reader {head.min_reader}, this is reader {READER}",
+            path=name,
+            cause="newer",
+            hint="update shmmap",
+        )
+    found = decode_map(unpacked, _PART, wrong)
+    if len(found.root_content) != _DIGEST_BYTES or not 1 <= found.version < 1 << 63:
+        raise wrong("it names no version")
+    if (found.slice, found.slices) != (number, run.slices):
+        raise wrong(f"it is slice {found.slice} of {found.slices}, not {number} of {run.slices}")
+    if not found.layers or POINTS in found.layers:
+        raise wrong("its layers are none, or have points")
+    check_layers(found.layers, wrong)
+    count = len(found.shard_cells) // 4
+    part = Part(
+        version=found.version,
+        root_content=found.root_content,
+        slice=found.slice,
+        slices=found.slices,
+        layers=found.layers,
+        keys=unpack_column(found.shard_keys, "<i4", count, 2, wrong),
+        counts=unpack_column(found.shard_cells, "<u4", count, 1, wrong),
+        sizes=unpack_column(found.shard_bytes, "<u4", count, 1, wrong),
+        hashes=unpack_column(found.shard_sha256, "u1", count, 32, wrong),
+    )
+    check_shards(part.keys, part.sizes, wrong)
+    if not part.counts.all():
+        raise wrong("a shard has no cell")
+    if part.run != run:
+        raise wrong(f"it is of run {part.run}")
+    return part
+
+
+def with_parts(root: Root, parts: Sequence[Part]) -> Root:
+    """Return the root that has the shards of these parts, and the layers of their run.
+
+    Raises
+    ------
+    MapDataError
+        A part has other shards than those of its slice.
+    """
+    sizes, hashes = root.sizes.copy(), root.hashes.copy()
+    layers = dict(root.layers)
+    for part in parts:
+        numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
+        same = np.array_equal(root.keys[numbers], part.keys) and np.array_equal(
+            root.counts[numbers], part.counts
+        )
+        if not same:
+            wrong = Damage(part.run.part_path(part.slice))
+            raise wrong(f"its shards are not those of slice {part.slice} of {part.slices}")
+        sizes[numbers], hashes[numbers] = part.sizes, part.hashes
+        layers |= part.layers
+    return replace(root, layers=dict(sorted(layers.items())), sizes=sizes, hashes=hashes)

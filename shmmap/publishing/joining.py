@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joining a run: what its slices have made becomes the current version, at once.
+
+Slices never switch a version; this alone does.  Killed at any moment, the version that was current is whole;
+run again, it finishes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from hashlib import sha256
+from itertools import groupby
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
+from shmmap.failpoints import step
+from shmmap.origin.remote.map_versions import (
+    CurrentState,
+    add_version,
+    changed_meanwhile,
+    new_entry,
+    read_current,
+    read_shards,
+    refuse_if_signed,
+)
+from shmmap.origin.remote.published_index import Root, map_version_of, pack_root
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.slice_part import (
+    MAX_PART_BYTES,
+    Part,
+    RunName,
+    part_number,
+    read_run,
+    slice_of_shards,
+    unpack_part,
+    with_parts,
+)
+from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.zstd_frame import pack_frame
+from shmmap.prepare.run import PrepareProgress
+from shmmap.publishing.publish import LONGEST_S, packed_root
+from shmmap.publishing.restore import object_sizes
+from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
+from shmmap.publishing.slicing import BaseVersion, changed_layers, read_base
+
+if TYPE_CHECKING:
+    from shmmap.publishing.signing import MapSigner
+
+__all__ = ["Joined", "join_slices", "numbers_text"]
+
+_OLD_S: Final = 6 * 86_400.0  # pruning may remove what no version names after seven days
+_READ_AT_ONCE: Final = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """What a join came to.
+
+    Attributes
+    ----------
+    version
+        The new version's number; None where the current one has these layers already.
+    current, map_version, root
+        Number, map version, and hash of the root of the version that is current now.
+    cells, layers
+        Of that version.
+    objects
+        How many were looked for.
+    """
+
+    run: RunName
+    version: int | None
+    current: int
+    map_version: int
+    root: str
+    cells: int
+    layers: tuple[str, ...]
+    objects: int = 0
+
+
+def join_slices(
+    store: Store, run: str, *, progress: PrepareProgress, signer: MapSigner | None = None
+) -> Joined:
+    """Make a version of what all slices of a run have made, and make it current.
+
+    Parameters
+    ----------
+    run
+        Its name, as `prepare_slice` gives it.
+    signer
+        Signs the version; needed for a map that is signed.
+
+    Raises
+    ------
+    BadRequest
+        It is no name of a run; the run is of another version than the current one; the store is read-only,
+        or the map is signed and there is no signer.
+    MapMissing
+        Nothing is published there, or some slices are not made, which are named.
+    MapDataError
+        A part or what it names is damaged, gone, or of another builder than other parts.
+    InstanceBusy
+        Another publisher was quicker: its version is current.
+    CannotWrite, Offline
+        The store refuses, does not answer, or it took longer than a day.
+    """
+    if store.read_only:
+        raise BadRequest(f"{store.url}: {store.read_only}")
+    name = read_run(run)
+    if signer is None:
+        refuse_if_signed(store, "join with the keys that signed it: --sign KEYDIR")
+    seen = read_current(store) if signer is None else signer.begin()
+    if seen.current is None:
+        raise MapMissing(f"no map is published at {store.url}")
+    base = read_base(store, seen.current)
+    return _Join(store, name, base, seen, progress, signer).run()
+
+
+class _Join:
+    """One join."""
+
+    def __init__(
+        self,
+        store: Store,
+        run: RunName,
+        base: BaseVersion,
+        seen: CurrentState,
+        progress: PrepareProgress,
+        signer: MapSigner | None,
+    ) -> None:
+        self._store = store
+        self._run = run
+        self._base = base
+        self._seen = seen
+        self._progress = progress
+        self._signer = signer
+        self._began_s = time.monotonic()
+
+    def run(self) -> Joined:
+        parts = self._read_parts()
+        if self._are_joined(parts):
+            return self._unchanged(parts)
+        self._check(parts)
+        layers = next(iter(parts.values())).layers.keys()
+        root = with_parts(self._base.root, list(parts.values()))
+        unpacked = packed_root(root, self._store.url)
+        if unpacked == pack_root(self._base.root):
+            return self._unchanged(parts)
+        frame = pack_frame(unpacked)
+        digest = sha256(frame).digest()
+        step("join.root")
+        send_object(self._store, blob_path(digest), frame)
+        step("join.entry")
+        # from here on pruning spares its objects; what had been removed before is found to be absent
+        entry = new_entry(self._store, digest.hex(), len(frame), self._base.current)
+        objects = self._look_for_objects(root, layers)
+        step("join.looked")
+        if time.monotonic() - self._began_s > LONGEST_S:
+            raise CannotWrite(
+                f"joining at {self._store.url} took longer than a day: the version is not made current",
+                hint="run the same command again",
+            )
+        if self._signer is None:
+            add_version(self._store, entry, self._seen)
+        else:
+            self._signer.switch(entry)
+        self._remove(parts)
+        self._progress.done(root.cells)
+        return Joined(
+            self._run,
+            entry.version,
+            entry.version,
+            map_version_of(unpacked),
+            entry.root,
+            root.cells,
+            tuple(root.layers),
+            objects,
+        )
+
+    def _unchanged(self, parts: Mapping[int, Part]) -> Joined:
+        current, root = self._base.current, self._base.root
+        if self._signer is not None:
+            self._signer.keep(current)
+        self._remove(parts)
+        self._progress.done(root.cells)
+        return Joined(
+            self._run,
+            None,
+            current.version,
+            root.map_version,
+            current.root,
+            root.cells,
+            tuple(root.layers),
+        )
+
+    # --- parts ----------------------------------------------------------------------------------
+
+    def _read_parts(self) -> dict[int, Part]:
+        """Read the parts that are there, by slice, ascending."""
+        run, store = self._run, self._store
+        found = (part_number(run, listed.path) for listed in store.list(run.path))
+        numbers = sorted(number for number in found if number is not None)
+
+        def read(number: int) -> Part:
+            path = run.part_path(number)
+            try:
+                return unpack_part(store.get(path, MAX_PART_BYTES), run, number, name=f"{store.url}/{path}")
+            except MapDataError as error:
+                error.hint = error.hint or f"make slice {number} again, which replaces it"
+                raise
+
+        try:
+            with ThreadPoolExecutor(_READ_AT_ONCE, "part") as threads:
+                return {part.slice: part for part in threads.map(read, numbers)}
+        except MapMissing:
+            self._refuse_if_changed()  # another join has removed it
+            raise
+
+    def _refuse_if_changed(self) -> None:
+        if read_current(self._store).current != self._base.current:
+            raise changed_meanwhile(self._store)
+
+    def _are_joined(self, parts: Mapping[int, Part]) -> bool:
+        """Whether the current version has all that these parts say: a join was killed after its switch."""
+        root = self._base.root
+        has_shards = False
+        for part in parts.values():
+            numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
+            has_shards |= len(numbers) > 0
+            is_in = (
+                part.layers.items() <= root.layers.items()
+                and np.array_equal(root.keys[numbers], part.keys)
+                and np.array_equal(root.counts[numbers], part.counts)
+                and np.array_equal(root.sizes[numbers], part.sizes)
+                and np.array_equal(root.hashes[numbers], part.hashes)
+            )
+            if not is_in:
+                return False
+        return has_shards and all(part.root_content != self._base.content for part in parts.values())
+
+    def _check(self, parts: Mapping[int, Part]) -> None:
+        """Refuse parts that are not those of all slices, of the current version, by one builder."""
+        run, store, base = self._run, self._store, self._base
+        if not parts:
+            self._refuse_if_changed()
+            raise MapMissing(
+                f"no slice of run {run} is at {store.url}",
+                hint="`shmmap prepare URL --layer ... --shards I/N` makes them; of a joined run none is left",
+            )
+        first = next(iter(parts.values()))
+        if first.root_content != base.content:  # that of all: the name of the run has it
+            same = first.version == base.current.version
+            raise BadRequest(
+                f"run {run} was made from {'another ' * same}version {first.version},"
+                f" version {base.current.version} is current: its slices have to be made again",
+                hint="`shmmap prepare URL` with the same options makes them from the current version",
+            )
+        missing = sorted(set(range(1, run.slices + 1)) - parts.keys())
+        if missing:
+            raise MapMissing(
+                f"slices {numbers_text(missing)} of {run.slices} are not made yet: run {run} at {store.url}",
+                hint=f"make them: `shmmap prepare URL` with the same options and"
+                f" --shards {missing[0]}/{run.slices}",
+            )
+        self._check_builders(parts)
+
+    def _check_builders(self, parts: Mapping[int, Part]) -> None:
+        first = next(iter(parts.values()))
+        for layer, built in first.layers.items():
+            others = [part for part in parts.values() if part.layers[layer] != built]
+            if others:
+                other = others[0].layers[layer]
+                slices = numbers_text(part.slice for part in others if part.layers[layer] == other)
+                raise MapDataError(
+                    f"{layer} of slices {slices} of {self._run.slices} is of builder version {other},"
+                    f" of slice {first.slice} of {built}",
+                    path=self._store.url,
+                    cause="other_builder",
+                    hint="use one version of shmmap on all machines, and make those slices again",
+                )
+
+    def _remove(self, parts: Mapping[int, Part]) -> None:
+        """Remove the parts; those without shards first: they alone would not say that the run was joined."""
+        for number, _ in sorted(parts.items(), key=lambda one: len(one[1].keys)):
+            step("join.part")
+            self._store.delete(self._run.part_path(number))
+
+    # --- objects --------------------------------------------------------------------------------
+
+    def _look_for_objects(self, root: Root, layers: Collection[str]) -> int:
+        """Look for every object of a root, which may differ from the current one in these layers alone."""
+        base = self._base.root
+        belongs = slice_of_shards(base, self._run.slices).tolist()
+        since_s = time.time() - _OLD_S
+        absent: dict[int, int] = {}  # how many, by slice; 0: of the version before
+        looked = 0
+        self._progress.stage("look for objects", root.cells)
+        shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)
+        with ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads:
+            for number, (of_slice, before, after) in enumerate(shards):
+                path = f"{self._store.url}/{self._run.part_path(of_slice)}"
+                changed = changed_layers(before, after, layers, name=path)
+                named = {name: set(object_sizes(layer)) for name, layer in after.layers.items()}
+                old = {one for name, objects in named.items() if name not in changed for one in objects}
+                new = {one for name in changed for one in named[name]} - old
+                if changed:
+                    new.add((root.shard_sha256(number), int(root.sizes[number])))
+                for key, objects, since in ((0, old, 0.0), (of_slice, new, since_s)):
+                    looked += len(objects)
+                    gone = absent_objects(self._store, sorted(objects), threads, since_s=since)
+                    if gone:
+                        absent[key] = absent.get(key, 0) + len(gone)
+                self._progress.advance(len(after))
+        self._refuse_absent(absent)
+        return looked
+
+    def _refuse_absent(self, absent: Mapping[int, int]) -> None:
+        slices = sorted(absent.keys() - {0})
+        if slices:
+            count = sum(absent[number] for number in slices)
+            raise MapDataError(
+                f"{count:,} objects of slices {numbers_text(slices)} of {self._run.slices} are not there, or"
+                " older than six days",
+                path=self._store.url,
+                hint="make those slices again: `shmmap prepare URL` with the same options",
+            )
+        if absent:
+            raise MapDataError(
+                f"{absent[0]:,} objects of version {self._base.current.version} are not there",
+                path=self._store.url,
+                hint="publish its map again, with --resend",
+            )
+
+
+def numbers_text(numbers: Iterable[int]) -> str:
+    """Return ascending numbers as text, runs of them as ``first-last``: ``3, 7-9``."""
+    ordered = list(numbers)
+    places = [number - place for place, number in enumerate(ordered)]
+    found = []
+    for _, group in groupby(zip(places, ordered, strict=True), key=lambda one: one[0]):
+        some = [number for _, number in group]
+        found.append(str(some[0]) if len(some) == 1 else f"{some[0]}-{some[-1]}")
+    return ", ".join(found)

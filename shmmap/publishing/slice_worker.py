@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A slice's worker: a process that makes layers of cells of a published map and sends their objects.
+
+Points are fetched for the next cells while one is made; they are made and sent as `shmmap.publishing.worker`
+does it with files.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Final
+
+from shmmap.errors import LoadFailed, MapDataError, MapMissing, Offline, ShmmapError
+from shmmap.layers.contract import Box
+from shmmap.layers.derive import CellJob
+from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.making import cache_key
+from shmmap.layers.points import LAYER
+from shmmap.layers.sources import CellSource, read_segment
+from shmmap.layers.spec import LayerSpec, layer_spec
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
+from shmmap.origin.remote.opened_store import open_store
+from shmmap.origin.remote.published_object import CellIdentity, ObjectName, write_segment
+from shmmap.origin.remote.published_source import stamp_of, unpack_source
+from shmmap.origin.remote.zstd_frame import unpack_frame
+from shmmap.prepare.work import CellTask, Ready, decode_task, encode
+from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.publishing.known_objects import KnownObjects
+from shmmap.publishing.messages import CellSent, NotSent, decode_slice_settings
+from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, LayerRefused, Sender, run_worker
+from shmmap.segment.source import Source
+from shmmap.segment.version import Stamp
+
+__all__ = ["HELD_BYTES", "PublishedPoints", "main"]
+
+HELD_BYTES: Final = 128 << 20
+"""Of fetched objects in memory: of neighbours those that the next cells look into as well."""
+_OF_THE_STORE: Final = (Offline.code, MapMissing.code)
+"""What one cell meets there, each other one would: the run ends."""
+
+
+class PublishedPoints:
+    """Reads the points of a published map's cells; see `shmmap.layers.source_reader.SourceReader`.
+
+    Parameters
+    ----------
+    objects
+        Reads objects, verified.
+    threads
+        Fetch ahead.
+    max_bytes
+        Most bytes of objects that are held in memory.
+    """
+
+    fetcher = None
+
+    def __init__(self, objects: KeptObjects, threads: Executor, *, max_bytes: int = HELD_BYTES) -> None:
+        self._objects = objects
+        self._threads = threads
+        self._max_bytes = max_bytes
+        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # used last, last
+        self._bytes = 0
+
+    def begin(self, sources: Sequence[Source]) -> None:
+        """Begin to fetch the points of cells, as far as there is room; returns at once."""
+        for source in sources:
+            name = unpack_source(source)[LAYER].name
+            if name not in self._held and self._bytes + name.size <= self._max_bytes:
+                self._hold(name)
+
+    def stamp(self, source: Source) -> Stamp:
+        """Return the state that its objects are of: they never change."""
+        return stamp_of(source)
+
+    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
+        """Read the columns that a layer needs of a cell's points.
+
+        Raises
+        ------
+        LoadFailed
+            They are damaged: a layer made without them would be another one.
+        Offline, MapMissing
+            They cannot be fetched.
+        """
+        name = unpack_source(source)[LAYER].name
+        identity = CellIdentity(source.name, box, "", self.stamp(source))
+        path = f"{self._objects.url}/{name.path}"
+        fd = os.memfd_create("points", os.MFD_CLOEXEC)
+        try:
+            unpacked = unpack_frame(self._frame(name), name.raw, name=path, exact=True)
+            header = write_segment(unpacked, fd, identity, LAYER, name=path)
+            del unpacked
+            return read_segment(fd, box, needs, header)
+        except MapDataError as error:
+            raise LoadFailed(str(error), cell_id=source.name) from None
+        finally:
+            os.close(fd)
+
+    def fill(
+        self,
+        spec: LayerSpec,
+        job: CellJob,
+        fd: int,
+        *,
+        reserve: Callable[[int], None] | None,
+        warn: Callable[[str], None],
+    ) -> None:
+        """None: each layer is computed."""
+        del spec, job, fd, reserve, warn
+
+    def named(self, message: str) -> str:
+        """Return the message as it is: it names cells by their ids."""
+        return message
+
+    def explain(self, source: Source, message: str) -> str:
+        """Return the message as it is."""
+        del source
+        return message
+
+    def _frame(self, name: ObjectName) -> memoryview:
+        held = self._held.get(name) or self._hold(name)
+        self._held.move_to_end(name)
+        try:
+            return held.result()
+        except ShmmapError as error:
+            del self._held[name]
+            self._bytes -= name.size
+            if not isinstance(error, MapDataError):
+                raise
+            return self._objects.read(name.sha256, name.size)  # it may have been damaged on its way
+
+    def _hold(self, name: ObjectName) -> Future[memoryview]:
+        held = self._held[name] = self._threads.submit(self._objects.read, name.sha256, name.size)
+        self._bytes += name.size
+        while self._bytes > self._max_bytes and len(self._held) > 1:
+            oldest, _ = self._held.popitem(last=False)
+            self._bytes -= oldest.size
+        return held
+
+
+class _Tasks:
+    """The tasks of a worker: those that have come are begun while the one before is worked on."""
+
+    def __init__(self, channel: socket.socket, begin: Callable[[CellTask], None]) -> None:
+        self._channel = channel
+        self._begin = begin
+
+    def __iter__(self) -> Iterator[CellTask]:
+        waiting: deque[CellTask] = deque()
+        while True:
+            while (data := self._receive(wait=not waiting)) is not None:
+                if not data:
+                    return
+                task = decode_task(data)
+                self._begin(task)
+                waiting.append(task)
+            yield waiting.popleft()
+
+    def _receive(self, *, wait: bool) -> bytes | None:
+        """The next packet; empty: the channel is closed; None: there is none yet."""
+        try:
+            return self._channel.recv(MAX_PACKET_BYTES, 0 if wait else socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return None
+
+
+def _work(channel: socket.socket, argument: str) -> None:
+    settings = decode_slice_settings(argument)
+    store = open_store(
+        settings.url,
+        insecure_http=settings.insecure_http,
+        instance_credentials=settings.instance_credentials,
+    )
+    cache = tier = None
+    if settings.cache_bytes:
+        cache = LayerCache(settings.cache_dir, limit_bytes=settings.cache_bytes)
+        tier = ObjectTier(settings.cache_dir, limit_bytes=settings.cache_bytes)
+    sending = threading.Lock()
+
+    def send(message: CellSent | NotSent) -> None:
+        with sending:
+            channel.send(encode(message))
+
+    sender = Sender(store, send, is_first=False)
+    channel.send(encode(Ready()))
+    with (
+        ThreadPoolExecutor(TASKS_AHEAD, "fetch") as fetching,
+        ThreadPoolExecutor(TASKS_AHEAD, "send") as pool,
+    ):
+        points = PublishedPoints(KeptObjects(store, tier, keep=settings.keep_points), fetching)
+        maker = CellMaker(KnownObjects(""), cache, keep=True, reader=points)
+
+        def begin(task: CellTask) -> None:
+            if not _is_kept(task, cache, points):
+                near = {one.source: None for around in task.around for one in around}
+                points.begin([task.source, *near])
+
+        def make(task: CellTask) -> None:
+            try:
+                cell = maker.make(task)
+            except LayerRefused as error:
+                layer = "" if error.code in _OF_THE_STORE else error.layer
+                send(NotSent(task.number, layer, error.code, error.message[:2000], error.hint))
+            else:
+                pool.submit(sender.send, task.number, cell)
+
+        for task in _Tasks(channel, begin):
+            make(task)
+
+
+def _is_kept(task: CellTask, cache: LayerCache | None, points: PublishedPoints) -> bool:
+    """Whether all layers of a cell are in the cache: its points are then not needed."""
+    if cache is None:
+        return False
+    keys = (
+        cache_key(
+            layer_spec(layer),
+            CellJob(task.cell_id, task.source, task.box, task.frame_id, around, points),
+        )
+        for layer, around in zip(task.layers, task.around, strict=True)
+    )
+    return all(key is not None and cache.has(key) for key in keys)
+
+
+def main(arguments: list[str]) -> int:
+    """Run with ``CHANNEL_FD PARENT_PID SETTINGS``, the settings as JSON."""
+    return run_worker(arguments, _work)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
