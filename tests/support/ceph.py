@@ -128,7 +128,7 @@ class CephServer(BucketServer):
         self.wait_for_gateway()
 
     def wait_for_disks(self, up: int) -> None:
-        """Wait until so many disks are up."""
+        """Wait until this number of disks is up."""
         waiting = Patience()
         while waiting(f" {up} up" not in self.run("ceph", "osd", "stat")):
             pass
