@@ -47,6 +47,7 @@ from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import Chore, ServingLoop
+from shmmap.daemon.telemetry.published_gauges import PublishedGauges, VersionInService
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.listener import Connections, Listener
@@ -69,7 +70,7 @@ LAST_WORDS_S: Final = 0.2
 """How long the end may take to deliver what was sent last."""
 
 
-class Elsewhere(Protocol):
+class Elsewhere(VersionInService, Protocol):
     """An origin that is not on this machine."""
 
     @property
@@ -122,6 +123,7 @@ class Service:
         take_slices(SERVING_SLICE_NS)
         self._connections = Connections()
         self._sockets: list[tuple[SocketFile, Listener]] = []
+        self._published = PublishedGauges(memory.statistics)
         self._look_s = 0.0
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
@@ -297,6 +299,7 @@ class Service:
             self._reload()
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)
+            self._published.look(self._elsewhere)
         version = memory.cache.catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)

@@ -126,10 +126,12 @@ class KeepingAhead:
         if health.is_out and self._out_since_s is None:
             self._out_since_s = now_s
             statistics.add("origin_outages")
+            statistics.set("origin_out_since_unix_ns", time.time_ns())
         if self._out_since_s is not None:
             statistics.set("last_outage_ns", int((now_s - self._out_since_s) * 1e9))
             if not health.is_out:
                 self._out_since_s = None
+                statistics.set("origin_out_since_unix_ns", 0)
 
     def _next(self, current: _Round, now_s: float) -> _Looking | None:
         """The next client that moves, its way from the beginning; None if there is none."""
