@@ -205,7 +205,7 @@ COUNTERS: Final = (
         for name, text in WINDOWED.items()
         for span in SPANS
     ),
-    Counter("origin_out_since_unix_ns", "gauge", "ns", "Since when origin_out is 1, wall clock; 0: it is not"),
+    Counter("origin_out_since_unix_ns", "gauge", "ns", "Since when origin_out is 1, wall clock; else 0"),
     *_PUBLISHED,
 )
 
