@@ -109,8 +109,8 @@ def screen(
     if verdict.hint:
         lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
     lines += _ahead(counters, width)
-    if words := published_words(counters):
-        units: list[Line] = [[(text, "red" if trouble else "")] for text, trouble in words]
+    if pieces := published_words(counters):
+        units: list[Line] = [[(text, "red" if trouble else "")] for text, trouble in pieces]
         lines += _flowing("published", units, width)
     lines += _latencies(found, earlier)
     lines += _flowing("loop", _longest_turns(counters), width)
