@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +15,13 @@ from tests.unit.doctor.test_checks import Ward, told
 
 URL = "s3://maps/town"
 DAY_S = 86_400.0
-ANSWERS = {"answers": True, "first_s": 0.012, "next_s": 0.003, "version": 7, "credentials": "somewhere"}
+ANSWERS: dict[str, Any] = {
+    "answers": True,
+    "first_s": 0.012,
+    "next_s": 0.003,
+    "version": 7,
+    "credentials": "somewhere",
+}
 
 
 @pytest.fixture
@@ -26,8 +33,9 @@ def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) ->
     """Each row: its state, and what it says."""
     counts = {"published_version": 7, "published_refused": 0, "published_expires_unix_ns": 0}
     counts |= {"published_taken_unix_ns": time.time_ns(), **counters}
-    patient = ward.patient(told(**counts), map_path=url)
-    patient.seen.identity = None  # type: ignore[union-attr]  # the map is that of the settings
+    patient = ward.patient(told(**counts), map_path=url)  # type: ignore[arg-type]
+    assert patient.seen is not None
+    patient.seen.identity = None  # the map is that of the settings
     patient.__dict__["store"] = answer
     checks = (check_link, check_credentials, check_clock, check_versions)
     found = [check(patient) for check in checks]
@@ -70,16 +78,15 @@ def test_all_well(ward: Ward) -> None:
     ],
 )
 def test_what_is_not_as_it_should_be(
-    ward: Ward, answer: dict[str, object], row: str, state: str, says: str
+    ward: Ward, answer: dict[str, Any], row: str, state: str, says: str
 ) -> None:
-    found = look(ward, StoreAnswer(**answer))  # type: ignore[arg-type]
+    found = look(ward, StoreAnswer(**answer))
     assert found[row][0] == state
     assert says in found[row][1]
 
 
 def test_the_daemon_may_be_worse_off(ward: Ward) -> None:
-    out = {"origin_out": 1, "last_outage_ns": 90 * 10**9}
-    found = look(ward, StoreAnswer(**ANSWERS), **out)
+    found = look(ward, StoreAnswer(**ANSWERS), origin_out=1, last_outage_ns=90 * 10**9)
     assert found["link"][0] == "warn"
     assert "the daemon has not reached it for 90.0 s" in found["link"][1]
 
