@@ -97,7 +97,8 @@ def check_clock(patient: Patient) -> Finding:
         return skip(name, FILES)
     off_s = patient.store.clock_s
     if off_s is None:
-        return skip(name, "the store does not say what time it is")
+        answers = patient.store.answers
+        return skip(name, f"the store {'does not say what time it is' if answers else 'was not reached'}")
     if abs(off_s) <= MOST_OFF_S:
         return ok(name, f"within {max(abs(off_s), 1.0):.0f} s of the store's")
     side = "behind" if off_s > 0 else "ahead of"
