@@ -60,6 +60,7 @@ from shmmap.protocol.events import Epoch
 
 if TYPE_CHECKING:
     from shmmap.daemon.map.catalogue_view import CatalogueView
+    from shmmap.daemon.map.object_keeper import ObjectKeeper
     from shmmap.daemon.map.origin_link import OriginLink
 
 __all__ = ["Elsewhere", "Service"]
@@ -76,6 +77,10 @@ class Elsewhere(VersionInService, Protocol):
     @property
     def link(self) -> OriginLink:
         """Says whether it is in reach, and has another version."""
+
+    @property
+    def keeper(self) -> ObjectKeeper | None:
+        """Keeps objects of cells on the disk ahead; None where nothing is kept."""
 
     def note_served(self, view: CatalogueView) -> None:
         """Remember which version of the map is served now."""
@@ -151,6 +156,7 @@ class Service:
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, change.collect, "map")
         origin_watch: Chore | None = None
+        disk_ahead: Chore | None = None
         if elsewhere is not None:
             from shmmap.daemon.loading.origin_watch import OriginWatch
 
@@ -158,6 +164,11 @@ class Service:
                 elsewhere.link, scheduler, elsewhere.try_again, self._take_another
             )
             watched.watch(elsewhere.link.fd, one.collect, "map")
+            if elsewhere.keeper is not None:
+                from shmmap.daemon.loading.prefetch.disk_ahead import DiskAhead
+
+                disk_ahead = ahead = DiskAhead(cache, scheduler, elsewhere.keeper)
+                watched.watch(elsewhere.keeper.fd, ahead.collect, "memory")
         defects = Defects(statistics)
         dispatch = Dispatch(
             handshake,
@@ -177,6 +188,8 @@ class Service:
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
         if origin_watch is not None:
             chores.append(("map", origin_watch))
+        if disk_ahead is not None:
+            chores.append(("memory", disk_ahead))
         self._handshake = handshake
         self._loop = ServingLoop(
             watched,

@@ -10,6 +10,7 @@ import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
+from shmmap.daemon.map.object_keeper import ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.map.published_view import PublishedView
 from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
@@ -60,6 +61,8 @@ class PublishedOrigin:
         For loaders.
     link
         Says whether it is in reach, and has another version.
+    keeper
+        Keeps objects of cells on the disk ahead; None where nothing is kept.
     """
 
     def __init__(
@@ -94,6 +97,10 @@ class PublishedOrigin:
         self.link = OriginLink(self._has_another, poll_s)
         self._fetcher = ShardFetcher(self._index, self.link.doubt)
         self._pages: weakref.WeakSet[ShardPages] = weakref.WeakSet()
+        self.keeper: ObjectKeeper | None = None
+        if self._tier is not None:
+            cells = kept_objects(self._store, cache_dir, cache_bytes, quiet=True)
+            self.keeper = ObjectKeeper(cells, self._tier, self.link.doubt)
 
     # --- taking a version -------------------------------------------------------------------------
 
@@ -233,8 +240,11 @@ class PublishedOrigin:
 
     @property
     def counts(self) -> ObjectCounts:
-        """What was read of the index so far."""
-        return self._index.counts
+        """What the daemon itself has read so far: of the index, and of what is kept on the disk ahead."""
+        index = self._index.counts
+        if self.keeper is None:
+            return index
+        return ObjectCounts(*map(sum, zip(index, self.keeper.counts, strict=True)))
 
     def try_again(self) -> None:
         """Have fetched again what of the list of cells could not be had; called in the serving loop."""
@@ -243,8 +253,10 @@ class PublishedOrigin:
 
     def close(self) -> bool:
         """End all threads; False if one still waits for the origin."""
-        link, fetcher = self.link.close(), self._fetcher.close()
-        return link and fetcher and not self._is_loading
+        ended = [self.link.close(), self._fetcher.close()]
+        if self.keeper is not None:
+            ended.append(self.keeper.close())
+        return all(ended) and not self._is_loading
 
 
 class _OnDisk:

@@ -108,6 +108,16 @@ class ObjectTier:
             self._say(error)
         return None
 
+    def has(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bool:
+        """Whether there is a file of an object, of its size; what is in it is looked at when it is read."""
+        try:
+            with self._opened() as place:
+                status = os.stat(_path(digest, is_index), dir_fd=place, follow_symlinks=False)
+        except OSError as error:
+            self._say(error)
+            return False
+        return stat.S_ISREG(status.st_mode) and status.st_size == nbytes
+
     def put(self, digest: bytes, data: bytes | memoryview, *, is_index: bool = False) -> bool:
         """Keep an object whose hash was compared; False if it cannot be kept.
 
