@@ -55,10 +55,16 @@ def until_ahead(one: DaemonProcess, seconds: float) -> None:
         time.sleep(0.02)
 
 
-def drive(one: DaemonProcess, window: shmmap.MapWindow, before_each_s: float) -> None:
-    """Drive as far as is to be ridden out; the cells of each step are there when it comes to them."""
+def until_in_memory(one: DaemonProcess, *names: str) -> None:
+    waiting = Patience()
+    while waiting(not set(names) <= {row.id for row in read_statistics(one.instance, one.shm_dir).cells}):
+        time.sleep(0.02)
+
+
+def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
+    """Drive as far as is to be ridden out; no step is made before a vehicle could have come so far."""
     for x in range(STEP, DRIVEN_M, STEP):
-        until_ahead(one, before_each_s)
+        until_in_memory(one, f"{x - STEP}_0.pcd", f"{x}_0.pcd")
         update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S)
         assert update.complete, (x, update.failed)
     told = counters(one)
@@ -81,7 +87,7 @@ def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, we
         until_ahead(one, 0.9 * RIDE_OUT_S)
         web.refuse()
         until_out(one)
-        drive(one, window, 0.0)
+        drive(one, window)
 
 
 def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: FaultyWeb) -> None:
@@ -99,5 +105,5 @@ def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: 
         assert told["objects_fetched"] >= wanted
         web.refuse()
         until_out(one)
-        drive(one, window, 2 * STEP / SPEED)
+        drive(one, window)
         assert counters(one)["objects_from_disk"] > wanted // 2
