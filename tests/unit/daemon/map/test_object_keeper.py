@@ -58,7 +58,8 @@ class Keeper:
         return self.done(1)[0]
 
     def done(self, count: int) -> list[Kept]:
-        poll, found = select.poll(), []
+        poll = select.poll()
+        found: list[Kept] = []
         poll.register(self.keeper.fd, select.POLLIN)
         while len(found) < count:
             assert poll.poll(PATIENCE_MS)
