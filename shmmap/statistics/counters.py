@@ -76,6 +76,7 @@ _PUBLISHED: Final = (
     Counter("published_expires_unix_ns", "gauge", "ns", "When what signs it runs out; 0: it is not signed"),
     Counter("map_pages", "gauge", "", "Pages of the list of cells"),
     Counter("map_pages_known", "gauge", "", "Pages of it that are here"),
+    Counter("disk_ahead", "gauge", "", "1 while what lies ahead and has no room in memory is on the disk"),
 )
 
 PUBLISHED: Final = frozenset(counter.name for counter in _PUBLISHED)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import shmmap
+from shmmap.doctor.keeping_ahead import ahead_verdict
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
@@ -100,6 +101,11 @@ def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: 
         cells = Path(one.cache_dir)
         while waiting(sum(path.is_file() for path in cells.rglob("objects/cells/*/*")) < wanted):
             time.sleep(0.05)
+        said = "the rest of --ride-out (30.0 s) is on the disk"
+        while waiting(said not in (verdict := ahead_verdict(counters(one))).why):
+            window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE)
+            time.sleep(0.02)
+        assert verdict.state == "enough"
         told = counters(one)
         assert told["ahead_ns"] < 0.5 * RIDE_OUT_S * 1e9, "memory has no room for all of it"
         assert told["objects_fetched"] >= wanted

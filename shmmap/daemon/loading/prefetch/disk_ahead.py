@@ -41,6 +41,7 @@ class DiskAhead:
         self._prefetch.health = prefetcher.prefetch.health
         self._map_version = 0
         self._rest: dict[tuple[int, str], float] = {}  # until when a layer of a cell is not looked at again
+        self._lacking: set[tuple[int, str]] = set()  # not on the disk when they were last looked at
         self._next_s = self._resume_s = -math.inf
         self._now_s = 0.0
 
@@ -57,17 +58,23 @@ class DiskAhead:
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)
         if not is_asked or len(self._scheduler.loads):
             self._prefetch.restart()  # it holds no state of the map meanwhile
+            if not is_asked:
+                self._forget()
             self._next_s = now_s + LOOK_S
             return
         catalogue = self._cache.catalogue
         if catalogue.map_version != self._map_version or len(self._rest) > MOST_KNOWN:
             self._map_version = catalogue.map_version
             self._rest.clear()  # indices mean other cells
+            self._forget()
         self._follow()
         wish = self._prefetch.next(catalogue, now_s)
         if wish is None:
             self._next_s = now_s if self._prefetch.more else self._prefetch.next_s(now_s)
+            if not self._prefetch.more and not self._prefetch.health.is_out:
+                self._cache.statistics.set("disk_ahead", int(not self._lacking))
             return
+        self._lacking.add((wish.cell, wish.layer))
         self._rest[wish.cell, wish.layer] = math.inf
         key = KeptCell(catalogue.map_version, wish.cell, wish.layer)
         self._keeper.keep(key, self._objects(wish.cell, wish.layer))
@@ -79,9 +86,15 @@ class DiskAhead:
             map_version, cell, layer = kept.key
             if map_version == self._map_version:
                 self._rest[cell, layer] = self._now_s + (KEPT_S if kept.is_here else AGAIN_S)
+                if kept.is_here:
+                    self._lacking.discard((cell, layer))
             if kept.has_no_room:
                 self._resume_s = self._now_s + KEPT_S
         self._next_s = -math.inf
+
+    def _forget(self) -> None:
+        self._lacking.clear()
+        self._cache.statistics.set("disk_ahead", 0)
 
     def _follow(self) -> None:
         """Look along the paths that are looked along for memory."""
