@@ -11,7 +11,7 @@ import pytest
 
 from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
 from shmmap.doctor.store_probe import StoreAnswer
-from tests.unit.doctor.test_checks import Ward, told
+from tests.support.doctor_ward import Ward, told
 
 URL = "s3://maps/town"
 DAY_S = 86_400.0
