@@ -47,6 +47,7 @@ from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
 from shmmap.daemon.service_manager.status import ServiceManager, status_line
 from shmmap.daemon.serving_loop import Chore, ServingLoop
+from shmmap.daemon.telemetry.published_gauges import PublishedGauges, VersionInService
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.listener import Connections, Listener
@@ -59,6 +60,7 @@ from shmmap.protocol.events import Epoch
 
 if TYPE_CHECKING:
     from shmmap.daemon.map.catalogue_view import CatalogueView
+    from shmmap.daemon.map.object_keeper import ObjectKeeper
     from shmmap.daemon.map.origin_link import OriginLink
 
 __all__ = ["Elsewhere", "Service"]
@@ -69,12 +71,16 @@ LAST_WORDS_S: Final = 0.2
 """How long the end may take to deliver what was sent last."""
 
 
-class Elsewhere(Protocol):
+class Elsewhere(VersionInService, Protocol):
     """An origin that is not on this machine."""
 
     @property
     def link(self) -> OriginLink:
         """Says whether it is in reach, and has another version."""
+
+    @property
+    def keeper(self) -> ObjectKeeper | None:
+        """Keeps objects of cells on the disk ahead; None where nothing is kept."""
 
     def note_served(self, view: CatalogueView) -> None:
         """Remember which version of the map is served now."""
@@ -122,6 +128,7 @@ class Service:
         take_slices(SERVING_SLICE_NS)
         self._connections = Connections()
         self._sockets: list[tuple[SocketFile, Listener]] = []
+        self._published = PublishedGauges(memory.statistics)
         self._look_s = 0.0
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
@@ -149,6 +156,7 @@ class Service:
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, change.collect, "map")
         origin_watch: Chore | None = None
+        disk_ahead: Chore | None = None
         if elsewhere is not None:
             from shmmap.daemon.loading.origin_watch import OriginWatch
 
@@ -156,6 +164,11 @@ class Service:
                 elsewhere.link, scheduler, elsewhere.try_again, self._take_another
             )
             watched.watch(elsewhere.link.fd, one.collect, "map")
+            if elsewhere.keeper is not None:
+                from shmmap.daemon.loading.prefetch.disk_ahead import DiskAhead
+
+                disk_ahead = ahead = DiskAhead(cache, scheduler, elsewhere.keeper)
+                watched.watch(elsewhere.keeper.fd, ahead.collect, "memory")
         defects = Defects(statistics)
         dispatch = Dispatch(
             handshake,
@@ -175,6 +188,8 @@ class Service:
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
         if origin_watch is not None:
             chores.append(("map", origin_watch))
+        if disk_ahead is not None:
+            chores.append(("memory", disk_ahead))
         self._handshake = handshake
         self._loop = ServingLoop(
             watched,
@@ -297,6 +312,7 @@ class Service:
             self._reload()
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)
+            self._published.look(self._elsewhere)
         version = memory.cache.catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)

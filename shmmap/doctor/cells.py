@@ -48,6 +48,8 @@ def check_cells(patient: Patient) -> Finding:
             "the files are not to blame: give the daemon more memory (MemoryMax=, docker --memory), or divide"
             " the map into smaller cells",
         )
+    if patient.seen.counters.get("origin_out", 0):
+        return warn(name, fact, "they are loaded once the map's origin answers again: see the row `map`")
     prefix = patient.seen.identity.id_prefix if patient.seen.identity is not None else ""
     return warn(
         name, fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it"

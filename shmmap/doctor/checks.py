@@ -22,6 +22,7 @@ from shmmap.doctor.memory import (
     check_shared_memory,
 )
 from shmmap.doctor.patient import Patient
+from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
 from shmmap.doctor.ros_bridge import check_ros_bridge
 
 __all__ = ["CHECKS", "diagnose"]
@@ -31,6 +32,10 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_socket,
     check_group,
     check_map_access,
+    check_link,
+    check_credentials,
+    check_clock,
+    check_versions,
     check_reload,
     check_cells,
     check_shared_memory,

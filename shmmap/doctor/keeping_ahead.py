@@ -104,6 +104,9 @@ def ahead_verdict(counters: Mapping[str, int]) -> AheadVerdict:
             "out", f"no load has succeeded for {since}; {memory}", "`shmmap tail` says why loads fail"
         )
     if ahead_s < FILLED * ride_out_s:
+        if counters.get("disk_ahead", 0):
+            rest = f"the rest of --ride-out ({format_duration(ride_out_s)}) is on the disk"
+            return AheadVerdict("enough", f"{memory}; {rest}" + (f"; {came_late}" if late else ""))
         short = f"{memory}, less than --ride-out ({format_duration(ride_out_s)})"
         if given and needed > MOST_BUSY * given:
             return AheadVerdict(

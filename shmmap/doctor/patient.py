@@ -7,10 +7,12 @@ import dataclasses
 import os
 import pwd
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
+from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.names import usual_directory
@@ -114,6 +116,30 @@ class Patient:
             return 0
         pid = self.seen.identity.pid
         return pid if self.machine.path(f"/proc/{pid}").exists() else 0
+
+    @cached_property
+    def environment(self) -> dict[str, str] | None:
+        """The daemon's environment; None where none lives, or this account may not see it."""
+        if not self.pid:
+            return None
+        try:
+            data = self.machine.path(f"/proc/{self.pid}/environ").read_bytes()
+        except OSError:
+            return None
+        pairs = (os.fsdecode(pair).partition("=") for pair in data.split(b"\0") if pair)
+        return {name: value for name, _, value in pairs}
+
+    @cached_property
+    def store(self) -> StoreAnswer:
+        """What the store of a published map answers, asked once."""
+        counters = self.seen.counters if self.alive and self.seen is not None else {}
+        question = StoreQuestion(
+            self.map_path,
+            self.config.insecure_http or self.alive,  # a daemon that serves it was allowed to
+            self.config.instance_credentials,
+            counters.get("published_version", 0),
+        )
+        return ask_store(question, self.environment)
 
     @property
     def is_service(self) -> bool:

@@ -82,6 +82,9 @@ class SourceReader(Protocol):
     def explain(self, source: Source, message: str) -> str:
         """Say why a source could not be read, in such words."""
 
+    def take_counts(self) -> tuple[int, ...]:
+        """Return what was read of objects since the last call, as statistics count it; empty for nothing."""
+
 
 class Files:
     """Sources that are PCD files.
@@ -142,6 +145,10 @@ class Files:
         if place != source.name and self.stamp(source) is None and os.path.exists(source.name):
             return f"{source.name}: {REPLACED}"
         return self._named(message)
+
+    def take_counts(self) -> tuple[int, ...]:
+        """Return nothing: files are no objects."""
+        return ()
 
 
 FILES: Final = Files()

@@ -114,6 +114,10 @@ class PublishedPoints:
         """None: each layer is computed."""
         del spec, job, fd, reserve, warn
 
+    def take_counts(self) -> tuple[int, ...]:
+        """Return nothing: what a slice read is not in statistics."""
+        return ()
+
     def named(self, message: str) -> str:
         """Return the message as it is: it names cells by their ids."""
         return message

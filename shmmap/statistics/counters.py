@@ -5,7 +5,17 @@ from __future__ import annotations
 
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["COUNTERS", "COUNTER_NAMES", "HISTOGRAMS", "SPANS", "TURN_KINDS", "WINDOWED", "Counter"]
+__all__ = [
+    "COUNTERS",
+    "COUNTER_NAMES",
+    "HISTOGRAMS",
+    "OBJECTS_READ",
+    "PUBLISHED",
+    "SPANS",
+    "TURN_KINDS",
+    "WINDOWED",
+    "Counter",
+]
 
 
 class Counter(NamedTuple):
@@ -46,6 +56,31 @@ TURN_KINDS: Final = {
     "map": "another state of the map was taken over",
 }
 """What a turn of the serving loop is named after: what took most of it."""
+
+OBJECTS_READ: Final = {
+    "objects_from_disk": ("", "Objects read out of the disk cache instead of the store"),
+    "bytes_from_disk": ("bytes", "Bytes of objects read out of the disk cache"),
+    "objects_fetched": ("", "Objects fetched from the store, index pages included"),
+    "bytes_fetched": ("bytes", "Bytes of objects fetched from the store"),
+    "objects_damaged_on_disk": ("", "Objects found damaged in the disk cache, and removed"),
+    "objects_damaged_in_store": ("", "Times that the store's object was not what its name says"),
+    "fetches_failed": ("", "Times that an object could not be fetched from the store"),
+}
+"""Counters of what a daemon of a published map and its loaders read: unit and help."""
+
+_PUBLISHED: Final = (
+    *(Counter(name, "counter", unit, text) for name, (unit, text) in OBJECTS_READ.items()),
+    Counter("published_version", "gauge", "", "Number of the published version that is served; 0: files"),
+    Counter("published_refused", "gauge", "", "Number of a version that is offered and refused; 0: none"),
+    Counter("published_taken_unix_ns", "gauge", "ns", "When the version served was taken, wall clock"),
+    Counter("published_expires_unix_ns", "gauge", "ns", "When what signs it runs out; 0: it is not signed"),
+    Counter("map_pages", "gauge", "", "Pages of the list of cells"),
+    Counter("map_pages_known", "gauge", "", "Pages of it that are here"),
+    Counter("disk_ahead", "gauge", "", "1 while what lies ahead and has no room in memory is on the disk"),
+)
+
+PUBLISHED: Final = frozenset(counter.name for counter in _PUBLISHED)
+"""Counters that mean nothing where the map is files."""
 
 COUNTERS: Final = (
     Counter("requests", "counter", "", "Requests received, well-formed or not"),
@@ -171,6 +206,8 @@ COUNTERS: Final = (
         for name, text in WINDOWED.items()
         for span in SPANS
     ),
+    Counter("origin_out_since_unix_ns", "gauge", "ns", "Since when origin_out is 1, wall clock; else 0"),
+    *_PUBLISHED,
 )
 
 COUNTER_NAMES: Final = tuple(counter.name for counter in COUNTERS)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from shmmap.statistics.counters import SPANS, WINDOWED
+from shmmap.statistics.counters import PUBLISHED, SPANS, WINDOWED
 from shmmap.statistics.histogram import STEPS, Histogram, lower_bound_ns
 from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
@@ -29,6 +29,9 @@ _LIVE = {
     "damaged": ("damaged_files", "gauge", "Files put aside as damaged, and chunks that are missing"),
     "failing": ("failing", "gauge", "1 while chunks cannot be loaded or saved"),
 }
+
+_NO_TIME_IF_0 = {"origin_out_since_unix_ns", "published_expires_unix_ns"}
+"""Of what has not happened, or never will, there is no time: 1970 would be an alarm."""
 
 _TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
 
@@ -74,10 +77,12 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
     )
     yield from one("info", "gauge", "What this daemon is and serves", 1, more)
     for counter in found.descriptions:
-        if counter.name in _TOLD_ELSEWHERE:
-            continue
         value: float = found.counters[counter.name]
         name = counter.name
+        if name in _TOLD_ELSEWHERE or (name in PUBLISHED and not found.counters.get("published_version")):
+            continue
+        if name in _NO_TIME_IF_0 and not value:
+            continue
         if counter.unit == "ns":
             name = name.replace("_unix_ns", "_timestamp_ns").removesuffix("_ns") + "_seconds"
             value *= 1e-9

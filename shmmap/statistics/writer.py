@@ -24,7 +24,7 @@ from shmmap.segment.names import statistics_name
 from shmmap.sharded_dict import ShardedDict
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
-from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, TURN_KINDS
+from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, OBJECTS_READ, TURN_KINDS
 from shmmap.statistics.exclusive_name import hold, take_name
 from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
@@ -157,6 +157,11 @@ class StatisticsWriter:
     def add(self, name: str, n: int = 1) -> None:
         """Add to a counter."""
         self.values[name] += n
+
+    def add_objects_read(self, more: Sequence[int]) -> None:
+        """Add to the counters `OBJECTS_READ`, in their order; nothing, if that is what was read."""
+        for name, n in zip(OBJECTS_READ, more, strict=False):
+            self.values[name] += n
 
     def add_duration(self, name: str, duration_ns: int) -> None:
         """Count a duration in a histogram."""

@@ -8,24 +8,29 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+import shmmap
 from shmmap.daemon.config import load_config
 from tests.process.conftest import DaemonFactory
-from tests.support.bucket_server import BucketServer
-from tests.support.daemon_process import ROOT
+from tests.support.bucket_server import KEYS, BucketServer
+from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import make_map
+from tests.support.faulty_web import faulty_web
 from tests.support.pages import read_page
+from tests.support.patience import Patience
 from tests.support.publishing import publish
 
 PAGE = read_page("shmmap/publishing/SERVING_FROM_A_BUCKET.md")
 
 
 def test_every_block_is_tested() -> None:
-    assert set(PAGE.blocks) == {"install", "credentials", "serve", "ask", "settings"}
-    assert PAGE.fences == len(PAGE.blocks) - 1  # one is of settings
+    shown = {"health", "status", "doctor", "log"}
+    assert set(PAGE.blocks) == {"install", "credentials", "serve", "ask", "settings", "down", *shown}
+    assert PAGE.fences == len(PAGE.blocks) - len(shown) - 1  # one is of settings
 
 
 def test_packages_are_those_of_the_extra() -> None:
@@ -71,3 +76,70 @@ def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFact
     assert "ndt(leaf=2.0" in query
     assert health.startswith("healthy")
     assert reload.startswith("0 cells changed")
+
+
+def verb(one: DaemonProcess, line: str) -> tuple[int, str]:
+    """Run a command of the page for this daemon; returns exit code and what is printed."""
+    words = shlex.split(line)[1:]
+    place = ["--instance", one.instance, "--runtime-dir", one.runtime_dir]
+    place += ["--shm-dir", one.shm_dir] if words[0] != "tail" else []
+    done = subprocess.run(
+        [sys.executable, "-m", "shmmap.cli", *words, *place],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "400"}, capture_output=True, text=True,
+    )  # fmt: skip
+    return done.returncode, done.stdout
+
+
+def is_shown(line: str, text: str) -> bool:
+    """Whether a line of the page is printed, whatever its numbers, times and blanks are."""
+    fixed = re.split(r"\d+(?:\.\d+)? [smhd]\b|\d+", " ".join(line.split()))
+    pattern = r"[\w. ]+?".join(re.escape(part) for part in fixed)
+    return re.search(pattern, " ".join(text.split())) is not None
+
+
+def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
+    """Commands, what they print, and what is served meanwhile."""
+    pytest.importorskip("obstore", reason="obstore is not installed")
+    pytest.importorskip("zstandard", reason="zstandard is not installed")
+    made = make_map(tmp_path / "files", columns=2, rows=2, points=300)
+    publish(made.root, tmp_path / "www/maps/town")
+    (serve,) = PAGE.commands("serve")
+    with faulty_web(tmp_path / "www") as web:
+        one = daemon(serve.split()[2], "--poll", "1", environment={**KEYS, "AWS_ENDPOINT_URL": web.url})
+        waiting = Patience()
+        with shmmap.connect(one.endpoint) as client:
+            near = client.around(-15.0, -15.0, 2.0, wait=60.0)
+            assert near.complete
+            while waiting(not list(one.state_dir.rglob("*.taken"))):
+                time.sleep(0.02)
+            web.refuse()
+            while waiting(verb(one, "shmmap health --strict")[0] != 1):
+                pass
+            cells = client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=60.0)
+            assert {failure.code for failure in cells.failed} == {"offline"}
+            assert {cell.id for cell in cells} == {cell.id for cell in near}
+            told = dict(zip(("health", "status", "doctor", "tail"), PAGE.commands("down"), strict=True))
+            for name in ("health", "status", "doctor"):
+                code, text = verb(one, told[name])
+                assert code == (1 if name == "health" else 0), text
+                for line in PAGE.blocks[name]:
+                    assert is_shown(line, text), f"{line}\n\n{text}"
+            assert "offline" in verb(one, told["tail"])[1]
+            with pytest.raises(shmmap.Offline):
+                client.reload()
+            del cells
+        one.stop()
+        one.start()
+        with shmmap.connect(one.endpoint) as client:
+            again = client.around(-15.0, -15.0, 2.0, wait=60.0)
+            assert {cell.version for cell in again} == {cell.version for cell in near}
+            while waiting(one.log.count("the map's origin is out of reach") < 2):  # in each run once
+                time.sleep(0.02)
+            web.listen()
+            while waiting(not client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=5.0).complete):
+                time.sleep(0.02)
+        for line in PAGE.blocks["log"]:
+            while waiting(line not in one.log):
+                time.sleep(0.02)
+        while waiting(verb(one, "shmmap health --strict")[0] != 0):
+            pass

@@ -11,6 +11,7 @@ import http.server
 import re
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +20,8 @@ __all__ = ["Fault", "FaultyWeb", "faulty_web"]
 
 Fault = Callable[[str], str]
 """What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
-``truncate``, ``corrupt``, a status such as ``503``; or nothing."""
+``truncate``, ``corrupt``, a status such as ``503``, or one with Amazon's code such as ``403 ExpiredToken``;
+or nothing."""
 
 
 def _no_fault(_path: str) -> str:
@@ -46,6 +48,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def log_message(self, *arguments: object) -> None:
         """Say nothing."""
 
+    def date_time_string(self, timestamp: float | None = None) -> str:
+        """Say what the server's clock shows."""
+        return super().date_time_string((timestamp or time.time()) + self.server.web.clock_ahead_s)
+
     def do_GET(self) -> None:
         """Answer."""
         web = self.server.web
@@ -55,8 +61,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             web.until_healed()
             self.close_connection = True
             return
-        if fault.isdigit():
-            self._answer(int(fault), b"")
+        if fault[:3].isdigit():
+            status, _, code = fault.partition(" ")
+            self._answer(int(status), f"<Error><Code>{code}</Code></Error>".encode() if code else b"")
             return
         try:
             data = (web.folder / path).read_bytes()
@@ -105,6 +112,7 @@ class FaultyWeb:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.fault: Fault = _no_fault
+        self.clock_ahead_s = 0.0
         self.connections: set[socket.socket] = set()
         self._requests: list[tuple[str, int]] = []
         self._healed = threading.Event()

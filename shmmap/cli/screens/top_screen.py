@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from shmmap.cli.screens.live_maps import STATE_STYLES, live_problems
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
+from shmmap.cli.screens.published_map import published_words
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.keeping_ahead import ahead_verdict, over_fetch
 from shmmap.statistics.counters import TURN_KINDS
@@ -108,6 +109,9 @@ def screen(
     if verdict.hint:
         lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
     lines += _ahead(counters, width)
+    if pieces := published_words(counters):
+        units: list[Line] = [[(text, "red" if trouble else "")] for text, trouble in pieces]
+        lines += _flowing("published", units, width)
     lines += _latencies(found, earlier)
     lines += _flowing("loop", _longest_turns(counters), width)
     lines += _flowing("queue", _loads(counters), width)

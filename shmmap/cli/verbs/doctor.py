@@ -32,8 +32,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="find problems and suggest fixes",
         description="Check the daemon, its socket and group, the map, shared memory and its limits, live "
-        "maps, the bridge to ROS, and what was left behind.  Changes nothing.  Run it as the user whose "
-        "program has a problem.",
+        "maps, where a published map comes from, the bridge to ROS, and what was left behind.  Changes "
+        "nothing.  Run it as the user whose program has a problem.",
         json=_JSON,
     )
     parser.add_argument(

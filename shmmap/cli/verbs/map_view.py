@@ -14,6 +14,8 @@ from shmmap.cli.areas import add_area_options, area_from, around, those_in
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import counted, format_bytes, print_hanging, print_line, wants_style
+from shmmap.cli.screens.published_map import published_words
+from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.errors import DaemonUnreachable
 from shmmap.lacking import area_text, extent_text
 
@@ -184,7 +186,9 @@ def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk)
     segments, clients = counted(len(rows), "segment"), counted(len(found.clients), "client")
     ahead = sum(row.ahead for row in rows)
     segments += f" ({ahead:,} of them fetched ahead, not asked for yet)" if ahead else ""
-    note = f"{segments} in memory, {format_bytes(memory)}, {clients}"
+    note = "; ".join(
+        (f"{segments} in memory, {format_bytes(memory)}, {clients}", *_published(found.counters))
+    )
     if disk.total is None:
         state = "paused" if found.state == "stopped" else found.state
         return f"{note}; the daemon is {state}: cells on disk are not shown"
@@ -192,6 +196,14 @@ def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk)
         return f"{note}, {counted(disk.total, 'cell')} in the map"
     count = f"more than {MOST_ON_DISK:,}" if area is not None else f"{disk.total:,}"
     return f"{note}, {count} cells in the map (too many to show those on disk)"
+
+
+def _published(counters: dict[str, int]) -> list[str]:
+    """What of a published map is known, and whether its store answers."""
+    texts = [text for text, _trouble in published_words(counters)]
+    if texts and counters.get("origin_out", 0):
+        texts.append(f"its store is out of reach for {outage_so_far(counters)}")
+    return texts
 
 
 def _print(scene: Scene) -> None:

@@ -150,7 +150,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="SECONDS",
         dest="ride_out_s",
         help="for so long the map's files may be out of reach without a moving client's noticing: cells are "
-        "fetched so far ahead (default: 10)",
+        "fetched so far ahead, of a published map onto the disk where memory has no room (default: 10)",
     )
     limits.add_argument(
         "--prefetch-share",

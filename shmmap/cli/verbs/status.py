@@ -17,6 +17,7 @@ from shmmap.cli.screens.output import (
     print_json,
     print_pairs,
 )
+from shmmap.cli.screens.published_map import published_as_json, published_lines, since
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.keeping_ahead import ahead_as_json, ahead_verdict, outage_so_far, over_fetch
 from shmmap.errors import DaemonUnreachable
@@ -41,6 +42,12 @@ _JSON = """\
              "last_outage_s", "moving_clients", "routed_clients", "cells_late", "prefetch_started",
              "prefetch_used", "prefetch_in_vain", "prefetch_overtaken", "bytes_prefetched",
              "over_fetch": bytes loaded by bytes handed out at least once, or null},
+   "published": null where the map is files, or
+            {"version": number, "refused": number of a version that is offered and refused, or null,
+             "taken_unix_s", "expires_unix_s": null if it is not signed, "offline_since_unix_s": or null,
+             "cells", "cells_known", "pages", "pages_known": of the list of cells,
+             "objects_fetched", "bytes_fetched", "objects_from_disk", "bytes_from_disk",
+             "objects_damaged_on_disk", "objects_damaged_in_store", "fetches_failed"},
    "live": [{"name", "problem": text, may be empty, "chunks": in memory, "active": known voxels in them,
              "bytes", "budget_bytes", "loading", "dirty", "saving", "evicting", "evicting_bytes",
              "waiting_bytes", "files", "file_bytes", "scans", "durable", "damaged", "mappers", "change"}]}
@@ -88,6 +95,7 @@ def run(args: argparse.Namespace) -> int:
                 "shm_dir": identity.shm_dir,
                 "counters": found.counters,
                 "ahead": ahead_as_json(found.counters),
+                "published": published_as_json(found.counters),
                 "live": [row._asdict() for row in found.live],
             }
         )
@@ -125,7 +133,10 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
             4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
         )
     if count.get("origin_out", 0):
-        lines.append(("origin", f"out of reach for {outage_so_far(count)}: what is in memory is served"))
+        kept = "in memory and on the disk" if published_lines(count) else "in memory"
+        out = f"out of reach for {outage_so_far(count)}{since(count)}"
+        lines.append(("origin", f"{out}: what is {kept} is served"))
+    lines += published_lines(count)
     if problems := count.get("map_problems", 0):
         lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
     if outside := count.get("cells_outside_box", 0):

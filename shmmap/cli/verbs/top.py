@@ -33,7 +33,7 @@ _JSON = """\
    "budget": the same by older names: {"pinned": in use, "idle", "zombie": retired,
               "reserved": loading and statistics, "free"},
    "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
-   "ahead": as in `shmmap status`,
+   "ahead": as in `shmmap status`, "published": as in `shmmap status`,
    "latency_s": {"request", "wait", "load", and a loader's own time: "load_points" from the map's files,
                  "load_computed", "load_cached" from the disk cache, "turn" of the daemon's loop:
                  {"p50", "p99", "count"}}, "load_queue", "waiting_requests",
@@ -180,6 +180,7 @@ def _styled(line: Line) -> Any:
 
 
 def _as_json(found: Snapshot) -> dict[str, object]:
+    from shmmap.cli.screens.published_map import published_as_json
     from shmmap.cli.screens.top_screen import budget_parts
     from shmmap.doctor.cache_size import cache_verdict
     from shmmap.doctor.keeping_ahead import ahead_as_json
@@ -207,6 +208,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
         "cache": verdict.why,
         "hint": verdict.hint,
         "ahead": ahead_as_json(count),
+        "published": published_as_json(count),
         "latency_s": {
             name: {"p50": h.quantile_s(0.5), "p99": h.quantile_s(0.99), "count": h.total}
             for name, h in found.histograms.items()

@@ -19,7 +19,7 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
-from shmmap.origin.remote.object_tier import KeptObjects
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts
 from shmmap.origin.remote.published_object import (
     CellIdentity,
     ObjectName,
@@ -204,7 +204,9 @@ class PublishedReader:
     def __init__(self, served: ServedFrom, cache_dir: str, cache_bytes: int) -> None:
         store = open_for_serving(served)
         self._url = store.url
-        self.fetcher = ObjectFetcher(kept_objects(store, cache_dir, cache_bytes, quiet=True))
+        self._objects = kept_objects(store, cache_dir, cache_bytes, quiet=True)
+        self._counts = ObjectCounts()
+        self.fetcher = ObjectFetcher(self._objects)
 
     def stamp(self, source: Source) -> Stamp:
         """Return the state that its objects are of: they never change."""
@@ -277,6 +279,12 @@ class PublishedReader:
         """Return the message as it is."""
         del source
         return message
+
+    def take_counts(self) -> tuple[int, ...]:
+        """Return what was read since the last call; empty for nothing."""
+        before, self._counts = self._counts, self._objects.counts
+        more = self._counts.since(before)
+        return tuple(more) if any(more) else ()
 
     def _unpacked(self, name: ObjectName) -> bytes:
         return unpack_frame(self.fetcher.get(name), name.raw, name=self._path(name), exact=True)

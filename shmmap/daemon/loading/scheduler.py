@@ -284,6 +284,8 @@ class Scheduler:
     def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
         """A worker is done with a job, in whichever way."""
         fd, spent_s = self.pool.finished(worker, message.number, now_s)
+        if not isinstance(message, Checked) and message.objects:
+            self._statistics.add_objects_read(message.objects)
         self.room.hungry.pop(message.number, None)
         load = self._jobs.pop(message.number, None)
         try:

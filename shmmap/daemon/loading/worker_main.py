@@ -172,6 +172,7 @@ class _Worker:
                 header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
                 tuple(self.reader.named(warning)[:500] for warning in made.warnings[:20]),
                 tuple(stamp.token for stamp in made.neighbours), made.cached, header.outside_points,
+                self.reader.take_counts(),
             )  # fmt: skip
             step("worker.pass")
             self._send(done)
@@ -249,7 +250,8 @@ class _Worker:
 
     def _fail(self, job: worker_messages.Job, code: str, message: str, *, unread: bool = False) -> None:
         stamp, why = self.reader.stamp(job.source), self.reader.explain(job.source, message)
-        self._send(worker_messages.Failed(job.number, code, why[:4000], stamp, unread))
+        objects = self.reader.take_counts()
+        self._send(worker_messages.Failed(job.number, code, why[:4000], stamp, unread, objects))
 
 
 def _test_hook(path: str) -> None:

@@ -108,7 +108,8 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
-    the disk cache; ``outside`` points lie outside the cell's box.
+    the disk cache; ``outside`` points lie outside the cell's box; ``objects``: what the worker has read of a
+    published map since it last said so (`shmmap.origin.remote.object_tier.ObjectCounts`).
     """
 
     number: int
@@ -124,6 +125,7 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
     neighbours: tuple[Stamp, ...] = ()
     cached: bool = False
     outside: int = 0
+    objects: tuple[int, ...] = ()
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
@@ -138,13 +140,17 @@ class Checked(msgspec.Struct, array_like=True, tag="checked"):
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
-    """No segment; ``stamp`` is the source's, if it could be had; ``unread``: it could not be read."""
+    """No segment; ``stamp`` is the source's, if it could be had; ``unread``: it could not be read.
+
+    ``objects`` as in `Done`.
+    """
 
     number: int
     code: str
     message: str
     stamp: Stamp | None = None
     unread: bool = False
+    objects: tuple[int, ...] = ()
 
 
 class Ended(msgspec.Struct, array_like=True, tag="ended"):

@@ -83,6 +83,10 @@ class Pages(Protocol):
     def known_cells(self) -> int:
         """How many cells the pages have that are here."""
 
+    @property
+    def known_pages(self) -> int:
+        """How many pages are here."""
+
     def is_here(self, page: int) -> bool:
         """Whether the page's cells are known."""
 

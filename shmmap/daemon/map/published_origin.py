@@ -10,6 +10,7 @@ import weakref
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
+from shmmap.daemon.map.object_keeper import ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.map.published_view import PublishedView
 from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
@@ -25,7 +26,7 @@ from shmmap.origin.remote.map_versions import (
     read_shard_object,
     root_path,
 )
-from shmmap.origin.remote.object_tier import ObjectTier
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.serving_store import ServedFrom, kept_objects, open_for_serving
 from shmmap.origin.remote.store import PROBE, ObjectReader
@@ -60,6 +61,8 @@ class PublishedOrigin:
         For loaders.
     link
         Says whether it is in reach, and has another version.
+    keeper
+        Keeps objects of cells on the disk ahead; None where nothing is kept.
     """
 
     def __init__(
@@ -90,9 +93,14 @@ class PublishedOrigin:
         self._seen = NOTHING
         self._is_loading = False
         self._saved: TakenVersion | None = None
+        self._in_service: TakenVersion | None = None
         self.link = OriginLink(self._has_another, poll_s)
         self._fetcher = ShardFetcher(self._index, self.link.doubt)
         self._pages: weakref.WeakSet[ShardPages] = weakref.WeakSet()
+        self.keeper: ObjectKeeper | None = None
+        if self._tier is not None:
+            cells = kept_objects(self._store, cache_dir, cache_bytes, quiet=True)
+            self.keeper = ObjectKeeper(cells, self._tier, self.link.doubt)
 
     # --- taking a version -------------------------------------------------------------------------
 
@@ -163,7 +171,7 @@ class PublishedOrigin:
         """Serve what was taken before the start, as far as it is on the disk."""
         known: dict[int, Shard] = {}
         if self._tier is not None and len(root.keys) <= FEW_SHARDS:
-            self._fetch_all(root, known, _OnDisk(self._tier, self.path))
+            self._fetch_all(root, known, _OnDisk(self._index))
         if self._poll_s:
             self.link.ask_now()
         return self._take(taken, root, known)
@@ -205,13 +213,38 @@ class PublishedOrigin:
     def note_served(self, view: object) -> None:
         """Remember which version is served now."""
         taken = self._taken
-        if taken is None or taken is self._saved or self._state is None:
-            return
-        if not isinstance(view, PublishedView) or view.number != taken.version:
+        if taken is None or not isinstance(view, PublishedView) or view.number != taken.version:
             return  # another one was taken, and waits for its pages
+        self._in_service = taken
+        if taken is self._saved or self._state is None:
+            return
         self._saved = taken
         with contextlib.suppress(RuntimeError):  # as many threads as there may be: then with the next one
             threading.Thread(target=_save, args=(self._state, taken), name="taken").start()
+
+    @property
+    def in_service(self) -> TakenVersion | None:
+        """The version that is served, as of the last `note_served`."""
+        return self._in_service
+
+    @property
+    def refused_version(self) -> int:
+        """Number of the version that is offered and was refused; 0: none."""
+        refused = self._refused
+        return refused.version if refused is not None and self._seen.current == refused else 0
+
+    @property
+    def expires_s(self) -> float | None:
+        """When what signs the version runs out, Unix time; None where nothing signs it."""
+        return None
+
+    @property
+    def counts(self) -> ObjectCounts:
+        """What the daemon itself has read so far: of the index, and of what is kept on the disk ahead."""
+        index = self._index.counts
+        if self.keeper is None:
+            return index
+        return ObjectCounts(*map(sum, zip(index, self.keeper.counts, strict=True)))
 
     def try_again(self) -> None:
         """Have fetched again what of the list of cells could not be had; called in the serving loop."""
@@ -220,22 +253,24 @@ class PublishedOrigin:
 
     def close(self) -> bool:
         """End all threads; False if one still waits for the origin."""
-        link, fetcher = self.link.close(), self._fetcher.close()
-        return link and fetcher and not self._is_loading
+        ended = [self.link.close(), self._fetcher.close()]
+        if self.keeper is not None:
+            ended.append(self.keeper.close())
+        return all(ended) and not self._is_loading
 
 
 class _OnDisk:
     """Reads index pages that are on the disk, and no others."""
 
-    def __init__(self, tier: ObjectTier, url: str) -> None:
-        self._tier = tier
-        self.url = url
+    def __init__(self, index: KeptObjects) -> None:
+        self._index = index
+        self.url = index.url
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        data = self._tier.get(bytes.fromhex(path.rpartition("/")[2]), nbytes, is_index=True)
+        data = self._index.read_kept(bytes.fromhex(path.rpartition("/")[2]), nbytes)
         if data is None:
             raise MapMissing(f"{path} is not on the disk")
-        return memoryview(data)
+        return data
 
 
 def _save(state: TakenVersionFile, taken: TakenVersion) -> None:

@@ -168,6 +168,11 @@ class ShardPages:
         """Whether all pages are here."""
         return len(self._here) == len(self)
 
+    @property
+    def known_pages(self) -> int:
+        """How many pages are here."""
+        return len(self._here)
+
     def is_here(self, page: int) -> bool:
         """Whether the page's cells are known."""
         return page in self._here

@@ -120,16 +120,19 @@ class KeepingAhead:
         statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
-        loaders = max(limit - 1, 1)  # one is kept for what somebody waits for
+        # some are kept for what clients wait for; those that fetch do so for many cells at once
+        loaders = max(limit * self._scheduler.pool.places - prefetcher.kept_places, 1)
         statistics.set("loadable_per_1000s", int(1e3 * loaders / health.mean_s) if health.mean_s else 0)
         statistics.set("origin_out", int(health.is_out))
         if health.is_out and self._out_since_s is None:
             self._out_since_s = now_s
             statistics.add("origin_outages")
+            statistics.set("origin_out_since_unix_ns", time.time_ns())
         if self._out_since_s is not None:
             statistics.set("last_outage_ns", int((now_s - self._out_since_s) * 1e9))
             if not health.is_out:
                 self._out_since_s = None
+                statistics.set("origin_out_since_unix_ns", 0)
 
     def _next(self, current: _Round, now_s: float) -> _Looking | None:
         """The next client that moves, its way from the beginning; None if there is none."""

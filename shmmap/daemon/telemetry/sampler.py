@@ -112,6 +112,8 @@ class Sampler:
         set_value("map_cells", len(cache.catalogue))
         pages = cache.catalogue.pages
         set_value("map_cells_known", len(cache.catalogue) if pages is None else pages.known_cells)
+        set_value("map_pages", 0 if pages is None else len(pages))
+        set_value("map_pages_known", 0 if pages is None else pages.known_pages)
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:

@@ -16,7 +16,15 @@ from typing import Any, Final, TypeVar, cast
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
 from shmmap.optional_packages import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
-from shmmap.origin.remote.store import WEB_SCHEMES, Listed, StoreUrl, Tag, Timeouts, is_loopback
+from shmmap.origin.remote.store import (
+    WEB_SCHEMES,
+    Listed,
+    StoreRefused,
+    StoreUrl,
+    Tag,
+    Timeouts,
+    is_loopback,
+)
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 with needed_packages("a map in a bucket or at a web server", together=FOR_REMOTE):
@@ -24,7 +32,7 @@ with needed_packages("a map in a bucket or at a web server", together=FOR_REMOTE
     from obstore import exceptions
     from obstore.store import AzureStore, GCSStore, HTTPStore, S3Store
 
-__all__ = ["BucketStore"]
+__all__ = ["BucketStore", "server_url"]
 
 _Answer = TypeVar("_Answer")
 
@@ -39,6 +47,17 @@ _SILENT: Final = "is the network up, and the address right? (s3:// has it of AWS
 _REGION: Final = "is AWS_REGION that of the bucket?"
 _CERTIFICATE: Final = "SSL_CERT_FILE names further authorities; is the clock right?"
 _CLOCK: Final = "are the credentials valid, and is the clock right?"
+_CODE: Final = re.compile(r"<Code>(\w+)</Code>")
+_REASONS: Final = {
+    "ExpiredToken": "the credentials have expired",
+    "TokenRefreshRequired": "the credentials have expired",
+    "InvalidAccessKeyId": "the store knows no such access key",
+    "InvalidToken": "the session token is not valid",
+    "SignatureDoesNotMatch": "the secret does not belong to the access key",
+    "RequestTimeTooSkewed": "this machine's clock differs from the store's",
+    "AccessDenied": "no permission",
+}
+"""What Amazon's codes of refusals mean, which others use, too."""
 _LISTED_AT_ONCE: Final = 1000
 
 
@@ -186,11 +205,14 @@ class BucketStore:
         except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
             if conditional:
                 raise
-            raise Offline(f"{self._name(path)}: refused (status 412)") from None
+            raise StoreRefused(f"{self._name(path)}: refused (status 412)") from None
         except exceptions.NotModifiedError:  # asked for by `get_if_changed` alone
             raise
-        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError):
-            raise Offline(f"{self._name(path)}: refused, no permission", hint=_CLOCK) from None
+        except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
+            why = _reason(str(error)) or "no permission"
+            raise StoreRefused(
+                f"{self._name(path)}: refused, {why}", hint=_CLOCK, of_credentials=True
+            ) from None
         except (exceptions.BaseError, OSError) as error:
             raise _out_of_reach(self._name(path), str(error)) from None
 
@@ -201,12 +223,39 @@ def _out_of_reach(name: str, text: str) -> Offline:
     if found is not None:
         status = found[1] or found[2]
         hint = _CLOCK if status.startswith("4") else _AGAIN
-        return Offline(f"{name}: refused (status {status})", hint=hint)
+        if why := _reason(text):
+            return StoreRefused(f"{name}: refused, {why}", hint=hint, of_credentials=True)
+        return StoreRefused(f"{name}: refused (status {status})", hint=hint)
     if "redirect" in text.lower():
-        return Offline(f"{name}: refused, it is somewhere else", hint=_REGION)
+        return StoreRefused(f"{name}: refused, it is somewhere else", hint=_REGION)
     if "certificate" in text.lower():
-        return Offline(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
+        return StoreRefused(f"{name}: the server's certificate is not accepted", hint=_CERTIFICATE)
     return Offline(f"{name}: no answer", hint=_SILENT)
+
+
+def _reason(text: str) -> str:
+    """Return why a store refuses, where it says so by one of the known codes."""
+    found = _CODE.search(text)
+    return _REASONS.get(found[1], "") if found is not None else ""
+
+
+def server_url(where: StoreUrl) -> str:
+    """Return the URL of the server that a store is asked at, which no credentials are needed for; or nothing.
+
+    For other questions than for objects: what it answers to anyone.
+    """
+    if where.scheme in WEB_SCHEMES:
+        return where.text
+    if endpoint := _endpoint(where.scheme):
+        return endpoint
+    region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
+    account = os.environ.get("AZURE_STORAGE_ACCOUNT_NAME", "")
+    usual = {
+        "s3": f"https://s3.{region}.amazonaws.com",
+        "gs": "https://storage.googleapis.com",
+        "az": f"https://{account}.blob.core.windows.net" if account.isalnum() else "",
+    }
+    return usual.get(where.scheme, "")
 
 
 def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bool) -> Any:

@@ -8,6 +8,7 @@ vehicle nothing answers, or a stranger does: so that is done only where it was c
 from __future__ import annotations
 
 import configparser
+import contextlib
 import os
 from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta, timezone
@@ -15,7 +16,7 @@ from typing import Any, Final
 
 from shmmap.errors import ConfigError
 
-__all__ = ["azure_settings", "google_settings", "s3_settings"]
+__all__ = ["azure_settings", "credentials_source", "google_settings", "s3_settings"]
 
 _DIRECTORY: Final = "CREDENTIALS_DIRECTORY"  # systemd.exec(5), LoadCredential=
 AWS_FILE: Final = "shmmap.aws"
@@ -39,11 +40,58 @@ _ASKED_OF_OTHERS: Final = (
     "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
     "AWS_CONTAINER_CREDENTIALS_FULL_URI",
 )
+_GOOGLE: Final = (
+    "GOOGLE_APPLICATION_CREDENTIALS",
+    "GOOGLE_SERVICE_ACCOUNT",
+    "GOOGLE_SERVICE_ACCOUNT_KEY",
+    "GOOGLE_SERVICE_ACCOUNT_PATH",
+    "SERVICE_ACCOUNT",
+)
+_GCLOUD: Final = "~/.config/gcloud/application_default_credentials.json"
 _AGAIN_AFTER: Final = timedelta(minutes=5)
 _TRUE: Final = ("1", "true", "yes", "on")
 
 Settings = dict[str, Any]
 Provider = Callable[[], dict[str, Any]]
+
+
+def credentials_source(scheme: str, environment: Mapping[str, str], *, instance: bool = False) -> str:
+    """Return in words where the credentials of a store come from, never what they are; empty: it needs none.
+
+    Raises
+    ------
+    ConfigError
+        As `s3_settings` and `azure_settings`; or they say themselves that they have expired.
+    """
+    if scheme == "s3":
+        return _s3_source(environment, instance=instance)
+    if scheme == "gs":
+        return _google_source(environment, instance=instance)
+    if scheme == "az":
+        return _azure_source(environment, instance=instance)
+    return ""
+
+
+_UNSIGNED: Final = "nowhere: requests are not signed"
+_INSTANCE: Final = "the cloud's metadata address (instance_credentials)"
+
+
+def _s3_source(environment: Mapping[str, str], *, instance: bool) -> str:
+    settings, provider = s3_settings(environment, instance=instance)
+    if provider is not None:
+        found = _static_keys(environment)
+        return found[1] if found is not None else _UNSIGNED
+    if "access_key_id" not in settings:
+        return _UNSIGNED if "skip_signature" in settings else _INSTANCE
+    if expiry := environment.get("AWS_CREDENTIAL_EXPIRATION"):
+        with contextlib.suppress(ValueError, TypeError):
+            if datetime.fromisoformat(expiry.replace("Z", "+00:00")) <= datetime.now(timezone.utc):
+                raise ConfigError(
+                    f"they expired at {expiry}", key="AWS_CREDENTIAL_EXPIRATION", origin="environment",
+                    hint="export others, and start the daemon again",
+                )  # fmt: skip
+    token = " with AWS_SESSION_TOKEN" if "session_token" in settings else ""
+    return f"the environment, AWS_ACCESS_KEY_ID{token}"
 
 
 def s3_settings(
@@ -81,15 +129,16 @@ def s3_settings(
     if _static_keys(environment) is not None:
 
         def provide() -> dict[str, Any]:
-            keys = _static_keys(environment)
-            return {**(keys or {}), "expires_at": datetime.now(timezone.utc) + _AGAIN_AFTER}
+            found = _static_keys(environment)
+            keys = found[0] if found is not None else {}
+            return {**keys, "expires_at": datetime.now(timezone.utc) + _AGAIN_AFTER}
 
         return settings, provide
     return (settings if instance else {**settings, "skip_signature": True}), None
 
 
-def _static_keys(environment: Mapping[str, str]) -> dict[str, Any] | None:
-    """The keys in the service manager's file or in the shared credentials file; None where there are none."""
+def _static_keys(environment: Mapping[str, str]) -> tuple[dict[str, Any], str] | None:
+    """The keys in the service manager's file or in the shared credentials file, and which; or None."""
     profile = environment.get("AWS_PROFILE", "")
     files = [
         *_given_file(environment, AWS_FILE),
@@ -101,11 +150,12 @@ def _static_keys(environment: Mapping[str, str]) -> dict[str, Any] | None:
             continue
         key, secret = section.get("aws_access_key_id"), section.get("aws_secret_access_key")
         if key and secret:
-            return {
+            keys = {
                 "access_key_id": key,
                 "secret_access_key": secret,
                 "token": section.get("aws_session_token") or None,
             }
+            return keys, f"profile {profile or 'default'!r} of {_named(environment, path)}"
         _refuse_kinds(section, path, profile or "default")
         raise ConfigError(f"profile {profile or 'default'!r} has no whole pair of keys", origin=path)
     config = _section(_config_file(environment), _config_section(profile))
@@ -144,17 +194,25 @@ def _config_section(profile: str) -> str:
 
 def google_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
     """Return what a store of Google Cloud is configured with."""
-    given = ("GOOGLE_APPLICATION_CREDENTIALS", "GOOGLE_SERVICE_ACCOUNT", "GOOGLE_SERVICE_ACCOUNT_KEY",
-             "GOOGLE_SERVICE_ACCOUNT_PATH", "SERVICE_ACCOUNT")  # fmt: skip
-    if any(environment.get(name) for name in given):
+    if any(environment.get(name) for name in _GOOGLE):
         return {}
     for path in _given_file(environment, GOOGLE_FILE):
         if os.path.exists(path):
             return {"application_credentials": path}
-    usual = os.path.expanduser("~/.config/gcloud/application_default_credentials.json")
-    if instance or os.path.exists(usual):
+    if instance or os.path.exists(os.path.expanduser(_GCLOUD)):
         return {}
     return {"skip_signature": True}
+
+
+def _google_source(environment: Mapping[str, str], *, instance: bool) -> str:
+    settings = google_settings(environment, instance=instance)
+    if path := settings.get("application_credentials"):
+        return _named(environment, path)
+    if name := next((name for name in _GOOGLE if environment.get(name)), ""):
+        return f"the environment, {name}"
+    if os.path.exists(os.path.expanduser(_GCLOUD)):
+        return _GCLOUD
+    return _UNSIGNED if "skip_signature" in settings else _INSTANCE
 
 
 def azure_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
@@ -176,10 +234,35 @@ def azure_settings(environment: Mapping[str, str], *, instance: bool = False) ->
         value = found.get(f"AZURE_STORAGE_{name}") or found.get(f"AZURE_{name}")
         if value:
             account["sas_key" if name == "SAS_TOKEN" else name.lower()] = value
-    has_secret = account.keys() & {"account_key", "sas_key", "client_secret"}
-    if has_secret or instance or environment.get("AZURE_USE_AZURE_CLI", "").lower() in _TRUE:
+    if (
+        account.keys() & _AZURE_SECRETS
+        or instance
+        or environment.get("AZURE_USE_AZURE_CLI", "").lower() in _TRUE
+    ):
         return account
     return {**account, "skip_signature": True}
+
+
+_AZURE_SECRETS: Final = {"account_key", "sas_key", "client_secret"}
+
+
+def _azure_source(environment: Mapping[str, str], *, instance: bool) -> str:
+    settings = azure_settings(environment, instance=instance)
+    if secrets := sorted(settings.keys() & _AZURE_SECRETS):
+        for path in _given_file(environment, AZURE_FILE):
+            if any(secrets[0].upper() in name for name in _lines(path)):
+                return _named(environment, path)
+        return f"the environment, AZURE_STORAGE_{secrets[0].upper()}"
+    if "skip_signature" in settings:
+        return _UNSIGNED
+    return _INSTANCE if instance else "the program az (AZURE_USE_AZURE_CLI)"
+
+
+def _named(environment: Mapping[str, str], path: str) -> str:
+    """Name a file by the variable that says where it is."""
+    directory = environment.get(_DIRECTORY)
+    inside = bool(directory) and os.path.dirname(path) == directory
+    return f"${_DIRECTORY}/{os.path.basename(path)}" if inside else path
 
 
 def _given_file(environment: Mapping[str, str], name: str) -> list[str]:

@@ -25,7 +25,7 @@ from hashlib import sha256
 from typing import Final, NamedTuple
 
 from shmmap.disk_budget import CELLS, INDEX, INTERIM, OBJECTS, DiskBudget, mark_used, why_not_private
-from shmmap.errors import MapDataError
+from shmmap.errors import MapDataError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.origin.remote.published_object import blob_path
@@ -107,6 +107,16 @@ class ObjectTier:
         except OSError as error:
             self._say(error)
         return None
+
+    def has(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bool:
+        """Whether there is a file of an object, of its size; what is in it is looked at when it is read."""
+        try:
+            with self._opened() as place:
+                status = os.stat(_path(digest, is_index), dir_fd=place, follow_symlinks=False)
+        except OSError as error:
+            self._say(error)
+            return False
+        return stat.S_ISREG(status.st_mode) and status.st_size == nbytes
 
     def put(self, digest: bytes, data: bytes | memoryview, *, is_index: bool = False) -> bool:
         """Keep an object whose hash was compared; False if it cannot be kept.
@@ -256,12 +266,22 @@ def _write(place: int, path: str, data: memoryview, *, durable: bool) -> None:
 
 
 class ObjectCounts(NamedTuple):
-    """What was read: out of the tier, and out of the store; bytes of objects."""
+    """What was read, out of the tier and out of the store, in the order of `counters.OBJECTS_READ`.
+
+    Bytes are those of objects; ``failed`` are fetches that brought nothing, for whatever reason.
+    """
 
     disk_objects: int = 0
     disk_bytes: int = 0
     fetched_objects: int = 0
     fetched_bytes: int = 0
+    damaged_on_disk: int = 0
+    damaged_in_store: int = 0
+    failed: int = 0
+
+    def since(self, before: ObjectCounts) -> ObjectCounts:
+        """Return what has come since then."""
+        return ObjectCounts(*(now - then for now, then in zip(self, before, strict=True)))
 
 
 class KeptObjects:
@@ -299,7 +319,8 @@ class KeptObjects:
     @property
     def counts(self) -> ObjectCounts:
         """What was read so far."""
-        return self._counts
+        damaged = self._tier.damaged_objects if self._tier is not None else 0
+        return self._counts._replace(damaged_on_disk=damaged)
 
     def read(self, digest: bytes, nbytes: int) -> memoryview:
         """Return the object of a SHA-256 and a size, both compared: they need not be compared again.
@@ -311,18 +332,32 @@ class KeptObjects:
         MapDataError
             The store has another one under its name (cause ``damaged``); that is not kept.
         """
-        kept = self._tier.get(digest, nbytes, is_index=self._is_index) if self._tier is not None else None
+        kept = self.read_kept(digest, nbytes)
         if kept is not None:
-            self._count(ObjectCounts(disk_objects=1, disk_bytes=nbytes))
-            return memoryview(kept)
+            return kept
         path = blob_path(digest)
-        data = self._store.get_exactly(path, nbytes)
-        if sha256(data).digest() != digest:
-            raise MapDataError("its SHA-256 is not its name", path=f"{self.url}/{path}", cause=DAMAGED)
+        try:
+            data = self._store.get_exactly(path, nbytes)
+            if sha256(data).digest() != digest:
+                raise MapDataError("its SHA-256 is not its name", path=f"{self.url}/{path}", cause=DAMAGED)
+        except MapDataError:
+            self._count(ObjectCounts(damaged_in_store=1, failed=1))
+            raise
+        except ShmmapError:
+            self._count(ObjectCounts(failed=1))
+            raise
         self._count(ObjectCounts(fetched_objects=1, fetched_bytes=nbytes))
         if self._tier is not None and self._keep:
             self._tier.put(digest, data, is_index=self._is_index)
         return data
+
+    def read_kept(self, digest: bytes, nbytes: int) -> memoryview | None:
+        """Return the object if it is in the tier; nothing is fetched."""
+        kept = self._tier.get(digest, nbytes, is_index=self._is_index) if self._tier is not None else None
+        if kept is None:
+            return None
+        self._count(ObjectCounts(disk_objects=1, disk_bytes=nbytes))
+        return memoryview(kept)
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
         """Return an object by its path in the store; what is not named by its hash is fetched."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 from urllib.parse import urlsplit
 
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, Offline
 
 __all__ = [
     "BUCKET_SCHEMES",
@@ -24,6 +24,7 @@ __all__ = [
     "Listed",
     "ObjectReader",
     "Store",
+    "StoreRefused",
     "StoreUrl",
     "Tag",
     "Timeouts",
@@ -39,6 +40,14 @@ _SCHEMES: Final = ("file", *BUCKET_SCHEMES, *WEB_SCHEMES)
 
 Tag: TypeAlias = Mapping[str, Any]
 """Names one state of an object; only the store that gave it knows what is in it."""
+
+
+class StoreRefused(Offline):
+    """The store answers, and refuses; ``of_credentials``: because of who asks, or how that is shown."""
+
+    def __init__(self, message: str, *, hint: str = "", of_credentials: bool = False) -> None:
+        super().__init__(message, hint=hint)
+        self.of_credentials = of_credentials
 
 
 class Listed(NamedTuple):

@@ -87,6 +87,10 @@ class MemoryPages:
     def known_cells(self) -> int:
         return sum(len(self.cells(page)) for page in self.needed)
 
+    @property
+    def known_pages(self) -> int:
+        return len(self.needed)
+
     def is_here(self, page: int) -> bool:
         return page in self.needed
 

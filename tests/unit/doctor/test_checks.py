@@ -8,11 +8,10 @@ import os
 import socket
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
-import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.doctor import access, disk_cache, kernel, lifetime, live, memory
@@ -22,49 +21,10 @@ from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
 from shmmap.protocol.live import LiveMapRow
 from shmmap.statistics.client_rows import ClientRow
-from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
-
-USER = 61005
-IDENTITY = DaemonIdentity(
-    pid=4242, start_time_ticks=1, pid_namespace=1, epoch=1, instance="default",
-    endpoint="/run/shmmap/default.sock", map_path="/maps/town", map_version=1, shm_dir="/dev/shm",
-    id_prefix="", library_version=shmmap.__version__, started_unix_ns=1, frame_id="map",
-)  # fmt: skip
-
-
-class Told(Snapshot):
-    """Statistics with these counters."""
-
-    def __init__(self, state: str, version: str, told: dict[str, int]) -> None:
-        identity = None if state == "absent" else dataclasses.replace(IDENTITY, library_version=version)
-        super().__init__(cast("Any", state), identity)
-        self.__dict__["counters"] = told
-
-
-def told(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
-    return Told(state, version, counters)
-
-
-class Ward:
-    """Makes patients; files of their machine are given by name."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-
-    def file(self, name: str, text: str) -> None:
-        path = self.root / name.lstrip("/")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-    def patient(
-        self, seen: Snapshot | None = None, *, uid: int = USER, file: str = "", **settings: object
-    ) -> Patient:
-        (self.root / "dev/shm").mkdir(parents=True, exist_ok=True)
-        config = DaemonConfig(**settings)  # type: ignore[arg-type]
-        return Patient(Machine(self.root), config, file, config.endpoint, seen or told("absent"), uid=uid)
+from tests.support.doctor_ward import USER, Ward, told
 
 
 @pytest.fixture

@@ -67,6 +67,12 @@ def driving(**values: int) -> dict[str, int]:
             f"raise --prefetch-share or --budget, or {LESS}",
         ),
         (
+            driving(ahead_ns=4 * S, prefetch_short=1, disk_ahead=1),
+            "enough",
+            f"enough: {SHORT.partition(', less')[0]}; the rest of --ride-out (10.0 s) is on the disk",
+            "",
+        ),
+        (
             driving(ahead_ns=4 * S, prefetch_short=2),
             "full",
             f"NOT ENOUGH: {SHORT}; the budget of 1.0 GiB is full of what is in use or needed sooner",

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from shmmap.segment.directory import ShmDirectory
-from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
+from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, OBJECTS_READ, PUBLISHED
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.prometheus import exposition
@@ -79,8 +79,23 @@ def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:
     assert samples["shmmap_longest_turn_requests_seconds", ""] == 0.012
     told |= {f"{name.removesuffix('_seconds')}_ns" for name in told}
     expected = {c.name for c in COUNTERS if not c.name.endswith(("_10s", "_1min", "_10min"))}
-    assert expected - {"last_reload_unix_ns"} <= told
+    not_yet = {"origin_out_since_unix_ns", *PUBLISHED}
+    assert expected - not_yet - {"last_reload_unix_ns"} <= told
+    assert not not_yet & told
     assert {f"{h.name}_seconds" for h in HISTOGRAMS} <= told
+
+
+def test_a_published_map(found: Snapshot) -> None:
+    told = found.counters | {"published_version": 7, "published_taken_unix_ns": 1_500_000_000_500_000_000}
+    told |= {"origin_out_since_unix_ns": 1_600_000_000_000_000_000, "objects_fetched": 5}
+    found.__dict__["counters"] = told
+    types, samples = parse(exposition(found, "unit"))
+    assert {f"shmmap_{name}_total" for name in OBJECTS_READ} <= types.keys()
+    assert samples["shmmap_published_version", ""] == 7
+    assert samples["shmmap_objects_fetched_total", ""] == 5
+    assert samples["shmmap_published_taken_timestamp_seconds", ""] == 1_500_000_000.5
+    assert samples["shmmap_origin_out_since_timestamp_seconds", ""] == 1_600_000_000
+    assert "shmmap_published_expires_timestamp_seconds" not in types, "no time is better than 1970"
 
 
 def test_histograms_are_cumulative(found: Snapshot) -> None:

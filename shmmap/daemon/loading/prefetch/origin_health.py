@@ -45,8 +45,11 @@ class OriginHealth:
         return self.unreachable or self.failed_in_a_row >= IN_A_ROW
 
     def next_try_s(self) -> float:
-        """Until when nothing is tried: minus infinity unless nothing can be loaded."""
-        return self._tried_s + PROBE_S if self.is_out else -math.inf
+        """Until when nothing is tried: minus infinity unless nothing can be loaded.
+
+        An origin may not answer, and loads succeed: what they need is on the disk.
+        """
+        return self._tried_s + PROBE_S if self.is_out and self.failed_in_a_row else -math.inf
 
     def tried(self, now_s: float) -> None:
         """A load begins."""

@@ -72,6 +72,7 @@ class Prefetcher:
         self._next_s = -math.inf
         self._full_until_s = self._followed_s = -math.inf
         self._running: dict[Load, int] = {}
+        self._no_room = False
 
     def restart(self) -> None:
         """More of the map is known, or less: look along all paths from the start."""
@@ -135,7 +136,7 @@ class Prefetcher:
         return not len(self._loads) and self._pool.free_places > 0
 
     @property
-    def _kept(self) -> int:
+    def kept_places(self) -> int:
         """How many places are kept free; not the only one."""
         pool = self._pool
         return min(max(1, pool.places // KEPT), pool.limit * pool.places - 1)
@@ -146,13 +147,14 @@ class Prefetcher:
         if wish is None:
             self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
             return
-        if wish.needed_in_s > URGENT_S and self._pool.free_places <= self._kept:
+        if wish.needed_in_s > URGENT_S and self._pool.free_places <= self.kept_places:
             # the last ones wait for demands, until a load ends or a client comes nearer
             self._next_s = now_s + wish.needed_in_s - URGENT_S
             return
         key, nbytes = Key(cache.catalogue.id(wish.cell), wish.layer), cache.estimate(wish.cell, wish.layer)
         taken = cache.ledger.prefetched_bytes + sum(self._running.values())
-        if taken + nbytes > self.share * cache.ledger.budget_bytes:
+        self._no_room = taken + nbytes > self.share * cache.ledger.budget_bytes
+        if self._no_room:
             self._next_s = math.inf  # until somebody asks for what was fetched
         else:
             computed = cache.layers.is_computed(wish.cell, wish.layer)
@@ -198,6 +200,10 @@ class Prefetcher:
         self._running.pop(load, None)
         if ran and load.sources and self.prefetch.health.ended(took_s, failed=out):
             self._loads.forget_failures()
+
+    def lacks_room(self, now_s: float) -> bool:
+        """Whether there was no memory for the last wish."""
+        return self._no_room or now_s < self._full_until_s
 
     def shortage(self, now_s: float) -> int:
         """What keeps cells from being fetched ahead: 0 nothing, 1 their share is full, 2 the budget is."""

@@ -150,9 +150,9 @@ class WayAhead:
         self._inside = inside
 
     def _known(self, catalogue: CatalogueView, area: Area, needed_in_s: float) -> NDArray[np.intp]:
-        """Cells of an area; pages that may have others are fetched, too."""
-        found, known = catalogue.query(area, MOST_CELLS)
-        if not known and (pages := catalogue.pages) is not None:
+        """Cells of an area; pages that may have others are fetched, too, and those that are here are kept."""
+        found, _known = catalogue.query(area, MOST_CELLS)
+        if (pages := catalogue.pages) is not None and not catalogue.complete:
             pages.want(pages.of_area(area), PREFETCH + needed_in_s)
         return found
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.errors import ConfigError
-from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
+from shmmap.origin.remote.credentials import azure_settings, credentials_source, google_settings, s3_settings
 
 SECRET = "hunter2"
 ANONYMOUS = {"region": "us-east-1", "skip_signature": True}
@@ -151,3 +151,33 @@ def test_google_and_azure(home: Path) -> None:
     with pytest.raises(ConfigError) as error:
         azure_settings(given)
     assert SECRET not in str(error.value)
+
+
+def test_sources_are_named_and_nothing_else(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def source(scheme: str, **environment: str) -> str:
+        return credentials_source(scheme, environment)
+
+    keys = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": SECRET}
+    assert source("https", **keys) == source("file") == ""
+    assert source("s3", **keys) == "the environment, AWS_ACCESS_KEY_ID"
+    assert source("s3", **keys, AWS_SESSION_TOKEN="t").endswith("with AWS_SESSION_TOKEN")
+    later = {"AWS_CREDENTIAL_EXPIRATION": "2999-01-01T00:00:00Z"}
+    assert source("s3", **keys, **later) == "the environment, AWS_ACCESS_KEY_ID"
+    with pytest.raises(ConfigError, match="expired at 2020"):
+        source("s3", **keys, AWS_CREDENTIAL_EXPIRATION="2020-01-01T00:00:00Z")
+    assert source("s3") == source("gs") == source("az") == "nowhere: requests are not signed"
+    assert source("s3", AWS_SKIP_SIGNATURE="1") == "nowhere: requests are not signed"
+    given = home / "given"
+    given.mkdir()
+    (given / "shmmap.aws").write_text(f"[default]\naws_access_key_id = a\naws_secret_access_key = {SECRET}\n")
+    (given / "shmmap.google").write_text("{}")
+    (given / "shmmap.azure").write_text(f"AZURE_STORAGE_ACCOUNT_KEY={SECRET}\n")
+    inside = {"CREDENTIALS_DIRECTORY": str(given)}
+    assert source("s3", **inside) == "profile 'default' of $CREDENTIALS_DIRECTORY/shmmap.aws"
+    assert source("gs", **inside) == "$CREDENTIALS_DIRECTORY/shmmap.google"
+    assert source("az", **inside) == "$CREDENTIALS_DIRECTORY/shmmap.azure"
+    assert source("gs", GOOGLE_SERVICE_ACCOUNT="x") == "the environment, GOOGLE_SERVICE_ACCOUNT"
+    assert source("az", AZURE_STORAGE_SAS_KEY="x") == "the environment, AZURE_STORAGE_SAS_KEY"
+    assert (
+        credentials_source("s3", {}, instance=True) == "the cloud's metadata address (instance_credentials)"
+    )

@@ -23,6 +23,7 @@ from shmmap.errors import MapDataError, MapMissing, Offline
 from shmmap.origin.remote.directory_store import DirectoryStore
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import blob_path
+from shmmap.statistics.counters import OBJECTS_READ
 from tests.support.trimming import wait_for_trimming
 
 DATA = random.Random(1).randbytes(20_000)
@@ -386,7 +387,7 @@ def test_damaged_in_the_store_is_not_kept(origin: Origin, tier: ObjectTier, cach
     with pytest.raises(MapMissing):
         objects.read(NAME, len(DATA))
     assert not cache.exists()
-    assert objects.counts == ObjectCounts()
+    assert objects.counts == ObjectCounts(damaged_in_store=2, failed=3)
 
 
 def test_what_has_no_hash_for_a_name_is_never_kept(origin: Origin, tier: ObjectTier, cache: Path) -> None:
@@ -480,3 +481,18 @@ def test_the_pages_of_the_version_in_use_stay(cache: Path) -> None:
         wait_for_trimming()
     left = [tier.get(name, 5000, is_index=True) is not None for name in names]
     assert left == [True, True, False, False, False, True, True, True]
+
+
+def test_counts_are_those_that_the_statistics_have(origin: Origin, tier: ObjectTier, cache: Path) -> None:
+    assert len(ObjectCounts._fields) == len(OBJECTS_READ)
+    objects = KeptObjects(origin, tier)
+    assert objects.read_kept(NAME, len(DATA)) is None
+    objects.read(NAME, len(DATA))
+    before = objects.counts
+    path_of(cache).write_bytes(DATA[::-1])
+    assert objects.read(NAME, len(DATA)) == DATA
+    more = dict(zip(OBJECTS_READ, objects.counts.since(before), strict=True))
+    assert {name: count for name, count in more.items() if count} == {
+        "objects_fetched": 1, "bytes_fetched": len(DATA), "objects_damaged_on_disk": 1,
+    }  # fmt: skip
+    assert objects.read_kept(NAME, len(DATA)) is not None

@@ -51,3 +51,15 @@ def test_times_are_those_of_the_last_loads(times: list[float]) -> None:
     assert health.mean_s == pytest.approx(sum(last) / len(last))
     assert sum(took_s > health.slow_s for took_s in last) <= len(last) / 20
     assert health.slow_s in last
+
+
+def test_loads_that_succeed_although_the_origin_is_away_are_not_held_back() -> None:
+    """What they need is on the disk."""
+    health = OriginHealth(unreachable=True)
+    health.tried(10.0)
+    health.ended(0.1, failed=False)
+    assert health.is_out
+    assert health.next_try_s() == -math.inf
+    health.tried(11.0)
+    health.ended(0.1, failed=True)
+    assert health.next_try_s() == 11.0 + PROBE_S

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Has objects of a published map kept on the disk before any loader needs them, in a few threads.
+
+They are fetched and compared with their hash as loaders do it, and nothing in them is looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+from shmmap.errors import Offline, ShmmapError
+from shmmap.logfmt import log
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
+from shmmap.origin.remote.published_object import ObjectName
+
+__all__ = ["Kept", "KeptCell", "ObjectKeeper"]
+
+THREADS: Final = 8
+END_S: Final = 0.5
+"""How long the end of the daemon waits for a thread that waits for the store."""
+
+
+class KeptCell(NamedTuple):
+    """What objects are for: a layer of a cell, by its index in a version of the map."""
+
+    map_version: int
+    cell: int
+    layer: str
+
+
+class Kept(NamedTuple):
+    """What has become of the objects asked for.
+
+    Attributes
+    ----------
+    is_here
+        They are on the disk.
+    has_no_room
+        They were fetched, and the disk does not take them.
+    """
+
+    key: KeptCell
+    is_here: bool
+    has_no_room: bool = False
+
+
+class ObjectKeeper:
+    """Fetches into the disk tier alone.
+
+    Parameters
+    ----------
+    failed
+        Called, in a thread, when the store could not be reached.
+
+    Attributes
+    ----------
+    fd
+        Readable when `take` has something to say.
+    """
+
+    def __init__(self, objects: KeptObjects, tier: ObjectTier, failed: Callable[[], None]) -> None:
+        self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._objects, self._tier, self._failed = objects, tier, failed
+        self._wanted: queue.SimpleQueue[tuple[KeptCell, Sequence[ObjectName]] | None] = queue.SimpleQueue()
+        self._done: deque[Kept] = deque()
+        self._threads: list[threading.Thread] = []
+        self._under_way = 0
+
+    @property
+    def counts(self) -> ObjectCounts:
+        """What was read so far."""
+        return self._objects.counts
+
+    @property
+    def free_places(self) -> int:
+        """How many more can be begun at once."""
+        return THREADS - self._under_way
+
+    def keep(self, key: KeptCell, names: Sequence[ObjectName]) -> None:
+        """Have these objects on the disk."""
+        self._under_way += 1
+        self._wanted.put((key, names))
+        if len(self._threads) < min(self._under_way, THREADS):
+            thread = threading.Thread(target=self._run, name="keep", daemon=True)
+            with contextlib.suppress(RuntimeError):  # there are as many threads as there may be
+                thread.start()
+                self._threads.append(thread)
+
+    def take(self) -> list[Kept]:
+        """Return what was done since the last time."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.fd)
+        found = [self._done.popleft() for _ in range(len(self._done))]
+        self._under_way -= len(found)
+        return found
+
+    def _run(self) -> None:
+        while (wanted := self._wanted.get()) is not None:
+            key, names = wanted
+            self._done.append(self._keep(key, names))
+            os.eventfd_write(self.fd, 1)
+
+    def _keep(self, key: KeptCell, names: Sequence[ObjectName]) -> Kept:
+        try:
+            for name in names:
+                if self._tier.has(name.sha256, name.size):
+                    continue
+                self._objects.read(name.sha256, name.size)
+                if not self._tier.has(name.sha256, name.size):
+                    return Kept(key, False, has_no_room=True)
+        except Offline:
+            self._failed()
+            return Kept(key, False)
+        except ShmmapError:  # a loader that needs it says so, by the cell's name
+            return Kept(key, False)
+        except Exception:  # noqa: BLE001  else it would count as under way for ever
+            log.exception("an object cannot be kept on disk ahead", cause="a defect in shmmap")
+            return Kept(key, False)
+        return Kept(key, True)
+
+    def close(self) -> bool:
+        """End the threads; False if one still waits for the store."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._wanted.get_nowait()
+        for _ in self._threads:
+            self._wanted.put(None)
+        until_s = time.monotonic() + END_S
+        for thread in self._threads:
+            thread.join(max(0.0, until_s - time.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asks the store of a published map in a process apart, as the daemon would ask it, and within a time.
+
+Only the configured URL is asked, with the daemon's credentials where this account may see where they come
+from.  Whatever hangs, a credentials file or a server that sends a byte a second, hangs that process; it is
+ended, and what it has said so far counts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from email.utils import parsedate_to_datetime
+from typing import Any, Final
+
+import msgspec
+
+from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline, PackageMissing, ShmmapError
+
+__all__ = ["ASKED_S", "StoreAnswer", "StoreQuestion", "ask_store"]
+
+ASKED_S: Final = 12.0
+"""How long the process may take, its start included."""
+_CLOCK_S: Final = 3.0
+_NAMED: Final = ("AWS_", "GOOGLE_", "AZURE_")
+_OTHERS: Final = (
+    "SERVICE_ACCOUNT", "CREDENTIALS_DIRECTORY", "SSL_CERT_FILE", "SSL_CERT_DIR", "HOME",
+    "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY",
+    "http_proxy", "https_proxy", "all_proxy", "no_proxy",
+)  # fmt: skip
+
+
+class StoreQuestion(msgspec.Struct):
+    """What is asked: a store, and the entry of the version that is served (0: none)."""
+
+    url: str
+    insecure_http: bool = False
+    instance_credentials: bool = False
+    served: int = 0
+
+
+class StoreAnswer(msgspec.Struct):
+    """What the store answered; times in seconds, Unix time where they are moments.
+
+    Attributes
+    ----------
+    credentials, credentials_error, credentials_hint
+        Where credentials come from, never what they are; or why they cannot be used.
+    is_refused
+        The store refuses them.
+    answers
+        Whether anything answers, if only with a refusal.
+    first_s, next_s
+        Of one small object over a new connection, and of the next one.
+    error, hint
+        Why it could not be read.
+    version
+        Number of what is offered; 0: not known.
+    created_s, served_created_s
+        When that one was published, and when the one that is served was.
+    clock_s
+        By how much the store's clock is ahead of this machine's.
+    is_late
+        The process was ended because it took too long.
+    """
+
+    credentials: str = ""
+    credentials_error: str = ""
+    credentials_hint: str = ""
+    is_refused: bool = False
+    answers: bool = False
+    first_s: float | None = None
+    next_s: float | None = None
+    error: str = ""
+    hint: str = ""
+    version: int = 0
+    created_s: float | None = None
+    served_created_s: float | None = None
+    clock_s: float | None = None
+    is_late: bool = False
+
+
+def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) -> StoreAnswer:
+    """Ask the store.
+
+    Parameters
+    ----------
+    environment
+        Of the daemon: what says where its credentials are is taken from it, and nothing else; None: it cannot
+        be seen, this process's own is used.
+    """
+    given = dict(os.environ)
+    if environment is not None:
+        given = {name: value for name, value in given.items() if not _is_of_a_store(name)}
+        given |= {name: value for name, value in environment.items() if _is_of_a_store(name)}
+    given["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "shmmap.doctor.store_probe", msgspec.json.encode(question).decode()],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=given, cwd="/",
+        )  # fmt: skip
+    except OSError as error:
+        return StoreAnswer(error=f"it cannot be asked: {sys.executable}: {error.strerror}")
+    is_late = False
+    try:
+        said, _ = process.communicate(timeout=ASKED_S)
+    except subprocess.TimeoutExpired:
+        is_late = True
+        process.kill()
+        said, _ = process.communicate()
+    lines = said.splitlines()
+    answer = msgspec.json.decode(lines[-1], type=StoreAnswer) if lines else StoreAnswer()
+    answer.is_late = is_late
+    if not is_late and process.returncode and not answer.error:
+        answer.error = f"the process that asks it ended with {process.returncode}"
+    return answer
+
+
+def _is_of_a_store(name: str) -> bool:
+    return name.startswith(_NAMED) or name in _OTHERS
+
+
+# --- in the process apart -----------------------------------------------------------------------------
+
+
+def main(words: str) -> None:
+    """Ask, and write down after each step what is known: the last line counts."""
+    question, answer = msgspec.json.decode(words, type=StoreQuestion), StoreAnswer()
+    for step in (_ask_credentials, _ask_objects, _ask_clock):
+        step(question, answer)
+        sys.stdout.write(msgspec.json.encode(answer).decode() + "\n")
+        sys.stdout.flush()
+    os._exit(0)  # threads that still ask are not waited for
+
+
+def _ask_credentials(question: StoreQuestion, answer: StoreAnswer) -> None:
+    from shmmap.origin.remote.credentials import credentials_source
+    from shmmap.origin.remote.store import read_url
+
+    try:
+        scheme = read_url(question.url).scheme
+        answer.credentials = credentials_source(scheme, os.environ, instance=question.instance_credentials)
+    except ConfigError as error:
+        answer.credentials_error, answer.credentials_hint = str(error), error.hint
+    except ShmmapError as error:
+        answer.error, answer.hint = error.message, error.hint
+
+
+def _ask_objects(question: StoreQuestion, answer: StoreAnswer) -> None:
+    from shmmap.origin.remote.map_versions import read_current, read_entry
+    from shmmap.origin.remote.serving_store import ServedFrom, open_for_serving
+    from shmmap.origin.remote.store import StoreRefused, Timeouts
+
+    if answer.error or answer.credentials_error:
+        return
+    timeouts = Timeouts(connect_s=3.0, read_s=3.0, retries=0, retry_s=3.0)
+    served = ServedFrom(question.url, question.insecure_http, question.instance_credentials)
+    try:
+        store = open_for_serving(served, timeouts)
+        began_s = time.monotonic()
+        current = read_current(store).current
+        answer.first_s, answer.answers = time.monotonic() - began_s, True
+        if current is None:
+            answer.error, answer.hint = "no map is published there", "shmmap publish MAP URL publishes one"
+            return
+        answer.version = current.version
+        began_s = time.monotonic()
+        with contextlib.suppress(MapMissing):
+            answer.created_s = read_entry(store, current.version).created_s
+            answer.next_s = time.monotonic() - began_s
+        if question.served == current.version:
+            answer.served_created_s = answer.created_s
+        elif question.served:
+            with contextlib.suppress(MapMissing):
+                answer.served_created_s = read_entry(store, question.served).created_s
+    except StoreRefused as error:
+        answer.answers, answer.is_refused = True, error.of_credentials
+        answer.error, answer.hint = error.message, error.hint
+    except Offline as error:
+        answer.error, answer.hint = error.message, error.hint
+    except PackageMissing as error:
+        answer.error, answer.hint = f"it cannot be asked with this Python: {error.message}", error.hint
+    except ShmmapError as error:
+        answer.answers = answer.answers or isinstance(error, MapDataError)
+        answer.error, answer.hint = str(error), error.hint
+
+
+def _ask_clock(question: StoreQuestion, answer: StoreAnswer) -> None:
+    """Compare clocks by the ``Date`` of any answer of the server, asked without credentials."""
+    import urllib.error
+    import urllib.request
+
+    from shmmap.origin.remote.bucket_store import server_url
+    from shmmap.origin.remote.store import read_url
+
+    if not answer.answers:
+        return
+    url = server_url(read_url(question.url))
+    if not url:
+        return
+
+    class Stay(urllib.request.HTTPRedirectHandler):
+        """Goes nowhere else."""
+
+        def redirect_request(self, *_: Any, **__: Any) -> None:
+            return None
+
+    request = urllib.request.Request(url, method="HEAD", headers={"User-Agent": "shmmap"})  # noqa: S310  http
+    with contextlib.suppress(OSError, ValueError):
+        try:
+            with urllib.request.build_opener(Stay).open(request, timeout=_CLOCK_S) as reply:
+                headers = reply.headers
+        except urllib.error.HTTPError as refused:
+            headers = refused.headers
+            refused.close()
+        here_s = time.time()
+        there_s = parsedate_to_datetime(headers["Date"]).timestamp() + float(headers.get("Age", "0"))
+        answer.clock_s = there_s - here_s
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What operators see of a published map: counters, screens, metrics; what they do not see of files."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import shmmap
+from shmmap.statistics.reader import read_statistics
+from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Shmmap
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import make_map
+from tests.support.faulty_web import FaultyWeb, faulty_web
+from tests.support.patience import Patience
+from tests.support.publishing import publish
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+pytest.importorskip("obstore", reason="obstore is not installed")
+
+ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
+CELLS = PAGES = 4
+
+
+@pytest.fixture
+def web(tmp_path: Path) -> Iterator[FaultyWeb]:
+    """A web server of a published map of four cells, each in a shard of its own."""
+    made = make_map(tmp_path / "town", columns=2, rows=2, points=300)
+    publish(made.root, tmp_path / "www")
+    with faulty_web(tmp_path / "www") as one:
+        yield one
+
+
+def counters(one: DaemonProcess) -> Mapping[str, int]:
+    return read_statistics(one.instance, one.shm_dir).counters
+
+
+def until(one: DaemonProcess, told: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
+    """Wait for a beat that tells this."""
+    waiting = Patience()
+    while waiting(not told(counters(one))):
+        time.sleep(0.02)
+    return counters(one)
+
+
+def load_all(one: DaemonProcess) -> shmmap.CellSet:
+    with shmmap.connect(one.endpoint) as client:
+        return client.area(ALL, wait=60.0)
+
+
+def evict_all(one: DaemonProcess, client: shmmap.Client) -> None:
+    """Drop all cells, and wait until none is left that could be taken back."""
+    client.evict()
+    until(one, lambda told: not told["cells_resident"] and not told["zombies"])
+
+
+def objects(web: FaultyWeb) -> list[Path]:
+    return [path for path in (web.folder / "blobs").rglob("*") if path.is_file()]
+
+
+def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    began_ns = time.time_ns()
+    one = daemon(web.url, "--poll", "0")
+    assert load_all(one).complete
+    sizes = [path.stat().st_size for path in objects(web)]
+    assert len(sizes) == CELLS + PAGES + 1
+    told = until(one, lambda told: told["objects_fetched"] == len(sizes))
+    assert told["bytes_fetched"] == sum(sizes)
+    assert (told["objects_from_disk"], told["fetches_failed"]) == (0, 0)
+    assert (told["published_version"], told["published_refused"], told["published_expires_unix_ns"]) == (
+        1,
+        0,
+        0,
+    )
+    assert began_ns < told["published_taken_unix_ns"] < time.time_ns()
+    assert (told["map_pages"], told["map_pages_known"], told["map_cells_known"]) == (PAGES, PAGES, CELLS)
+    taken_ns = told["published_taken_unix_ns"]
+    waiting = Patience()
+    while waiting(not list(one.state_dir.rglob("*.taken"))):
+        time.sleep(0.02)
+
+    one.stop()
+    one.start()
+    assert load_all(one).complete
+    told = until(one, lambda told: told["objects_from_disk"] == CELLS + PAGES)  # the root is state
+    assert (told["objects_fetched"], told["published_taken_unix_ns"]) == (0, taken_ns)
+
+
+def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    one = daemon(web.url, "--poll", "0")
+    assert load_all(one).complete
+    kept = [path for path in Path(one.cache_dir).rglob("objects/cells/*/*") if path.is_file()]
+    assert len(kept) == CELLS
+    one.stop()
+    kept[0].write_bytes(kept[0].read_bytes()[:-1] + b"?")
+    shutil.rmtree(kept[1].parent)
+    lost = kept[1].name
+    web.fault = lambda path: "corrupt" if path.endswith(lost) else ""
+    one.start()
+    cells = load_all(one)
+    assert len(cells.failed) == 1
+    told = until(one, lambda told: told["objects_damaged_in_store"] == 2)  # it is asked twice
+    assert (told["objects_damaged_on_disk"], told["fetches_failed"]) == (1, 2)
+
+    before_ns = time.time_ns()
+    web.refuse()
+    with shmmap.connect(one.endpoint) as client:
+        waiting = Patience()
+        while waiting([failure.code for failure in client.area(ALL, wait=5.0).failed] != ["offline"]):
+            time.sleep(0.05)
+    told = until(one, lambda told: told["origin_out"] == 1 and told["fetches_failed"] > 2)
+    assert before_ns < told["origin_out_since_unix_ns"] < time.time_ns()
+    web.listen()
+    told = until(one, lambda told: told["origin_out"] == 0)
+    assert told["origin_out_since_unix_ns"] == 0
+
+
+def test_a_refused_offer_is_shown_until_another_one_comes(
+    daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path
+) -> None:
+    first = (web.folder / "CURRENT").read_bytes()
+    other = make_map(tmp_path / "other", columns=2, rows=2, points=200)
+    publish(other.root, web.folder)
+    second = (web.folder / "CURRENT").read_bytes()
+    one = daemon(web.url, "--poll", "1")
+    until(one, lambda told: told["published_version"] == 2)
+    (web.folder / "CURRENT").write_bytes(first)
+    until(one, lambda told: told["published_refused"] == 1)
+    assert "version 1 is offered and refused" in Shmmap(one, tmp_path)("status")
+    (web.folder / "CURRENT").write_bytes(second)
+    until(one, lambda told: told["published_refused"] == 0)
+
+
+def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -> None:
+    one = daemon(web.url, "--poll", "0")
+    assert load_all(one).complete
+    until(one, lambda told: told["objects_fetched"] == CELLS + PAGES + 1)
+    shmmap_ = Shmmap(one, tmp_path)
+    told: dict[str, Any] = shmmap_.json("status")["published"]
+    assert shmmap_.json("top")["published"].keys() == told.keys()
+    assert (told["version"], told["objects_fetched"], told["cells_known"]) == (1, CELLS + PAGES + 1, CELLS)
+    assert told["expires_unix_s"] is told["offline_since_unix_s"] is told["refused"] is None
+    assert abs(told["taken_unix_s"] - time.time()) < 240
+    status, top = shmmap_("status"), " ".join(shmmap_("top", "--once").split())
+    assert re.search(r"^version +1, taken on \d{4}-\d\d-\d\d \d\d:\d\d UTC, .* ago$", status, re.MULTILINE)
+    assert re.search(r"^known +all 4 cells$", status, re.MULTILINE)
+    fetched = re.search(
+        r"^fetched +(9 objects, [\d.]+ KiB; from the disk 0 objects, 0 B)$", status, re.MULTILINE
+    )
+    assert fetched is not None
+    assert fetched[1] in top
+    assert "version 1, taken on" in " ".join(shmmap_("map").split())
+    metrics = shmmap_("metrics")
+    assert re.search(r"^shmmap_objects_fetched_total\{.*\} 9$", metrics, re.MULTILINE)
+    assert re.search(r"^shmmap_published_version\{.*\} 1$", metrics, re.MULTILINE)
+    assert re.search(r"^shmmap_published_taken_timestamp_seconds\{", metrics, re.MULTILINE)
+    assert "shmmap_published_expires" not in metrics
+    assert "shmmap_origin_out_since" not in metrics
+
+    web.refuse()
+    with shmmap.connect(one.endpoint) as client:
+        evict_all(one, client)
+        assert client.area(ALL, wait=60.0).complete, "out of the disk cache"
+    shutil.rmtree(one.cache_dir)
+    with shmmap.connect(one.endpoint) as client:
+        evict_all(one, client)
+        waiting = Patience()
+        while waiting(len(client.area(ALL, wait=5.0).failed) != CELLS):
+            time.sleep(0.05)
+    until(one, lambda told: told["origin_out"] == 1)
+    assert re.search(
+        r"^origin +out of reach for .* \(since .* UTC\): what is in memory and on", shmmap_("status"), re.M
+    )
+    assert "its store is out of reach for" in " ".join(shmmap_("map").split())
+    assert shmmap_.json("status")["published"]["offline_since_unix_s"] <= time.time()
+    assert re.search(r"^shmmap_origin_out_since_timestamp_seconds\{.*\} 1", shmmap_("metrics"), re.MULTILINE)
+
+
+def test_nothing_of_it_where_the_map_is_files(daemon: DaemonFactory, tmp_path: Path) -> None:
+    made = make_map(tmp_path / "town", columns=2, rows=2, points=300)
+    one = daemon(made.root)
+    assert load_all(one).complete
+    shmmap_ = Shmmap(one, tmp_path)
+    assert shmmap_.json("status")["published"] is None
+    assert shmmap_.json("top")["published"] is None
+    for text in (shmmap_("status"), shmmap_("top", "--once"), shmmap_("map")):
+        assert "taken on" not in text
+        assert "fetched  " not in text
+    metrics = shmmap_("metrics")
+    assert not re.search("shmmap_(objects|published|fetches|map_pages)", metrics)
+    assert "shmmap_map_cells_known" in metrics

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A vehicle drives along its route while the store of a published map is away: it does not notice."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import shmmap
+from shmmap.doctor.keeping_ahead import ahead_verdict
+from shmmap.statistics.reader import read_statistics
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import DaemonProcess
+from tests.support.divided_map import DividedMap, random_points
+from tests.support.faulty_web import FaultyWeb, faulty_web
+from tests.support.patience import Patience
+from tests.support.publishing import publish
+
+pytest.importorskip("zstandard", reason="zstandard is not installed")
+pytest.importorskip("obstore", reason="obstore is not installed")
+
+SIZE, ROAD_M, SHARDS = 20, 1400, 20
+SPEED, RIDE_OUT_S, RADIUS, STEP = 20.0, 30.0, 6.0, 20
+ROUTE = [(0.0, 10.0), (float(ROAD_M), 10.0)]
+DRIVEN_M = int(SPEED * RIDE_OUT_S)
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def web(tmp_path: Path) -> Iterator[FaultyWeb]:
+    """A road of cells from the origin east, and some shards far from it: the list of cells comes in pages."""
+    made = DividedMap(tmp_path / "road", float(SIZE))
+    made.pcd_dir.mkdir(parents=True)
+    rng = np.random.default_rng(3)
+    far = [(640 * number, 6400) for number in range(SHARDS)]
+    for corner in [*((x, 0) for x in range(0, ROAD_M, SIZE)), *far]:
+        made.write_cell(f"{corner[0]}_{corner[1]}.pcd", corner, random_points(rng, corner, 3000))
+    made.write_metadata()
+    publish(made.root, tmp_path / "www")
+    with faulty_web(tmp_path / "www") as one:
+        yield one
+
+
+def counters(one: DaemonProcess) -> Mapping[str, int]:
+    return read_statistics(one.instance, one.shm_dir).counters
+
+
+def until_ahead(one: DaemonProcess, seconds: float) -> None:
+    """Wait until all that is needed for so long is in memory."""
+    waiting = Patience()
+    while waiting(counters(one)["ahead_ns"] < seconds * 1e9):
+        time.sleep(0.02)
+
+
+def until_in_memory(one: DaemonProcess, *names: str) -> None:
+    waiting = Patience()
+    while waiting(not set(names) <= {row.id for row in read_statistics(one.instance, one.shm_dir).cells}):
+        time.sleep(0.02)
+
+
+def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
+    """Drive as far as is to be ridden out; no step is made before a vehicle could have come so far."""
+    for x in range(STEP, DRIVEN_M, STEP):
+        until_in_memory(one, f"{x - STEP}_0.pcd", f"{x}_0.pcd")
+        update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S)
+        assert update.complete, (x, update.failed)
+    told = counters(one)
+    assert told["cells_late"] == 0
+    assert told["origin_out"] == 1, "and it was away all the time"
+
+
+def until_out(one: DaemonProcess) -> None:
+    waiting = Patience()
+    while waiting(not counters(one)["origin_out"]):
+        time.sleep(0.02)
+
+
+def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    """Of the list of cells there is room for a part only; what lies along the route stays."""
+    words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--catalogue-budget", "64K")
+    one = daemon(web.url, *words)
+    with shmmap.MapWindow(one.endpoint, RADIUS) as window:
+        assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S).complete
+        until_ahead(one, 0.9 * RIDE_OUT_S)
+        web.refuse()
+        until_out(one)
+        drive(one, window)
+
+
+def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    """Memory has room for a few seconds of the drive; the rest comes out of the disk cache in time."""
+    words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--budget", "2M", "--prefetch-share", "0.2")
+    one = daemon(web.url, *words)
+    with shmmap.MapWindow(one.endpoint, RADIUS) as window:
+        assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S).complete
+        wanted, waiting = DRIVEN_M // SIZE + 1, Patience()
+        cells = Path(one.cache_dir)
+        while waiting(sum(path.is_file() for path in cells.rglob("objects/cells/*/*")) < wanted):
+            time.sleep(0.05)
+        said = "the rest of --ride-out (30.0 s) is on the disk"
+        while waiting(said not in (verdict := ahead_verdict(counters(one))).why):
+            window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE)
+            time.sleep(0.02)
+        assert verdict.state == "enough"
+        told = counters(one)
+        assert told["ahead_ns"] < 0.5 * RIDE_OUT_S * 1e9, "memory has no room for all of it"
+        assert told["objects_fetched"] >= wanted
+        web.refuse()
+        until_out(one)
+        drive(one, window)
+        assert counters(one)["objects_from_disk"] > wanted // 2

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Machines for doctor, made of files in a directory, and daemons that tell what a test wants."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, cast
+
+import shmmap
+from shmmap.daemon.config import DaemonConfig
+from shmmap.doctor.patient import Machine, Patient
+from shmmap.statistics.identity import DaemonIdentity
+from shmmap.statistics.snapshot import Snapshot
+
+__all__ = ["IDENTITY", "USER", "Told", "Ward", "told"]
+
+USER = 61005
+IDENTITY = DaemonIdentity(
+    pid=4242, start_time_ticks=1, pid_namespace=1, epoch=1, instance="default",
+    endpoint="/run/shmmap/default.sock", map_path="/maps/town", map_version=1, shm_dir="/dev/shm",
+    id_prefix="", library_version=shmmap.__version__, started_unix_ns=1, frame_id="map",
+)  # fmt: skip
+
+
+class Told(Snapshot):
+    """Statistics with these counters."""
+
+    def __init__(self, state: str, version: str, told: dict[str, int]) -> None:
+        identity = None if state == "absent" else dataclasses.replace(IDENTITY, library_version=version)
+        super().__init__(cast("Any", state), identity)
+        self.__dict__["counters"] = told
+
+
+def told(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
+    return Told(state, version, counters)
+
+
+class Ward:
+    """Makes patients; files of their machine are given by name."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def file(self, name: str, text: str) -> None:
+        path = self.root / name.lstrip("/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    def patient(
+        self, seen: Snapshot | None = None, *, uid: int = USER, file: str = "", **settings: object
+    ) -> Patient:
+        (self.root / "dev/shm").mkdir(parents=True, exist_ok=True)
+        config = DaemonConfig(**settings)  # type: ignore[arg-type]
+        return Patient(Machine(self.root), config, file, config.endpoint, seen or told("absent"), uid=uid)

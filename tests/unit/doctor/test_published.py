@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What doctor says of a published map, by what its store has answered and the daemon tells."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
+from shmmap.doctor.store_probe import StoreAnswer
+from tests.support.doctor_ward import Ward, told
+
+URL = "s3://maps/town"
+DAY_S = 86_400.0
+ANSWERS: dict[str, Any] = {
+    "answers": True,
+    "first_s": 0.012,
+    "next_s": 0.003,
+    "version": 7,
+    "credentials": "somewhere",
+}
+
+
+@pytest.fixture
+def ward(tmp_path: Path) -> Ward:
+    return Ward(tmp_path / "machine")
+
+
+def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) -> dict[str, tuple[str, str]]:
+    """Each row: its state, and what it says."""
+    counts = {"published_version": 7, "published_refused": 0, "published_expires_unix_ns": 0}
+    counts |= {"published_taken_unix_ns": time.time_ns(), **counters}
+    patient = ward.patient(told(**counts), map_path=url)  # type: ignore[arg-type]
+    assert patient.seen is not None
+    patient.seen.identity = None  # the map is that of the settings
+    patient.__dict__["store"] = answer
+    checks = (check_link, check_credentials, check_clock, check_versions)
+    found = [check(patient) for check in checks]
+    return {one.name: ("skip" if one.skipped else one.state, f"{one.fact} -> {one.advice}") for one in found}
+
+
+def test_files_are_skipped(ward: Ward) -> None:
+    found = look(ward, StoreAnswer(error="never asked"), url="/maps/town")
+    assert {state for state, _ in found.values()} == {"skip"}
+
+
+def test_all_well(ward: Ward) -> None:
+    found = look(ward, StoreAnswer(**ANSWERS, clock_s=-3.0))
+    assert {state for state, _ in found.values()} == {"ok"}
+    assert "12.0 ms for a small object over a new connection, 3.0 ms for the next one" in found["link"][1]
+    assert "within 3 s" in found["clock"][1]
+
+
+@pytest.mark.parametrize(
+    ("answer", "row", "state", "says"),
+    [
+        ({"credentials": "x", "is_late": True}, "link", "warn", "no answer within 12 s"),
+        ({"error": f"{URL}/CURRENT: no answer"}, "link", "warn", "no answer; the daemon reached it when"),
+        ({"credentials_error": "half a pair"}, "credentials", "warn", "can be seen with sudo"),
+        ({"credentials_error": "half a pair"}, "link", "skip", "see credentials"),
+        (
+            {"answers": True, "is_refused": True, "error": "refused"},
+            "link",
+            "ok",
+            "refuses what this account has",
+        ),
+        ({"is_refused": True, "error": "no!", "credentials": "x"}, "credentials", "warn", "no!"),
+        ({"answers": True, "clock_s": 61.0}, "clock", "warn", "61.0 s behind the store's"),
+        ({"answers": True, "clock_s": -3601.0}, "clock", "warn", "60 min ahead of the store's"),
+        ({"answers": True}, "clock", "skip", "does not say"),
+        ({"version": 6}, "versions", "warn", "version 6 is offered, which is older"),
+        ({"version": 8}, "versions", "ok", "version 8 is offered -> it is taken at the next --poll"),
+        ({"version": 7, "created_s": 0.0}, "versions", "ok", "it is what is offered"),
+        ({}, "versions", "ok", "what is offered is not known"),
+    ],
+)
+def test_what_is_not_as_it_should_be(
+    ward: Ward, answer: dict[str, Any], row: str, state: str, says: str
+) -> None:
+    found = look(ward, StoreAnswer(**answer))
+    assert found[row][0] == state
+    assert says in found[row][1]
+
+
+def test_the_daemon_may_be_worse_off(ward: Ward) -> None:
+    found = look(ward, StoreAnswer(**ANSWERS), origin_out=1, last_outage_ns=90 * 10**9)
+    assert found["link"][0] == "warn"
+    assert "the daemon has not reached it for 90.0 s" in found["link"][1]
+
+
+def test_refused_and_expired(ward: Ward) -> None:
+    found = look(ward, StoreAnswer(**ANSWERS), published_refused=9)["versions"]
+    assert (found[0], "version 9 is offered and refused" in found[1]) == ("warn", True)
+    expired = int((time.time() - 3 * DAY_S) * 1e9)
+    found = look(ward, StoreAnswer(**ANSWERS), published_expires_unix_ns=expired)["versions"]
+    assert (found[0], "what signs it has expired 3 d ago" in found[1]) == ("warn", True)
