@@ -56,6 +56,7 @@ from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.protocol.codec import MAX_REQUEST_BYTES
 from shmmap.protocol.events import Epoch
+from shmmap.statistics.counters import REFUSALS
 
 if TYPE_CHECKING:
     from shmmap.daemon.map.catalogue_view import CatalogueView
@@ -75,6 +76,18 @@ class Elsewhere(Protocol):
     @property
     def link(self) -> OriginLink:
         """Says whether it is in reach, and has another version."""
+
+    @property
+    def expires_s(self) -> float | None:
+        """When what signs the version that was taken runs out, Unix time; None where nothing signs it."""
+
+    @property
+    def signed_s(self) -> float:
+        """When that was signed, Unix time; 0: it is not."""
+
+    @property
+    def refusal(self) -> str:
+        """Why what is offered is not taken, one of `REFUSALS`; empty where it is."""
 
     def note_served(self, view: CatalogueView) -> None:
         """Remember which version of the map is served now."""
@@ -297,10 +310,17 @@ class Service:
             self._reload()
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)
+            self._show_trust(self._elsewhere)
         version = memory.cache.catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
             memory.statistics.update_identity(memory.identity)
+
+    def _show_trust(self, origin: Elsewhere) -> None:
+        statistics = self._memory.statistics
+        statistics.set("published_expires_unix_ns", int((origin.expires_s or 0.0) * 1e9))
+        statistics.set("published_signed_unix_ns", int(origin.signed_s * 1e9))
+        statistics.set("published_refusal", REFUSALS.index(origin.refusal))
 
     def _status(self) -> str:
         cache = self._memory.cache

@@ -5,7 +5,16 @@ from __future__ import annotations
 
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["COUNTERS", "COUNTER_NAMES", "HISTOGRAMS", "SPANS", "TURN_KINDS", "WINDOWED", "Counter"]
+__all__ = [
+    "COUNTERS",
+    "COUNTER_NAMES",
+    "HISTOGRAMS",
+    "REFUSALS",
+    "SPANS",
+    "TURN_KINDS",
+    "WINDOWED",
+    "Counter",
+]
 
 
 class Counter(NamedTuple):
@@ -46,6 +55,9 @@ TURN_KINDS: Final = {
     "map": "another state of the map was taken over",
 }
 """What a turn of the serving loop is named after: what took most of it."""
+
+REFUSALS: Final = ("", "unsigned", "older", "expired", "altered", "foreign_root", "other")
+"""Why a version of a published map that is offered is not taken, by the value of ``published_refusal``."""
 
 COUNTERS: Final = (
     Counter("requests", "counter", "", "Requests received, well-formed or not"),
@@ -170,6 +182,15 @@ COUNTERS: Final = (
         Counter(f"{name}_{span}", "gauge", "", f"{text}, in the last {span}")
         for name, text in WINDOWED.items()
         for span in SPANS
+    ),
+    Counter("published_expires_unix_ns", "gauge", "ns", "When what signs it runs out; 0: it is not signed"),
+    Counter("published_signed_unix_ns", "gauge", "ns", "When that was signed, wall clock; 0: it is not"),
+    Counter(
+        "published_refusal",
+        "gauge",
+        "",
+        "Why the version that is offered is not taken: 0 it is, 1 unsigned, 2 older, 3 expired, 4 altered,"
+        " 5 foreign root, 6 something else",
     ),
 )
 
