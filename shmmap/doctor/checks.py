@@ -23,6 +23,7 @@ from shmmap.doctor.memory import (
 )
 from shmmap.doctor.patient import Patient
 from shmmap.doctor.ros_bridge import check_ros_bridge
+from shmmap.doctor.signed_map import check_signature
 
 __all__ = ["CHECKS", "diagnose"]
 
@@ -32,6 +33,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_group,
     check_map_access,
     check_reload,
+    check_signature,
     check_cells,
     check_shared_memory,
     check_cache,

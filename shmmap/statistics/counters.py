@@ -189,8 +189,7 @@ COUNTERS: Final = (
         "published_refusal",
         "gauge",
         "",
-        "Why the version that is offered is not taken: 0 it is, 1 unsigned, 2 older, 3 expired, 4 altered,"
-        " 5 foreign root, 6 something else",
+        "Why an offer is not taken: 1 unsigned, 2 older, 3 expired, 4 altered, 5 foreign, 6 other",
     ),
 )
 

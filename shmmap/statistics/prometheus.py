@@ -30,6 +30,9 @@ _LIVE = {
     "failing": ("failing", "gauge", "1 while chunks cannot be loaded or saved"),
 }
 
+_NO_TIME_IF_0 = {"published_expires_unix_ns", "published_signed_unix_ns"}
+"""Of what has not happened, or never will, there is no time: 1970 would be an alarm."""
+
 _TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
 
 
@@ -77,6 +80,8 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
         if counter.name in _TOLD_ELSEWHERE:
             continue
         value: float = found.counters[counter.name]
+        if counter.name in _NO_TIME_IF_0 and not value:
+            continue
         name = counter.name
         if counter.unit == "ns":
             name = name.replace("_unix_ns", "_timestamp_ns").removesuffix("_ns") + "_seconds"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
@@ -19,6 +20,7 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.keeping_ahead import ahead_as_json, ahead_verdict, outage_so_far, over_fetch
+from shmmap.doctor.signed_map import signature_lines
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -65,8 +67,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the state of the daemon."""
-    import time
-
     from shmmap.cli.daemon_address import snapshot
 
     found, identity = snapshot(args)
@@ -126,6 +126,7 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         )
     if count.get("origin_out", 0):
         lines.append(("origin", f"out of reach for {outage_so_far(count)}: what is in memory is served"))
+    lines += [("signature", text) for text in signature_lines(count, time.time())]
     if problems := count.get("map_problems", 0):
         lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
     if outside := count.get("cells_outside_box", 0):
