@@ -83,7 +83,7 @@ def unit_text(name: str, program: Program | None = None) -> str:
 
 
 def configuration(map_path: str = "", *, group: bool = True, trust: str = "") -> str:
-    """Return the example configuration: with this map and root of trust, with or without the service's group."""
+    """Return the example configuration with this map and root of trust, and with or without a group."""
     text = shipped_text("shmmap.toml")
     if map_path:
         # what JSON quotes is quoted the same way in TOML
