@@ -11,6 +11,7 @@ import fcntl
 import os
 import socket
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -45,6 +46,8 @@ __all__ = ["verify_version"]
 
 _URL = "map:///"  # the updater's names are URLs; what follows is a path at the store
 _ROLES: Final = ("timestamp", "snapshot", "targets", "root")
+_FORBIDDEN: Final = "(status 403)"
+"""What a bucket answers for what it does not have, where its user may not list it."""
 _NICE: Final = 5
 
 
@@ -68,6 +71,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
     with writing_errors(memory):
         os.makedirs(memory, mode=0o700, exist_ok=True)
         with _locked(memory):
+            _remove_interim(memory)
             updater, asked = _updater(store, trusted, memory, trust)
             try:
                 updater.refresh()
@@ -108,6 +112,8 @@ def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Upd
                 asked.failed.append(error)
                 raise DownloadHTTPError(path, 404) from None
             except ShmmapError as error:
+                if path.endswith(f".{_ROLES[-1]}.json") and _FORBIDDEN in error.message:
+                    raise DownloadHTTPError(path, 403) from None  # so a store says that there is none
                 asked.failed.append(error)
                 raise
             asked.found[path.removesuffix(".json").rpartition(".")[2]] = data
@@ -210,6 +216,13 @@ def _times(memory: str) -> tuple[float, dict[str, datetime]]:
     except (AttributeError, ValueError, OverflowError):
         signed_s = 0.0
     return signed_s, {role: one.expires for role, one in found.items()}
+
+
+def _remove_interim(memory: str) -> None:
+    """Remove what TUF's client had half written when it was killed."""
+    for name in os.listdir(memory):
+        if name.startswith(tempfile.gettempprefix()):
+            os.unlink(os.path.join(memory, name))
 
 
 @contextmanager
