@@ -133,6 +133,7 @@ class PublishedOrigin:
         self._accept_version = accept_version
         self._taken: TakenVersion | None = None
         self._lock = threading.Lock()  # of `_taken`: a reload changes it, and the thread that asks
+        self._saving = threading.Lock()
         self._problem: _Problem | None = None
         self._seen = NOTHING
         self._is_loading = False
@@ -341,7 +342,16 @@ class PublishedOrigin:
             return  # another one was taken, and waits for its pages
         self._saved = taken
         with contextlib.suppress(RuntimeError):  # as many threads as there may be: then with the next one
-            threading.Thread(target=_save, args=(self._state, taken), name="taken").start()
+            threading.Thread(target=self._save, args=(self._state, taken), name="taken").start()
+
+    def _save(self, state: TakenVersionFile, taken: TakenVersion) -> None:
+        with self._saving:
+            if taken is not self._saved:
+                return  # a later one was quicker, or comes
+            try:
+                state.save(taken)
+            except CannotWrite as error:
+                log.warning("the version taken cannot be remembered for the next start", reason=error)
 
     @property
     def expires_s(self) -> float | None:
@@ -386,13 +396,6 @@ class _OnDisk:
         if data is None:
             raise MapMissing(f"{path} is not on the disk")
         return memoryview(data)
-
-
-def _save(state: TakenVersionFile, taken: TakenVersion) -> None:
-    try:
-        state.save(taken)
-    except CannotWrite as error:
-        log.warning("the version taken cannot be remembered for the next start", reason=error)
 
 
 def _same_shards(view: PublishedView, root: Root) -> dict[int, Shard]:
