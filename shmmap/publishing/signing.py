@@ -241,7 +241,7 @@ class MapSigner:
         if Root.type in roles:
             signers.append(following)
         data = _signed_by(root, signers)
-        step("sign.next_root")
+        step("sign.nextroot")
         if not self._store.put_new(metadata_path(Root.type, root.version), data):
             raise InstanceBusy(
                 f"another rotation of {self._store.url} came between", hint="run the same command again"
@@ -429,7 +429,7 @@ class MapSigner:
         with writing_errors(self._directory):
             if not os.path.lexists(path):
                 _write_key(path)
-        step("sign.next_key")
+        step("sign.nextkey")
         return _read_key(self._directory, f"{name}.next")
 
     def _keys_here(self, role: str) -> list[CryptoSigner]:
