@@ -16,7 +16,15 @@ from typing import Any, Final, TypeVar, cast
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
 from shmmap.optional_packages import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
-from shmmap.origin.remote.store import WEB_SCHEMES, Listed, StoreUrl, Tag, Timeouts, is_loopback
+from shmmap.origin.remote.store import (
+    NO_PERMISSION,
+    WEB_SCHEMES,
+    Listed,
+    StoreUrl,
+    Tag,
+    Timeouts,
+    is_loopback,
+)
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
 with needed_packages("a map in a bucket or at a web server", together=FOR_REMOTE):
@@ -190,7 +198,7 @@ class BucketStore:
         except exceptions.NotModifiedError:  # asked for by `get_if_changed` alone
             raise
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError):
-            raise Offline(f"{self._name(path)}: refused, no permission", hint=_CLOCK) from None
+            raise Offline(f"{self._name(path)}: {NO_PERMISSION}", hint=_CLOCK) from None
         except (exceptions.BaseError, OSError) as error:
             raise _out_of_reach(self._name(path), str(error)) from None
 

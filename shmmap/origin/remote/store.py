@@ -18,6 +18,7 @@ from shmmap.errors import BadRequest
 __all__ = [
     "BUCKET_SCHEMES",
     "LONG_RUN",
+    "NO_PERMISSION",
     "PROBE",
     "SERVING",
     "WEB_SCHEMES",
@@ -37,6 +38,9 @@ __all__ = [
 BUCKET_SCHEMES: Final = ("s3", "gs", "az")
 WEB_SCHEMES: Final = ("https", "http")
 _SCHEMES: Final = ("file", *BUCKET_SCHEMES, *WEB_SCHEMES)
+
+NO_PERMISSION: Final = "refused, no permission"
+"""What errors of a store say when it answers 403: so it does for what is not there, too, unless it may be listed."""
 
 Tag: TypeAlias = Mapping[str, Any]
 """Names one state of an object; only the store that gave it knows what is in it."""

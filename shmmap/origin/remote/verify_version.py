@@ -26,7 +26,7 @@ from shmmap.optional_packages import TO_SIGN, needed_packages
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.store import LONG_RUN, SERVING
+from shmmap.origin.remote.store import LONG_RUN, NO_PERMISSION, SERVING
 from shmmap.origin.remote.verify_apart import (
     Verified,
     VerifyReply,
@@ -46,8 +46,6 @@ __all__ = ["verify_version"]
 
 _URL = "map:///"  # the updater's names are URLs; what follows is a path at the store
 _ROLES: Final = ("timestamp", "snapshot", "targets", "root")
-_FORBIDDEN: Final = "(status 403)"
-"""What a bucket answers for what it does not have, where its user may not list it."""
 _NICE: Final = 5
 
 
@@ -112,7 +110,7 @@ def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Upd
                 asked.failed.append(error)
                 raise DownloadHTTPError(path, 404) from None
             except ShmmapError as error:
-                if path.endswith(f".{_ROLES[-1]}.json") and _FORBIDDEN in error.message:
+                if path.endswith(f".{_ROLES[-1]}.json") and NO_PERMISSION in error.message:
                     raise DownloadHTTPError(path, 403) from None  # so a store says that there is none
                 asked.failed.append(error)
                 raise
