@@ -6,11 +6,13 @@ from __future__ import annotations
 import datetime
 import time
 from collections.abc import Mapping
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.patient import Patient
 from shmmap.statistics.counters import REFUSALS
+
+if TYPE_CHECKING:
+    from shmmap.doctor.patient import Patient
 
 __all__ = ["check_signature", "signature_lines", "trust_problems"]
 

@@ -18,7 +18,6 @@ from typing import Literal
 
 from shmmap.errors import CannotWrite, MapMissing
 from shmmap.origin.remote.store import is_url, read_url
-from shmmap.origin.remote.verify_apart import read_trusted_root
 from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import DROP_IN, MOUNT
 from shmmap.service.program import Program, command_line, is_hidden, quoted
@@ -139,6 +138,8 @@ def _root_of_trust(given: str, path: Path) -> list[PlannedFile]:
     """A copy of a root of trust: the service sees it, wherever the original lies; it is no secret."""
     if not given:
         return []
+    from shmmap.origin.remote.verify_apart import read_trusted_root
+
     return [PlannedFile(path, read_trusted_root(os.path.abspath(given)).decode())]
 
 

@@ -40,7 +40,7 @@ WEB_SCHEMES: Final = ("https", "http")
 _SCHEMES: Final = ("file", *BUCKET_SCHEMES, *WEB_SCHEMES)
 
 NO_PERMISSION: Final = "refused, no permission"
-"""What errors of a store say when it answers 403: so it does for what is not there, too, unless it may be listed."""
+"""What errors say where a store answers 403: for what is not there, too, unless it may be listed."""
 
 Tag: TypeAlias = Mapping[str, Any]
 """Names one state of an object; only the store that gave it knows what is in it."""
