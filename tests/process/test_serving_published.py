@@ -628,7 +628,7 @@ def test_an_older_offer_is_no_reason_not_to_start(
     waiting = Patience()
     with shmmap.connect(one.endpoint) as client:
         assert client.map_version == served
-        while waiting("could not be read again" not in health(one)[1]):
+        while waiting("is refused, older" not in health(one)[1]):
             time.sleep(0.05)
         assert client.area(ALL, wait=60.0).map_version == served
     one.stop()
