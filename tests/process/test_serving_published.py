@@ -408,7 +408,9 @@ def test_a_version_never_goes_back(
             client.reload()
         assert "--accept-version 1" in refused.value.hint
         assert client.area(ALL, wait=60.0).map_version == served
-        assert "could not be read again" in health(one)[1]
+        waiting = Patience()
+        while waiting("is refused, older" not in health(one)[1]):
+            time.sleep(0.05)
         (web.folder / "CURRENT").write_bytes(second)
         client.reload()
         assert health(one)[0] == 0
