@@ -160,7 +160,7 @@ class Service:
         )  # fmt: skip
         paging.follow()
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
-        watched.watch(reloader.fd, change.collect, "map")
+        watched.watch(reloader.fd, lambda: self._collect_reload(change), "map")
         origin_watch: Chore | None = None
         if elsewhere is not None:
             from shmmap.daemon.loading.origin_watch import OriginWatch
@@ -315,6 +315,11 @@ class Service:
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
             memory.statistics.update_identity(memory.identity)
+
+    def _collect_reload(self, change: MapChange) -> None:
+        if self._elsewhere is not None:  # before the reload is answered
+            self._show_trust(self._elsewhere)
+        change.collect()
 
     def _show_trust(self, origin: Elsewhere) -> None:
         statistics = self._memory.statistics
