@@ -52,10 +52,10 @@ def store_at(url: str, args: argparse.Namespace) -> Store:
 
     with needed_packages("a published map"):
         from shmmap.origin.remote.opened_store import open_store
+        from shmmap.origin.remote.store import may_be_plain
 
-        return open_store(
-            url, insecure_http=args.insecure_http, instance_credentials=args.instance_credentials
-        )
+        plain = may_be_plain(url, insecure_http=args.insecure_http, trust=getattr(args, "trust", None))
+        return open_store(url, insecure_http=plain, instance_credentials=args.instance_credentials)
 
 
 def add_sign_option(parser: argparse.ArgumentParser) -> None:
@@ -75,9 +75,9 @@ def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False
     return MapSigner(store, args.sign, make_keys=make_keys)
 
 
-def add_trust_option(parser: argparse.ArgumentParser) -> None:
+def add_trust_option(group: argparse._ActionsContainer) -> None:
     """Add the root of trust."""
-    parser.add_argument(
+    group.add_argument(
         "--trust", metavar="ROOT.json", help="take only what is signed under this root, and nothing older"
     )
 
@@ -90,6 +90,7 @@ def verified_at(store: Store, args: argparse.Namespace) -> Verified | None:
         return None
     from shmmap.daemon.config_live import state_directory
     from shmmap.errors import ConfigError
+    from shmmap.origin.remote.store import may_be_plain
     from shmmap.origin.remote.verify_apart import VerifySettings, verify_apart
 
     state_dir = state_directory("")
@@ -100,7 +101,7 @@ def verified_at(store: Store, args: argparse.Namespace) -> Verified | None:
             store.url,
             os.path.abspath(args.trust),
             state_dir,
-            args.insecure_http,
+            may_be_plain(store.url, insecure_http=args.insecure_http, trust=args.trust),
             args.instance_credentials,
         )
     )

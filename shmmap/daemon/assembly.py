@@ -154,7 +154,7 @@ class Service:
         )  # fmt: skip
         paging.follow()
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
-        watched.watch(reloader.fd, change.collect, "map")
+        watched.watch(reloader.fd, lambda: self._collect_reload(change), "map")
         origin_watch: Chore | None = None
         disk_ahead: Chore | None = None
         if elsewhere is not None:
@@ -317,6 +317,11 @@ class Service:
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
             memory.statistics.update_identity(memory.identity)
+
+    def _collect_reload(self, change: MapChange) -> None:
+        if self._elsewhere is not None:  # before the reload is answered
+            self._published.look(self._elsewhere)
+        change.collect()
 
     def _status(self) -> str:
         cache = self._memory.cache

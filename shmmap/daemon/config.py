@@ -113,6 +113,9 @@ class DaemonConfig:
     catalogue_budget_bytes
         What the list of cells of a large published map may take of memory; beyond, what was needed least
         recently is fetched again when it is needed.
+    trust
+        Root of trust, ``ROOT.json``: of a published map only what is signed under it is taken; empty: what
+        the origin says.
     accept_version
         A version of a published map that is taken although a later one was taken before; 0: none.
     insecure_http
@@ -159,6 +162,7 @@ class DaemonConfig:
     cache_bytes: int = 8 << 30
     poll_s: float = 60.0
     catalogue_budget_bytes: int = 256 << 20
+    trust: str = ""
     accept_version: int = 0
     insecure_http: bool = False
     instance_credentials: bool = False

@@ -185,7 +185,12 @@ def run(config: DaemonConfig) -> int:
 def _published(config: DaemonConfig) -> PublishedOrigin | None:
     """Open a published map: a URL, or a directory with a file CURRENT; None where the map is files."""
     path = config.map_path
-    if "://" not in path and not os.path.isfile(os.path.join(path, "CURRENT")):
+    if config.trust and "://" not in path and not os.path.isdir(path):
+        raise ConfigError(
+            "--trust is for a published map", key="trust",
+            hint="name its URL or directory; `shmmap publish MAP URL --sign KEYDIR` makes one",
+        )  # fmt: skip
+    if not config.trust and "://" not in path and not os.path.isfile(os.path.join(path, "CURRENT")):
         return None
     for name in ("metadata", "unit", "vertical_unit", "watch"):
         if getattr(config, name):
@@ -196,9 +201,11 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
     with needed_packages("a published map"):
         from shmmap.daemon.map.published_origin import PublishedOrigin
         from shmmap.origin.remote.serving_store import ServedFrom
+        from shmmap.origin.remote.store import may_be_plain
 
+        insecure_http = may_be_plain(path, insecure_http=config.insecure_http, trust=config.trust)
         return PublishedOrigin(
-            ServedFrom(path, config.insecure_http, config.instance_credentials),
+            ServedFrom(path, insecure_http, config.instance_credentials),
             instance=config.instance,
             state_dir=state_directory(config.instance),
             cache_dir=absolute_path(config.cache_dir or default_cache_directory()),
@@ -206,6 +213,7 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
             catalogue_bytes=config.catalogue_budget_bytes,
             poll_s=config.poll_s,
             accept_version=config.accept_version,
+            trust=absolute_path(config.trust) if config.trust else "",
         )
 
 

@@ -24,6 +24,7 @@ from shmmap.doctor.memory import (
 from shmmap.doctor.patient import Patient
 from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
 from shmmap.doctor.ros_bridge import check_ros_bridge
+from shmmap.doctor.signed_map import check_signature
 
 __all__ = ["CHECKS", "diagnose"]
 
@@ -37,6 +38,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_clock,
     check_versions,
     check_reload,
+    check_signature,
     check_cells,
     check_shared_memory,
     check_cache,

@@ -5,12 +5,19 @@ Three keys: ``root.pem`` names the others, is needed to make and to rotate them,
 ``targets.pem`` signs versions, where one publishes; ``online.pem`` signs snapshot and timestamp, which is all
 that a refresh needs.  What vehicles trust is ``ROOT.json``.  A version is current as soon as the timestamp
 names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired when the map is signed next.
+
+A key is rotated so that the map is valid all the while, also for a vehicle that reads in the middle of it,
+and wherever it is killed.  The next key lies beside the old one, as ``<name>.next.pem``.  A new root names
+both of them; what they sign is signed again by both; then another root names the next key alone, which takes
+the old one's place.  The root's own key needs one root only, signed by the old key and the next.
 """
 
 from __future__ import annotations
 
+import copy
 import os
 import stat
+from collections.abc import Sequence
 from datetime import datetime, timedelta, timezone
 from typing import Final, NamedTuple, TypeVar
 
@@ -47,7 +54,7 @@ from shmmap.origin.remote.signed_metadata import (
 )
 from shmmap.origin.remote.store import Store, put_over
 
-__all__ = ["LIFETIMES", "ROOT_FILE", "MapSigner", "Refreshed"]
+__all__ = ["LIFETIMES", "ROLES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
 
 ROOT_FILE: Final = "ROOT.json"
 LIFETIMES: Final = {
@@ -57,6 +64,7 @@ LIFETIMES: Final = {
     Timestamp.type: timedelta(days=7),
 }
 _KEYS: Final = {Root.type: "root", Targets.type: "targets", Snapshot.type: "online", Timestamp.type: "online"}
+ROLES: Final = tuple(_KEYS)
 _MAX_TRIES: Final = 1000
 _MAX_KEY_BYTES: Final = 1 << 16
 _Role = TypeVar("_Role", Root, Timestamp, Snapshot, Targets)
@@ -69,6 +77,14 @@ class Refreshed(NamedTuple):
     timestamp: datetime
     snapshot: datetime
     targets: datetime
+
+
+class Rotated(NamedTuple):
+    """What was rotated: the roles that have another key, its file, and the number of the newest root."""
+
+    roles: tuple[str, ...]
+    key: str
+    root: int
 
 
 class MapSigner:
@@ -108,6 +124,8 @@ class MapSigner:
             self.trusted = file.read(MAX_METADATA_BYTES + 1)
         self._root = newest_root(store, self.trusted)
         self._check_origin()
+        for name in dict.fromkeys(_KEYS.values()):
+            self._finish_rotation(name)
 
     def begin(self) -> CurrentState:
         """Return what is current, for a new version: what is signed, or what ``CURRENT`` says if nothing is.
@@ -120,7 +138,7 @@ class MapSigner:
             A key that a version needs is not here, or cannot be used.
         """
         for role in (Targets.type, Timestamp.type):
-            self._signer(role)
+            self._signers(role)
         return self._repaired()
 
     def _repaired(self) -> CurrentState:
@@ -170,38 +188,122 @@ class MapSigner:
             state.targets.signed.expires,
         )
 
+    def rotate(self, role: str) -> Rotated:
+        """Give a role another key; snapshot and timestamp have one key, so that is both of them.
+
+        The old key is removed.  A rotation that was killed is carried on with.
+
+        Raises
+        ------
+        MapMissing
+            Nothing is signed there.
+        ConfigError
+            A key that this needs is not here: ``root.pem`` in any case.
+        InstanceBusy
+            Another rotation came between.
+        """
+        if self._state() is None:
+            raise MapMissing(
+                f"nothing is signed at {self._store.url}", hint="shmmap publish MAP URL --sign KEYDIR"
+            )
+        if not os.path.lexists(self._key_path("root")):
+            raise ConfigError(
+                f"{self._key_path('root')} is not there, and it alone says which keys sign the map",
+                hint="it is offline: put it there for as long as this takes",
+            )
+        name = _KEYS[role]
+        roles = tuple(one for one, key in _KEYS.items() if key == name)
+        following = self._next_key(name)
+        if role != Root.type:
+            if following.public_key.keyid not in self._root.signed.roles[role].keyids:
+                self._add_root(roles, following, keep=True)
+            self._sign(None, 0)
+            step("sign.renewed")
+        before = self._root
+        self._add_root(roles, following, keep=False)
+        step("sign.rotated")
+        if role != Root.type:
+            # a publisher with the old key may have signed meanwhile, and cannot any more after this
+            self._sign(None, 0, read_under=before)
+        self._finish_rotation(name)
+        return Rotated(roles, self._key_path(name), self._root.signed.version)
+
+    def _add_root(self, roles: Sequence[str], following: CryptoSigner, *, keep: bool) -> None:
+        """Write the next root, in which a key is that of roles, beside the ones before or instead of them."""
+        signers = self._signers(Root.type)
+        root = copy.deepcopy(self._root.signed)
+        root.version += 1
+        root.expires = _now() + LIFETIMES[Root.type]
+        for role in roles:
+            for keyid in () if keep else tuple(root.roles[role].keyids):
+                root.revoke_key(keyid, role)
+            root.add_key(following.public_key, role)
+        if Root.type in roles:
+            signers.append(following)
+        data = _signed_by(root, signers)
+        step("sign.nextroot")
+        if not self._store.put_new(metadata_path(Root.type, root.version), data):
+            raise InstanceBusy(
+                f"another rotation of {self._store.url} came between", hint="run the same command again"
+            )
+        self._root = Metadata.from_bytes(data)
+
+    def _finish_rotation(self, name: str) -> None:
+        """Have the next key take the place of the one before, once no root names that any more."""
+        following = self._key_path(f"{name}.next")
+        if not os.path.lexists(following):
+            return
+        role = next(role for role, key in _KEYS.items() if key == name)
+        named = [signer.public_key.keyid for signer in self._keys_here(role)]
+        if named == [_read_key(self._directory, f"{name}.next").public_key.keyid]:
+            with writing_errors(following):
+                os.replace(following, self._key_path(name))
+
     # --- metadata -------------------------------------------------------------------------------
 
     def _state(self) -> SignedState | None:
         return read_signed_state(self._store, self._root)
 
-    def _sign(self, current: Current | None, before: int) -> SignedState:
+    def _sign(
+        self, current: Current | None, before: int, *, read_under: Metadata[Root] | None = None
+    ) -> SignedState:
         """Have ``current`` named by targets, snapshot and timestamp; None: what is named already.
 
         ``before`` is the version that was current when this one was made: if another one is by now, that
-        one stays.
+        one stays.  ``read_under`` is the root under which the keys are that signed what is there, if that is
+        not the newest one.
         """
-        state, made = self._state(), None
+        made: tuple[Current, int, Metadata[Targets]] | None = None
         for _ in range(_MAX_TRIES):
+            state = read_signed_state(self._store, read_under or self._root)
+            if self._has_newer_root():  # read after the state: what replaces that is signed by its keys
+                continue
             named = state.current if state is not None else None
             if current is not None and named is not None and named != current and named.version != before:
                 raise changed_meanwhile(self._store)
+            wanted = current or named
+            assert wanted is not None  # noqa: S101  a refresh and a rotation have looked
             targets = seen = state.targets if state is not None else None
-            if current is not None and (targets is None or named != current or _is_half_over(targets)):
-                if made is None:
-                    made = self._add(Targets, targets, Targets(targets={TARGET: target_of(current)}))
-                targets = made
-            assert targets is not None  # noqa: S101  a refresh has looked
+            is_over = targets is None or named != wanted or (current is not None and _is_half_over(targets))
+            if targets is None or is_over or not self._is_signed(targets):
+                if made is None or made[:2] != (wanted, self._root.signed.version):
+                    added = self._add(Targets, targets, Targets(targets={TARGET: target_of(wanted)}))
+                    made = wanted, self._root.signed.version, added
+                targets = made[2]
             snapshot = state.snapshot if state is not None else None
-            if snapshot is None or targets is not seen or _is_half_over(snapshot):
+            if (
+                snapshot is None
+                or targets is not seen
+                or _is_half_over(snapshot)
+                or not self._is_signed(snapshot)
+            ):
                 meta = {f"{Targets.type}.json": MetaFile(targets.signed.version)}
                 snapshot = self._add(Snapshot, snapshot, Snapshot(meta=meta))
             elif state is not None and current is not None and not _is_half_over(state.timestamp):
-                return state  # a refresh signs the timestamp again in any case
+                return state  # a refresh signs the timestamp again in any case, and so does a rotation
             written = self._write_timestamp(state, snapshot, targets)
             if written is not None:
                 return written
-            state = self._state()  # a refresh came between, or another version
         raise InstanceBusy(f"other publishers keep signing {self._store.url}", hint="try again later")
 
     def _write_timestamp(
@@ -234,9 +336,18 @@ class MapSigner:
         raise InstanceBusy(f"other publishers take every number at {self._store.url}", hint="try again later")
 
     def _signed_bytes(self, signed: _Role) -> bytes:
-        metadata = Metadata(signed)
-        metadata.sign(self._signer(signed.type))
-        return metadata.to_bytes()
+        return _signed_by(signed, self._signers(signed.type))
+
+    def _has_newer_root(self) -> bool:
+        """Whether keys were rotated since the root was read, which is then that one."""
+        newest = newest_root(self._store, self.trusted)
+        before, self._root = self._root, newest
+        return newest.signed.version != before.signed.version
+
+    def _is_signed(self, metadata: Metadata[_Role]) -> bool:
+        """Whether all keys that are here have signed it: not so in the middle of a rotation."""
+        here = self._keys_here(metadata.signed.type)
+        return all(signer.public_key.keyid in metadata.signatures for signer in here)
 
     def _check_origin(self) -> None:
         """Have the first root at the store, which must be the one of these keys."""
@@ -309,12 +420,40 @@ class MapSigner:
             except FileExistsError:
                 pass  # another run was quicker, with the same keys
 
-    def _signer(self, role: str) -> CryptoSigner:
-        signer = _read_key(self._directory, _KEYS[role])
-        if signer.public_key.keyid not in self._root.signed.roles[role].keyids:
-            path = os.path.join(self._directory, f"{_KEYS[role]}.pem")
-            raise ConfigError(f"{path} is not the key that the map's root of trust names for {role}")
-        return signer
+    def _key_path(self, name: str) -> str:
+        return os.path.join(self._directory, f"{name}.pem")
+
+    def _next_key(self, name: str) -> CryptoSigner:
+        """Return the key that follows; the one of a rotation that was killed, or a new one."""
+        path = self._key_path(f"{name}.next")
+        with writing_errors(self._directory):
+            if not os.path.lexists(path):
+                _write_key(path)
+        step("sign.nextkey")
+        return _read_key(self._directory, f"{name}.next")
+
+    def _keys_here(self, role: str) -> list[CryptoSigner]:
+        """Keys of a role that are here and that the root names: in a rotation the old one, and the next."""
+        names = (_KEYS[role], f"{_KEYS[role]}.next")
+        here = [_read_key(self._directory, name) for name in names if os.path.lexists(self._key_path(name))]
+        return [signer for signer in here if signer.public_key.keyid in self._root.signed.roles[role].keyids]
+
+    def _signers(self, role: str) -> list[CryptoSigner]:
+        """Return what a role signs with, one at least."""
+        if not (here := self._keys_here(role)):
+            _read_key(self._directory, _KEYS[role])  # says why, if it cannot be read
+            raise ConfigError(
+                f"{self._key_path(_KEYS[role])} is not the key that the map's root of trust names for {role}",
+                hint="if that was rotated elsewhere, the new key belongs here",
+            )
+        return here
+
+
+def _signed_by(signed: _Role, signers: Sequence[CryptoSigner]) -> bytes:
+    metadata = Metadata(signed)
+    for signer in signers:
+        metadata.sign(signer, append=True)
+    return metadata.to_bytes()
 
 
 def _write_key(path: str) -> None:

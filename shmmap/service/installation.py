@@ -28,6 +28,8 @@ __all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_tex
 SHIPPED_PROGRAM = "/usr/bin/shmmapd"
 SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
 PUBLISHED_MAP = "drop-ins/published-map.conf"
+ROOT_OF_TRUST = "ROOT.json"
+"""What a root of trust is called in the directory of the configuration, into which it is copied."""
 CREDENTIALS = ("shmmap.aws", "shmmap.google", "shmmap.azure")
 """Files in /etc/shmmap that are passed to the service, whose account need not be able to read them."""
 _GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
@@ -79,12 +81,14 @@ def unit_text(name: str, program: Program | None = None) -> str:
     return text.replace(SHIPPED_BRIDGE, command_line(program.bridge))
 
 
-def configuration(map_path: str = "", *, group: bool = True) -> str:
-    """Return the example configuration, with this map and with or without the service's group."""
+def configuration(map_path: str = "", *, group: bool = True, trust: str = "") -> str:
+    """Return the example configuration with this map and root of trust, and with or without a group."""
     text = shipped_text("shmmap.toml")
     if map_path:
         # what JSON quotes is quoted the same way in TOML
         text = re.sub(r"^map_path = .*$", lambda _: f"map_path = {json.dumps(map_path)}", text, flags=re.M)
+    if trust:
+        text = re.sub(r"^#trust = .*$", lambda _: f"trust = {json.dumps(trust)}", text, flags=re.M)
     return text if group else re.sub(r"^group = .*$", '#group = ""', text, flags=re.M)
 
 
@@ -130,7 +134,18 @@ def _network(path: Path, file_system: FileSystem, *, is_remote: bool) -> list[Pl
     return [PlannedFile(path, _GENERATED + shipped_text(PUBLISHED_MAP) + lines)]
 
 
-def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False) -> list[PlannedFile]:
+def _root_of_trust(given: str, path: Path) -> list[PlannedFile]:
+    """A copy of a root of trust: the service sees it, wherever the original lies; it is no secret."""
+    if not given:
+        return []
+    from shmmap.origin.remote.verify_apart import read_trusted_root
+
+    return [PlannedFile(path, read_trusted_root(os.path.abspath(given)).decode())]
+
+
+def plan_system(
+    map_path: str = "", root: str = "/", *, huge_pages: bool = False, trust: str = ""
+) -> list[PlannedFile]:
     """Return what a service for the whole machine needs.
 
     Parameters
@@ -143,6 +158,8 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
         program in it.
     huge_pages
         Keep the segments on a tmpfs of their own, with huge pages; kept where an earlier installation did.
+    trust
+        Root of trust of a published map that is signed, a file of this machine; it is copied.
 
     Raises
     ------
@@ -151,7 +168,8 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
     BadRequest
         ``root`` is no directory, or a URL cannot be served.
     ConfigError
-        The image has no program, or the service's account could not read it.
+        The image has no program, or the service's account could not read it; or ``trust`` is no root of
+        trust.
     """
     file_system = FileSystem(root)
     map_path, is_remote = _map_path(map_path, file_system)
@@ -185,11 +203,13 @@ def plan_system(map_path: str = "", root: str = "/", *, huge_pages: bool = False
             planned.append(PlannedFile(path, _GENERATED + shipped_text(DROP_IN)))
     for name in ("sysusers.d/shmmap.conf", "tmpfiles.d/shmmap.conf"):
         planned.append(PlannedFile(place(name), shipped_text(name)))
+    planned += _root_of_trust(trust, place("shmmap", ROOT_OF_TRUST))
     config = place("shmmap", "shmmap.toml", keep=True)
-    return [*planned, PlannedFile(config, configuration(map_path), keep=True)]
+    text = configuration(map_path, trust=f"/etc/shmmap/{ROOT_OF_TRUST}" if trust else "")
+    return [*planned, PlannedFile(config, text, keep=True)]
 
 
-def plan_user(map_path: str = "", config_home: str = "") -> list[PlannedFile]:
+def plan_user(map_path: str = "", config_home: str = "", *, trust: str = "") -> list[PlannedFile]:
     """Return what a user's own service needs; parameters and errors as for `plan_system`."""
     map_path, _ = _map_path(map_path, FileSystem())
     home = Path(config_home or os.environ.get("XDG_CONFIG_HOME", "") or Path.home() / ".config")
@@ -199,7 +219,12 @@ def plan_user(map_path: str = "", config_home: str = "") -> list[PlannedFile]:
             for name in shipped_names()
             if name.startswith("user/")
         ),
-        PlannedFile(home / "shmmap" / "shmmap.toml", configuration(map_path, group=False), keep=True),
+        *_root_of_trust(trust, home / "shmmap" / ROOT_OF_TRUST),
+        PlannedFile(
+            home / "shmmap" / "shmmap.toml",
+            configuration(map_path, group=False, trust=str(home / "shmmap" / ROOT_OF_TRUST) if trust else ""),
+            keep=True,
+        ),
     ]
 
 

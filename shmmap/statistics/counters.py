@@ -11,6 +11,7 @@ __all__ = [
     "HISTOGRAMS",
     "OBJECTS_READ",
     "PUBLISHED",
+    "REFUSALS",
     "SPANS",
     "TURN_KINDS",
     "WINDOWED",
@@ -57,6 +58,9 @@ TURN_KINDS: Final = {
 }
 """What a turn of the serving loop is named after: what took most of it."""
 
+REFUSALS: Final = ("", "unsigned", "older", "expired", "altered", "foreign_root", "other")
+"""Why a version of a published map that is offered is not taken, by the value of ``published_refusal``."""
+
 OBJECTS_READ: Final = {
     "objects_from_disk": ("", "Objects read out of the disk cache instead of the store"),
     "bytes_from_disk": ("bytes", "Bytes of objects read out of the disk cache"),
@@ -74,6 +78,13 @@ _PUBLISHED: Final = (
     Counter("published_refused", "gauge", "", "Number of a version that is offered and refused; 0: none"),
     Counter("published_taken_unix_ns", "gauge", "ns", "When the version served was taken, wall clock"),
     Counter("published_expires_unix_ns", "gauge", "ns", "When what signs it runs out; 0: it is not signed"),
+    Counter("published_signed_unix_ns", "gauge", "ns", "When that was signed, wall clock; 0: it is not"),
+    Counter(
+        "published_refusal",
+        "gauge",
+        "",
+        "Why an offer is not taken: 1 unsigned, 2 older, 3 expired, 4 altered, 5 foreign, 6 other",
+    ),
     Counter("map_pages", "gauge", "", "Pages of the list of cells"),
     Counter("map_pages_known", "gauge", "", "Pages of it that are here"),
     Counter("disk_ahead", "gauge", "", "1 while what lies ahead and has no room in memory is on the disk"),

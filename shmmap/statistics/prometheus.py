@@ -30,7 +30,7 @@ _LIVE = {
     "failing": ("failing", "gauge", "1 while chunks cannot be loaded or saved"),
 }
 
-_NO_TIME_IF_0 = {"origin_out_since_unix_ns", "published_expires_unix_ns"}
+_NO_TIME_IF_0 = {"origin_out_since_unix_ns", "published_expires_unix_ns", "published_signed_unix_ns"}
 """Of what has not happened, or never will, there is no time: 1970 would be an alarm."""
 
 _TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()

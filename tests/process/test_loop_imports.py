@@ -15,6 +15,7 @@ from tests.support.command_line import Shmmap
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import make_map
 from tests.support.patience import Patience
+from tests.support.publishing import publish
 
 PATIENCE_S = 60.0
 WATCH_IMPORTS = """
@@ -54,3 +55,33 @@ def test_nothing_is_imported_while_it_serves(daemon: DaemonFactory, tmp_path: Pa
             operator(*verb.split())
     imported = [line.split() for line in seen.read_text().splitlines()[before:]]
     assert [name for pid, name in imported if int(pid) == one.pid] == []
+
+
+def test_python_tuf_is_never_imported_by_a_daemon(daemon: DaemonFactory, tmp_path: Path) -> None:
+    """Nor anything else, while a process apart verifies what it then takes."""
+    for package in ("tuf", "obstore", "zstandard"):
+        pytest.importorskip(package, reason=f"{package} is not installed")
+    (tmp_path / "watch").mkdir()
+    (tmp_path / "watch" / "sitecustomize.py").write_text(WATCH_IMPORTS)
+    seen = tmp_path / "imports"
+    made = make_map(tmp_path / "map", columns=2, rows=1, points=60)
+    store, keys = tmp_path / "store", tmp_path / "keys"
+    publish(made.root, store, "--sign", str(keys))
+    environment = {"PYTHONPATH": f"{tmp_path / 'watch'}:{ROOT}", "IMPORTS_SEEN": str(seen)}
+    one = daemon(store, "--trust", str(keys / "ROOT.json"), "--poll", "1", environment=environment)
+    before = len(seen.read_text().splitlines())
+    with shmmap.connect(one.endpoint) as client:
+        first = client.around(0, 0, radius=500, wait=PATIENCE_S).map_version
+        made.change("0_0.pcd", seed=7)
+        publish(made.root, store, "--sign", str(keys))
+        waiting = Patience()
+        while waiting(client.around(0, 0, radius=500, wait=PATIENCE_S).map_version == first):
+            pass
+        (store / "timestamp.json").unlink()
+        with pytest.raises(ShmmapError):
+            client.reload()
+    imported = [line.split() for line in seen.read_text().splitlines()]
+    assert [name for pid, name in imported[before:] if int(pid) == one.pid] == []
+    importing_tuf = {int(pid) for pid, name in imported if name.partition(".")[0] == "tuf"}
+    assert one.pid not in importing_tuf
+    assert len(importing_tuf) >= 3, "each time another process"

@@ -133,7 +133,7 @@ def test_a_refused_offer_is_shown_until_another_one_comes(
     until(one, lambda told: told["published_version"] == 2)
     (web.folder / "CURRENT").write_bytes(first)
     until(one, lambda told: told["published_refused"] == 1)
-    assert "version 1 is offered and refused" in Shmmap(one, tmp_path)("status")
+    assert "version 1, which is offered, is refused, older" in Shmmap(one, tmp_path)("status")
     (web.folder / "CURRENT").write_bytes(second)
     until(one, lambda told: told["published_refused"] == 0)
 

@@ -25,7 +25,8 @@ pytestmark = pytest.mark.usefixtures("layer_kernels")
 
 def test_every_block_is_tested() -> None:
     assert set(PAGE.blocks) == {
-        "install", "credentials", "publish", "directory", "fetch", "install-sign", "sign", "versions",
+        "install", "credentials", "publish", "directory", "fetch", "install-sign", "sign", "rotate",
+        "versions",
     }  # fmt: skip
     assert PAGE.fences == len(PAGE.blocks)
 
@@ -98,3 +99,6 @@ def test_a_map_is_published_fetched_and_goes_back(tmp_path: Path, buckets: Bucke
     assert "version 1 is signed" in refreshed
     assert "version 1 is signed, until" in listed
     assert "4 cells, 1,200 points" in verified
+    (rotated,) = map(run, PAGE.commands("rotate"))
+    assert rotated.startswith("targets: signed by a new key, as root of trust 3 says\n")
+    assert "version 1 is signed, until" in run(PAGE.commands("sign")[2])

@@ -29,15 +29,19 @@ PAGE = read_page("shmmap/publishing/SERVING_FROM_A_BUCKET.md")
 
 def test_every_block_is_tested() -> None:
     shown = {"health", "status", "doctor", "log"}
-    assert set(PAGE.blocks) == {"install", "credentials", "serve", "ask", "settings", "down", *shown}
+    assert set(PAGE.blocks) == {"install", "credentials", "serve", "ask", "settings", "down", "trust", *shown}
     assert PAGE.fences == len(PAGE.blocks) - len(shown) - 1  # one is of settings
 
 
 def test_packages_are_those_of_the_extra() -> None:
     (install,) = PAGE.commands("install")
+    text = (ROOT / "shmmap/publishing/SERVING_FROM_A_BUCKET.md").read_text(encoding="utf-8")
+    (signing,) = re.findall(r"`pip install (tuf [^`]+)`", text)
     project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     (extra,) = re.findall(r"^remote = \[\n(.*?)^\]", project, re.MULTILINE | re.DOTALL)
     assert install.split()[3:] == re.findall(r'"([a-z]+)>=', extra)
+    (extra,) = re.findall(r"^sign = \[\n(.*?)^\]", project, re.MULTILINE | re.DOTALL)
+    assert shlex.split(signing) == re.findall(r'"([a-z\[\]]+)>=', extra)
 
 
 def test_settings_are_settings(tmp_path: Path) -> None:
@@ -143,3 +147,23 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
                 time.sleep(0.02)
         while waiting(verb(one, "shmmap health --strict")[0] != 0):
             pass
+
+
+def test_a_signed_map_is_served(buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path) -> None:
+    pytest.importorskip("tuf", reason="tuf is not installed")
+    pytest.importorskip("zstandard", reason="zstandard is not installed")
+    made = make_map(tmp_path / "town", columns=2, rows=1, points=100)
+    keys = tmp_path / "keys"
+    publish(made.root, buckets.url("vehicle/signed"), "--sign", str(keys))
+    (serve,) = PAGE.commands("trust")
+    _, _, url, option, root = shlex.split(serve)
+    assert (url, root) == (buckets.url("signed"), "ROOT.json")
+    environment = buckets.environment
+    words = url.replace("maps/", "maps/vehicle/"), option, str(keys / root)
+    one = daemon(*words, environment=environment)
+    with shmmap.connect(one.endpoint) as client:
+        assert client.around(0, 0, radius=500, wait=60.0).complete
+    secret = environment["AWS_SECRET_ACCESS_KEY"]
+    kept = [path for path in one.state_dir.rglob("*") if path.is_file()]
+    assert kept
+    assert not [path for path in kept if secret.encode() in path.read_bytes()]

@@ -409,7 +409,9 @@ def test_a_version_never_goes_back(
             client.reload()
         assert "--accept-version 1" in refused.value.hint
         assert client.area(ALL, wait=60.0).map_version == served
-        assert "could not be read again" in health(one)[1]
+        waiting = Patience()
+        while waiting("is refused, older" not in health(one)[1]):
+            time.sleep(0.05)
         (web.folder / "CURRENT").write_bytes(second)
         client.reload()
         assert health(one)[0] == 0
@@ -660,7 +662,7 @@ def test_an_older_offer_is_no_reason_not_to_start(
     waiting = Patience()
     with shmmap.connect(one.endpoint) as client:
         assert client.map_version == served
-        while waiting("could not be read again" not in health(one)[1]):
+        while waiting("is refused, older" not in health(one)[1]):
             time.sleep(0.05)
         assert client.area(ALL, wait=60.0).map_version == served
     one.stop()

@@ -109,7 +109,7 @@ def test_a_signed_map_is_not_changed_without_its_keys(
     errors = shmmap("publish", town.root, store, "--sign", tmp_path / "others", code=65)
     assert "foreign root" in errors
     assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
-    assert "--refresh or --rollback" in shmmap("versions", store, "--sign", keys, code=2)
+    assert "--refresh, --rollback or --rotate" in shmmap("versions", store, "--sign", keys, code=2)
     assert "--sign KEYDIR" in shmmap("versions", store, "--refresh", code=2)
     assert "nothing is signed" in shmmap(
         "versions", tmp_path / "nowhere", "--refresh", "--sign", keys, code=66
@@ -339,6 +339,143 @@ def test_the_slower_of_two_publishers_changes_nothing(
     assert Signed(store, keys).version == 9
     assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 10
     read_signed(store, keys)
+
+
+# --- other keys ---------------------------------------------------------------------------------------
+
+
+def key_of(keys: Path, name: str) -> bytes:
+    return (keys / f"{name}.pem").read_bytes()
+
+
+@pytest.mark.parametrize("role", ["root", "targets", "snapshot", "timestamp"])
+def test_a_rotated_key_signs_from_then_on_and_vehicles_follow(
+    role: str, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    trust = ("--trust", keys / "ROOT.json")
+    assert shmmap.json("versions", store, *trust)["current"] == 1
+    before = {name: key_of(keys, name) for name in ("root", "targets", "online")}
+    first = Signed(store, keys)
+    done = shmmap.json("versions", store, "--rotate", role, "--sign", keys)
+    name = {"snapshot": "online", "timestamp": "online"}.get(role, role)
+    roles = ["snapshot", "timestamp"] if name == "online" else [role]
+    assert sorted(done["roles"]) == roles
+    assert done["root"] == (2 if role == "root" else 3)
+    assert done["key"] == str(keys / f"{name}.pem")
+    assert {one for one in before if key_of(keys, one) != before[one]} == {name}
+    assert sorted(path.name for path in keys.iterdir()) == [
+        "ROOT.json", "online.pem", "root.pem", "targets.pem",
+    ]  # fmt: skip
+    assert stat.S_IMODE((keys / f"{name}.pem").stat().st_mode) == 0o600
+    signed = read_signed(store, keys)
+    assert signed.version == 1
+    for one in ("root", "targets", "snapshot", "timestamp"):
+        old, new = (found.root.signed.roles[one].keyids for found in (first, signed))
+        assert (set(old).isdisjoint(new), len(new)) == (one in roles, 1)
+    assert shmmap.json("versions", store, *trust)["current"] == 1, "one that has seen the first root"
+    town.change("0_0.pcd", seed=1)
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
+    shmmap("versions", store, "--refresh", "--sign", keys)
+    read_signed(store, keys)
+    with_an_empty_memory = {"XDG_STATE_HOME": str(keys / "none")}
+    assert shmmap.json("versions", store, *trust, env=with_an_empty_memory)["current"] == 2
+    # the old key is none any more
+    (keys / f"{name}.pem").write_bytes(before[name])
+    words = ("--rotate", "root") if role == "root" else ("--rollback", "1")
+    errors = shmmap("versions", store, *words, "--sign", keys, code=78)
+    assert "is not the key that the map's root of trust names for" in errors
+
+
+@pytest.mark.parametrize(
+    ("role", "label"),
+    [
+        ("targets", "sign.nextkey"),
+        ("targets", "sign.nextroot"),
+        ("targets", "sign.metadata"),
+        ("targets", "sign.metadata:2"),
+        ("targets", "sign.timestamp"),
+        ("targets", "sign.renewed"),
+        ("targets", "sign.nextroot:2"),
+        ("targets", "sign.rotated"),
+        ("targets", "sign.timestamp:2"),
+        ("timestamp", "sign.nextroot"),
+        ("timestamp", "sign.metadata"),
+        ("timestamp", "sign.timestamp"),
+        ("timestamp", "sign.renewed"),
+        ("timestamp", "sign.nextroot:2"),
+        ("timestamp", "sign.rotated"),
+        ("root", "sign.nextkey"),
+        ("root", "sign.nextroot"),
+        ("root", "sign.rotated"),
+    ],
+)
+def test_a_rotation_killed_anywhere_leaves_a_valid_map(
+    role: str, label: str, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+) -> None:
+    before = Signed(store, keys).root.signed.roles[role].keyids
+    words = ("versions", store, "--rotate", role, "--sign", keys)
+    shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
+    assert read_signed(store, keys).version == 1
+    assert shmmap.json("versions", store, "--trust", keys / "ROOT.json")["current"] == 1
+    # what is published in between is signed by keys that are named then
+    town.change("0_0.pcd", seed=1)
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
+    assert read_signed(store, keys).version == 2
+    shmmap(*words)
+    signed = read_signed(store, keys)
+    assert signed.version == 2
+    assert len(signed.root.signed.roles[role].keyids) == 1
+    assert set(before).isdisjoint(signed.root.signed.roles[role].keyids)
+    assert not list(keys.glob("*.next.pem"))
+    assert shmmap.json("versions", store, "--trust", keys / "ROOT.json")["current"] == 2
+
+
+def test_what_a_rotation_needs(shmmap: Shmmap, store: Path, keys: Path, tmp_path: Path) -> None:
+    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    (keys / "root.pem").rename(tmp_path / "root.pem")
+    errors = shmmap("versions", store, "--rotate", "targets", "--sign", keys, code=78)
+    assert f"{keys}/root.pem is not there" in errors
+    assert "it is offline" in errors
+    assert "--sign KEYDIR" in shmmap("versions", store, "--rotate", "targets", code=2)
+    assert "invalid choice" in shmmap("versions", store, "--rotate", "other", "--sign", keys, code=2)
+    assert "nothing is signed" in shmmap(
+        "versions", tmp_path / "nowhere", "--rotate", "root", "--sign", keys, code=66
+    )
+    assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
+    assert not list(keys.glob("*.next.pem"))
+
+
+def test_a_key_that_is_lost_is_rotated(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> None:
+    (keys / "online.pem").unlink()
+    assert "No such file" in shmmap("versions", store, "--refresh", "--sign", keys, code=78)
+    shmmap("versions", store, "--rotate", "timestamp", "--sign", keys)
+    assert read_signed(store, keys).version == 1
+    town.change("0_0.pcd", seed=1)
+    assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
+    assert shmmap.json("versions", store, "--trust", keys / "ROOT.json")["current"] == 2
+
+
+def test_a_publisher_with_the_old_key_leaves_a_valid_map(
+    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+) -> None:
+    """Its run began before the rotation, and ends in the midst of it, or after."""
+    old = Path(shutil.copytree(keys, tmp_path / "old"))
+    town.change("0_0.pcd", seed=1)
+    with locked(store):  # it holds back timestamps: the one of the publisher, and those of the rotation
+        slow = before_its_timestamp(shmmap, town, store, old)
+        rotation = shmmap.start("versions", store, "--rotate", "targets", "--sign", keys)
+        while not (store / "2.root.json").exists():
+            assert rotation.poll() is None
+            time.sleep(0.01)
+    _, errors = slow.communicate()
+    _, other_errors = rotation.communicate()
+    assert rotation.returncode == 0, other_errors
+    assert slow.returncode in (0, 78), errors  # quick enough, or too late
+    signed = Signed(store, keys)
+    assert signed.version == (2 if slow.returncode == 0 else 1)
+    assert shmmap.json("versions", store, "--trust", keys / "ROOT.json")["current"] == signed.version
+    errors = shmmap("publish", town.root, store, "--sign", old, code=78)
+    assert "if that was rotated elsewhere, the new key belongs here" in errors
 
 
 @pytest.mark.parametrize("package", ["tuf", "cryptography"])

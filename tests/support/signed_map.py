@@ -22,6 +22,12 @@ class Signed:
         self.store, self.keys = store, keys
         self.root: Any = Metadata.from_file(str(store / "1.root.json"))
         assert (store / "1.root.json").read_bytes() == (keys / "ROOT.json").read_bytes()
+        while (path := store / f"{self.root.signed.version + 1}.root.json").exists():
+            following: Any = Metadata.from_file(str(path))
+            for root in (self.root, following):
+                root.signed.verify_delegate("root", following.signed_bytes, following.signatures)
+            assert following.signed.version == self.root.signed.version + 1
+            self.root = following
         self.timestamp: Any = self._read("timestamp.json", "timestamp")
         number = self.timestamp.signed.snapshot_meta.version
         self.snapshot: Any = self._read(f"{number}.snapshot.json", "snapshot")

@@ -7,6 +7,7 @@ import datetime
 import time
 from collections.abc import Mapping
 
+from shmmap.doctor.signed_map import signature_lines, trust_problems
 from shmmap.quantities import counted, format_bytes, format_duration
 from shmmap.statistics.counters import OBJECTS_READ
 
@@ -39,8 +40,7 @@ def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
     if not counters.get("published_version"):
         return []
     lines = [("version", _version(counters)), ("known", _known(counters)), ("fetched", _fetched(counters))]
-    if refused := _refused(counters):
-        lines.insert(1, ("", refused))
+    lines[1:1] = [("signature", text) for text in _signature(counters)]
     if troubles := _troubles(counters):
         lines.append(("", troubles))
     return lines
@@ -50,7 +50,9 @@ def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
     """Return the same in short pieces, and whether each is trouble."""
     if not counters.get("published_version"):
         return []
-    pieces = [(f"version {_version(counters)}", _is_expired(counters)), (_refused(counters), True)]
+    problems = trust_problems(counters, time.time())
+    pieces = [(f"version {_version(counters)}", False)]
+    pieces += [(text, text in problems) for text in _signature(counters)]
     pieces += [(_known(counters), False), (_fetched(counters), False), (_troubles(counters), True)]
     return [(text, trouble) for text, trouble in pieces if text]
 
@@ -62,24 +64,13 @@ def since(counters: Mapping[str, int]) -> str:
 
 
 def _version(counters: Mapping[str, int]) -> str:
-    taken_ns, expires_ns = counters["published_taken_unix_ns"], counters["published_expires_unix_ns"]
+    taken_ns = counters["published_taken_unix_ns"]
     ago = format_duration(max(time.time() - taken_ns * 1e-9, 0.0))
-    text = f"{counters['published_version']}, taken on {_date(taken_ns)}, {ago} ago"
-    if not expires_ns:
-        return text
-    return (
-        f"{text}; signed, {'EXPIRED since' if _is_expired(counters) else 'valid until'} {_date(expires_ns)}"
-    )
+    return f"{counters['published_version']}, taken on {_date(taken_ns)}, {ago} ago"
 
 
-def _is_expired(counters: Mapping[str, int]) -> bool:
-    expires_ns = counters["published_expires_unix_ns"]
-    return bool(expires_ns) and expires_ns <= time.time_ns()
-
-
-def _refused(counters: Mapping[str, int]) -> str:
-    refused = counters["published_refused"]
-    return f"version {refused} is offered and refused: `shmmap reload` says why" if refused else ""
+def _signature(counters: Mapping[str, int]) -> list[str]:
+    return signature_lines(counters, time.time())
 
 
 def _known(counters: Mapping[str, int]) -> str:

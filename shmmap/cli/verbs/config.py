@@ -30,6 +30,7 @@ _CHOSEN = {
     "group": "only the daemon's own user may connect",
     "admin_group": "only root and the daemon's own user",
     "budget_bytes": "at start: a quarter of the memory available, at most 4 GiB",
+    "trust": "nothing is verified: what the map's origin says is taken",
     "workers": "at start: one less than there are processors, from 1 to 4",
     "cache_dir": "the service's or the user's cache directory",
     "cache_bytes": "no layers are kept",
@@ -100,6 +101,10 @@ def run_check(args: argparse.Namespace) -> int:
         raise ConfigError("no map is named", key="map_path", hint="set map_path, or give `shmmap serve MAP`")
     if not is_url(config.map_path) and not os.path.exists(config.map_path):
         raise MapMissing(f"there is no map at {config.map_path}", hint="map_path names it")
+    if config.trust:
+        from shmmap.origin.remote.verify_apart import read_trusted_root
+
+        read_trusted_root(config.trust)
     if args.json:
         print_json({"file": file or None, "good": True})
     else:

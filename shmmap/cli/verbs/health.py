@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_json, print_line
+from shmmap.doctor.signed_map import trust_problems
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -22,7 +24,8 @@ _JSON = """\
    "troubles": [text], what --strict counts}
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
 also 1 while clients lack something: cells were refused in the last minute, the map's files are out of
-reach, the map could not be read again or has problems, or a live map has one."""
+reach, the map could not be read again or has problems, what signs it has expired, what its origin offers is
+refused, or a live map has one."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -90,7 +93,8 @@ def _troubles(found: Snapshot) -> list[str]:
     troubles = [f"{count:,} {text}" for count, text in counted_troubles if count]
     if counts.get("origin_out", 0):
         troubles.append("no load succeeds: the map's files are out of reach")
-    if counts.get("last_reload_failed", 0):
+    troubles += trust_problems(counts, time.time())
+    if counts.get("last_reload_failed", 0) and not counts.get("published_refusal", 0):
         troubles.append("the map could not be read again: its old state is served")
     return troubles
 

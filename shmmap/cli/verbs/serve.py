@@ -7,7 +7,7 @@ import argparse
 import os
 
 from shmmap.cli.options import Subparsers, add_unit_options, add_verb
-from shmmap.cli.store_options import add_access_options
+from shmmap.cli.store_options import add_access_options, add_trust_option
 
 __all__ = ["add_parser", "run"]
 
@@ -20,15 +20,17 @@ it.  A LAS or float64 cloud far from the origin is shifted close to it, and the 
 by how much.  To keep its frame: `shmmap divide --translate none`, and serve that map.
 MAP may also be where `shmmap publish` has put a map: an s3://, gs://, az://, https:// or file:// URL, or a
 directory.  Its cells are fetched as they are needed; a new version is taken by itself (--poll), and on
-`shmmap reload`.
+`shmmap reload`.  With --trust what is unsigned, older, expired, altered or signed by others is not taken;
+what was taken is served on.
 `shmmapd` is `shmmap serve`: the same options.
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for
 its next start (a restart sends it first, then SIGTERM as usual; in a container: --stop-signal USR1);
 SIGHUP reads the map again; where the daemon was started at a terminal it stops it, as when that is closed
 (not under nohup or a service manager).
-Exit code: 0 after a signal, 65 bad map, 66 no map there, 71 something is full, missing or in the way, 75 the
-instance runs already, 78 bad setting."""
+Exit code: 0 after a signal, 65 bad map, or one that --trust refuses, 66 no map there, 69 a package is
+missing, 71 something is full, missing or in the way, 75 the instance runs already, or a published map that
+was never taken is out of reach, 78 bad setting."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -106,6 +108,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="BYTES",
         help="most memory for the list of cells (default: 256M, a million cells)",
     )
+    add_trust_option(published)
     published.add_argument(
         "--accept-version",
         metavar="N",

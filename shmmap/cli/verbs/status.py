@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
@@ -72,8 +73,6 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the state of the daemon."""
-    import time
-
     from shmmap.cli.daemon_address import snapshot
 
     found, identity = snapshot(args)

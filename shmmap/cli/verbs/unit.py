@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_verb
 from shmmap.cli.screens.output import print_line
-from shmmap.errors import ConfigError
+from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
     from shmmap.service.installation import PlannedFile
@@ -29,7 +29,8 @@ it, as root in shmmap's checkout:
 that let the daemon use it; a later install keeps them.  To undo it, remove run-shmmap_huge.mount and both
 30-huge-pages.conf.
 For the URL of a published map a drop-in lets the service reach the network.  Credentials that are in
-/etc/shmmap, files shmmap.aws, shmmap.google and shmmap.azure of root alone, are passed to it.
+/etc/shmmap, files shmmap.aws, shmmap.google and shmmap.azure of root alone, are passed to it.  --trust copies
+the root of trust to ROOT.json beside the settings, which name it there.
 With --root the units start the program that the image has in /opt/shmmap (or /usr/local, /usr), and the
 map is the one that has its path there; what lies outside of the image is refused.
 Exit code: 0, 66 no map there, 73 a file cannot be written, 78 the service could not read this program."""
@@ -58,6 +59,9 @@ def add_parser(subparsers: Subparsers) -> None:
         epilog=_INSTALL,
     )
     install.add_argument("--map", metavar="MAP", default="", help="the map to serve: a path or a URL")
+    install.add_argument(
+        "--trust", metavar="ROOT.json", default="", help="of a signed map: take only what is signed under it"
+    )
     install.add_argument(
         "--huge-pages",
         action="store_true",
@@ -104,14 +108,20 @@ def run_install(args: argparse.Namespace) -> int:
 
     if args.huge_pages and (args.user or args.root == "/"):
         check_possible(user=args.user)
+    if args.trust and not args.map:
+        raise BadRequest("--trust goes with --map URL")
     planned = (
-        plan_user(args.map) if args.user else plan_system(args.map, args.root, huge_pages=args.huge_pages)
+        plan_user(args.map, trust=args.trust)
+        if args.user
+        else plan_system(args.map, args.root, huge_pages=args.huge_pages, trust=args.trust)
     )
     width = max(len(one.action) for one in planned)
     for one in planned:
         print_line(f"{one.action.ljust(width)}  {one.path}")
     if args.map and planned[-1].action == "kept":
-        print_line(f"note: {planned[-1].path} is kept: set map_path there")
+        print_line(
+            f"note: {planned[-1].path} is kept: set map_path{' and trust' if args.trust else ''} there"
+        )
     if args.dry_run:
         return 0
     write(planned)

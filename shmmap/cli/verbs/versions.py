@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap versions URL``: the versions of a published map; going back to one, removing old ones."""
+"""``shmmap versions URL``: a published map's versions: going back to one, removing old ones; its keys."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ JSON (fields may be added, none is removed):
    content it has again, or 0}]}, the latest first; a web server cannot list those that were never served
   --rollback: {"url", "changed", "version": the current one, "restored", "objects": that were looked for}
   --refresh: {"url", "version", "valid_until": {"timestamp", "snapshot", "targets": RFC 3339}}
+  --rotate: {"url", "roles": [role], "key": file, "root": number of the newest root of trust}
   --prune: {"url", "versions": [number], "objects", "bytes", "parts": of slices, "kept_versions": [number],
    "kept_objects", "kept_bytes"}
 Exit code: 0, 2 wrong usage, 65 damaged or --trust refuses, 66 no such map or version, 69 a package is
@@ -75,6 +76,12 @@ def add_parser(subparsers: Subparsers) -> None:
         action="store_true",
         help="renew a signed map's timestamp, and its snapshot when due; needs --sign",
     )
+    what.add_argument(
+        "--rotate",
+        metavar="ROLE",
+        choices=("root", "targets", "snapshot", "timestamp"),
+        help="give root, targets, snapshot or timestamp another key, and remove the old one; needs root.pem",
+    )
     parser.add_argument(
         "--keep",
         metavar="DAYS",
@@ -100,15 +107,17 @@ def _days(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List, roll back, refresh or prune."""
+    """List, roll back, refresh, rotate or prune."""
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
 
     if args.keep is not None and not args.prune:
         raise BadRequest("--keep goes with --prune")
-    if args.sign is not None and not (args.refresh or args.rollback):
-        raise BadRequest("--sign goes with --refresh or --rollback")
-    if args.trust is not None and (args.refresh or args.rollback or args.prune):
+    if args.sign is not None and not (args.refresh or args.rollback or args.rotate):
+        raise BadRequest("--sign goes with --refresh, --rollback or --rotate")
+    if args.rotate and args.sign is None:
+        raise BadRequest("--rotate needs the directory with the keys, root.pem too", hint="--sign KEYDIR")
+    if args.trust is not None and (args.refresh or args.rollback or args.prune or args.rotate):
         raise BadRequest("--trust goes with the list of versions alone")
     if args.refresh and args.sign is None:
         raise BadRequest("--refresh needs the directory with online.pem and ROOT.json", hint="--sign KEYDIR")
@@ -118,6 +127,8 @@ def run(args: argparse.Namespace) -> int:
     progress = StageProgress(quiet=args.quiet or args.json, unit=unit, scale=1.0)
     if args.rollback is not None:
         _roll_back(store, args.rollback, progress, signer, as_json=args.json)
+    elif signer is not None and args.rotate:
+        _rotate(store, signer, args.rotate, as_json=args.json)
     elif signer is not None:
         _refresh(store, signer, as_json=args.json)
     elif args.prune:
@@ -167,6 +178,15 @@ def _refresh(store: Store, signer: MapSigner, *, as_json: bool) -> None:
         return
     print_line(f"version {refreshed.current.version} is signed")
     print_pairs([(role, f"until {until:%Y-%m-%d %H:%M} UTC") for role, until in valid.items()])
+
+
+def _rotate(store: Store, signer: MapSigner, role: str, *, as_json: bool) -> None:
+    rotated = signer.rotate(role)
+    if as_json:
+        print_json({"url": store.url, **rotated._asdict()})
+        return
+    print_line(f"{' and '.join(rotated.roles)}: signed by a new key, as root of trust {rotated.root} says")
+    print_line(f"the new key is {rotated.key}: it belongs wherever the old one was")
 
 
 def _prune(store: Store, keep_days: float | None, progress: PrepareProgress, *, as_json: bool) -> None:

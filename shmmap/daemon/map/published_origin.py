@@ -8,20 +8,25 @@ import threading
 import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final
+from hashlib import sha256
+from typing import Final, NamedTuple
+
+import msgspec
 
 from shmmap.daemon.map.object_keeper import ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.map.published_view import PublishedView
 from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
 from shmmap.daemon.map.shard_pages import FEW_SHARDS, ShardPages
-from shmmap.errors import CannotWrite, MapDataError, MapMissing, ShmmapError
+from shmmap.errors import CannotWrite, ConfigError, MapDataError, MapMissing, Offline, ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.remote.map_versions import (
+    CURRENT,
+    MAX_METADATA_BYTES,
+    TIMESTAMP,
     Current,
     CurrentState,
     read_current,
-    read_current_again,
     read_root_object,
     read_shard_object,
     root_path,
@@ -29,18 +34,43 @@ from shmmap.origin.remote.map_versions import (
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpack_shard
 from shmmap.origin.remote.serving_store import ServedFrom, kept_objects, open_for_serving
-from shmmap.origin.remote.store import PROBE, ObjectReader
+from shmmap.origin.remote.store import PROBE, ObjectReader, Store
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
+from shmmap.origin.remote.verify_apart import VerifySettings, read_trusted_root, verify_apart
+from shmmap.statistics.counters import REFUSALS
 
 __all__ = ["PublishedOrigin"]
 
 NOTHING: Final = CurrentState(None, None)
+VERIFY_S: Final = 30.0
+"""Most time for verifying what is signed: a server that says nothing is given up long before."""
+
+
+class _Offer(NamedTuple):
+    """The version that the origin says is current, and of a signed one when it was signed and runs out."""
+
+    current: Current
+    signed_s: float = 0.0
+    expires_s: float = 0.0
+
+
+class _Problem(NamedTuple):
+    """What is wrong with an offer, by the names that errors have for it."""
+
+    code: str
+    cause: str
+
+    @classmethod
+    def of(cls, error: ShmmapError) -> _Problem:
+        return cls(error.code, error.cause if isinstance(error, MapDataError) else "")
 
 
 class PublishedOrigin:
     """What views of a published map come from; see `shmmap.daemon.map.catalogue_view.ViewOrigin`.
 
-    The first view is of the version that was taken last, whatever the origin says then, if anything.
+    The first view is of the version that was taken last, whatever the origin says then, if anything.  An
+    offer that cannot be taken is a problem that a reload says once, not with each poll; another reload
+    follows when it is another problem, or none.
 
     Parameters
     ----------
@@ -54,6 +84,14 @@ class PublishedOrigin:
         How often it is asked whether there is another version; 0: never.
     accept_version
         A version that is taken although a later one was taken before; 0: none.
+    trust
+        Path of the root of trust: what is current is then what is signed under it, which a process apart
+        verifies, and only what was taken under it is served at the start.  Empty: what ``CURRENT`` says.
+
+    Raises
+    ------
+    ConfigError
+        The root of trust cannot be read or is none, or there is no state directory for what was verified.
 
     Attributes
     ----------
@@ -76,7 +114,14 @@ class PublishedOrigin:
         catalogue_bytes: int,
         poll_s: float,
         accept_version: int = 0,
+        trust: str = "",
     ) -> None:
+        self._trust = trust
+        self._trusted = sha256(read_trusted_root(trust)).hexdigest() if trust else ""
+        if trust and not state_dir:
+            raise ConfigError(
+                "there is no directory to keep what was verified", key="trust", hint="set XDG_STATE_HOME"
+            )
         self._store = open_for_serving(served)
         self._probe = open_for_serving(served, PROBE)
         self._index = kept_objects(self._store, cache_dir, cache_bytes, is_index=True)
@@ -84,12 +129,16 @@ class PublishedOrigin:
         self.path = self._store.url
         self.served = served._replace(url=self.path)
         self._instance = instance
-        self._state = TakenVersionFile(state_dir, instance, self.path) if state_dir else None
+        self._state_dir = state_dir
+        self._state = TakenVersionFile(state_dir, instance, self.path, self._trusted) if state_dir else None
         self._catalogue_bytes = catalogue_bytes
         self._poll_s = poll_s
         self._accept_version = accept_version
         self._taken: TakenVersion | None = None
-        self._refused: Current | None = None
+        self._lock = threading.Lock()  # of `_taken`: a reload changes it, and the thread that asks
+        self._saving = threading.Lock()
+        self._problem: _Problem | None = None
+        self._refused = 0
         self._seen = NOTHING
         self._is_loading = False
         self._saved: TakenVersion | None = None
@@ -112,7 +161,8 @@ class PublishedOrigin:
         MapMissing
             Nothing is published there.
         MapDataError
-            Its index is damaged, or the version is lower than one that was taken before.
+            Its index is damaged, or the version is lower than one that was taken before; or it is refused
+            under the root of trust, see `verify_apart`, whose other errors come, too.
         Offline
             It is out of reach.
         """
@@ -121,8 +171,10 @@ class PublishedOrigin:
         try:
             if view is None and not fresh and (taken := self._remembered()) is not None:
                 if self._accept_version:
-                    with contextlib.suppress(ShmmapError):
+                    try:
                         return self._offered(None)
+                    except ShmmapError:
+                        self._problem = None  # the next poll says it
                 return self._restored(*taken)
             return self._offered(view)
         finally:
@@ -130,25 +182,83 @@ class PublishedOrigin:
 
     def _offered(self, view: PublishedView | None) -> PublishedView:
         """Take the version that is current."""
-        self._seen = seen = read_current(self._store)
-        current = seen.current
-        if current is None:
-            raise MapMissing(
-                f"no map is published at {self.path}", hint="shmmap publish MAP URL publishes one"
-            )
-        judged = judge_offer(self._taken, current, accept=self._accept_version)
-        if judged.problem:
-            self._refused = current
-            raise MapDataError(judged.problem, cause="older_version", hint=judged.hint)
-        if view is not None and view.number == current.version:
-            return view
-        frame = read_root_object(self._index, current)
-        root = unpack_root(frame, name=f"{self.path}/{root_path(current)}")
-        taken = TakenVersion(self._instance, self.path, "", current.version, frame, time.time())
+        try:
+            offer = self._read_offer()
+            self._judge(offer)
+            current = offer.current
+            if view is not None and view.number == current.version:
+                self._problem = None
+                return view
+            frame, root = self._read_root(current)
+        except ShmmapError as error:
+            self._problem = _Problem.of(error)
+            raise
+        self._problem = None
+        taken = TakenVersion(
+            self._instance,
+            self.path,
+            self._trusted,
+            current.version,
+            frame,
+            time.time(),
+            offer.signed_s,
+            offer.expires_s,
+        )
         known = {} if view is None else _same_shards(view, root)
         if len(root.keys) <= FEW_SHARDS:
             self._fetch_all(root, known, self._index)
         return self._take(taken, root, known)
+
+    def _read_offer(self) -> _Offer:
+        """Ask which version is current: the one that is signed, or without a root of trust what is said."""
+        self._refused = 0
+        if self._trust:
+            return self._verify()
+        self._seen = read_current(self._store)
+        if self._seen.current is None:
+            raise MapMissing(
+                f"no map is published at {self.path}", hint="shmmap publish MAP URL publishes one"
+            )
+        return _Offer(self._seen.current)
+
+    def _verify(self) -> _Offer:
+        """Have it verified which version is signed."""
+        tag = None
+        with contextlib.suppress(MapMissing, MapDataError):  # verifying says by name what is wrong
+            _, tag = self._store.get_tagged(TIMESTAMP, MAX_METADATA_BYTES)
+        settings = VerifySettings(
+            self.path,
+            self._trust,
+            self._state_dir,
+            self.served.insecure_http,
+            self.served.instance_credentials,
+            is_serving=True,
+        )
+        verified = verify_apart(settings, timeout_s=VERIFY_S)
+        if verified.trust != self._trusted:
+            raise ConfigError(
+                f"{self._trust} is another root of trust than when this daemon was started",
+                key="trust",
+                hint="restart it: what is signed under this one is verified then",
+            )
+        self._seen = CurrentState(verified.current, tag)
+        return _Offer(verified.current, verified.signed_s, verified.expires_s)
+
+    def _judge(self, offer: _Offer) -> None:
+        """Refuse what must not be taken; the version that was taken may have been signed again."""
+        with self._lock:
+            taken = self._taken
+            judged = judge_offer(taken, offer.current, accept=self._accept_version)
+            if judged.problem:
+                self._refused = offer.current.version
+                raise MapDataError(judged.problem, cause=judged.cause, hint=judged.hint)
+            if taken is not None and taken.current == offer.current:
+                again = msgspec.structs.replace(taken, signed_s=offer.signed_s, expires_s=offer.expires_s)
+                self._taken = taken if taken == again else again
+
+    def _read_root(self, current: Current) -> tuple[bytes, Root]:
+        frame = read_root_object(self._index, current)
+        return frame, unpack_root(frame, name=f"{self.path}/{root_path(current)}")
 
     def _remembered(self) -> tuple[TakenVersion, Root] | None:
         """Return the version that was taken before the start, if that is known."""
@@ -164,7 +274,8 @@ class PublishedOrigin:
         except MapDataError as error:  # of a later version of shmmap, say
             log.warning("the version taken last cannot be served", reason=error)
             return None
-        self._taken = self._saved = taken
+        with self._lock:
+            self._taken = self._saved = taken
         return taken, root
 
     def _restored(self, taken: TakenVersion, root: Root) -> PublishedView:
@@ -177,7 +288,8 @@ class PublishedOrigin:
         return self._take(taken, root, known)
 
     def _take(self, taken: TakenVersion, root: Root, known: dict[int, Shard]) -> PublishedView:
-        self._taken = taken
+        with self._lock:
+            self._taken = taken
         if self._tier is not None:
             digests = [root.shard_sha256(number) for number in range(len(root.keys))]
             self._tier.mark_index_used([bytes.fromhex(taken.current.root), *digests])
@@ -201,12 +313,34 @@ class PublishedOrigin:
             known.update((number, shard) for number, shard in fetched if shard is not None)
 
     def _has_another(self) -> bool:
-        """Whether there is another version than the one that was taken; asked in a thread."""
+        """Whether a reload would find other than what is known; asked in a thread.
+
+        That is another version than the one that was taken, a problem with the offer, or its end.
+        """
         if self._taken is None:
             return False
-        store = self._probe if self.link.is_out else self._store
-        self._seen = read_current_again(store, self._seen)
-        return self._seen.current not in (self._taken.current, self._refused, None)
+        is_same = self._is_same(self._probe if self.link.is_out else self._store)
+        before = self._problem
+        if is_same and before is None:
+            return False
+        try:
+            offer = self._read_offer()
+            self._judge(offer)
+            if offer.current != self._taken.current:
+                self._read_root(offer.current)
+                return True
+        except ShmmapError as error:  # out of reach, too: it has just answered
+            return _Problem.of(error) != before
+        return before is not None
+
+    def _is_same(self, store: Store) -> bool:
+        """Whether the origin says what it said when it was last read."""
+        path, tag = TIMESTAMP if self._trust else CURRENT, self._seen.tag
+        with contextlib.suppress(MapMissing, MapDataError):  # reading it says what is wrong
+            if tag is not None:
+                return store.get_if_changed(path, MAX_METADATA_BYTES, tag) is None
+            store.get_tagged(path, MAX_METADATA_BYTES)
+        return False
 
     # --- while it is served -----------------------------------------------------------------------
 
@@ -220,7 +354,36 @@ class PublishedOrigin:
             return
         self._saved = taken
         with contextlib.suppress(RuntimeError):  # as many threads as there may be: then with the next one
-            threading.Thread(target=_save, args=(self._state, taken), name="taken").start()
+            threading.Thread(target=self._save, args=(self._state, taken), name="taken").start()
+
+    def _save(self, state: TakenVersionFile, taken: TakenVersion) -> None:
+        with self._saving:
+            if taken is not self._saved:
+                return  # a later one was quicker, or comes
+            try:
+                state.save(taken)
+            except CannotWrite as error:
+                log.warning("the version taken cannot be remembered for the next start", reason=error)
+
+    @property
+    def expires_s(self) -> float | None:
+        """When what signs the version that was taken runs out, Unix time; None where nothing signs it."""
+        taken = self._taken
+        return taken.expires_s or None if taken is not None else None
+
+    @property
+    def signed_s(self) -> float:
+        """When that was signed, Unix time; 0: it is not."""
+        taken = self._taken
+        return taken.signed_s if taken is not None else 0.0
+
+    @property
+    def refusal(self) -> str:
+        """Why what is offered is not taken, one of `REFUSALS`; empty where it is, or is out of reach."""
+        problem = self._problem
+        if problem is None or problem.code == Offline.code:
+            return ""
+        return problem.cause if problem.cause in REFUSALS[1:] else REFUSALS[-1]
 
     @property
     def in_service(self) -> TakenVersion | None:
@@ -229,14 +392,8 @@ class PublishedOrigin:
 
     @property
     def refused_version(self) -> int:
-        """Number of the version that is offered and was refused; 0: none."""
-        refused = self._refused
-        return refused.version if refused is not None and self._seen.current == refused else 0
-
-    @property
-    def expires_s(self) -> float | None:
-        """When what signs the version runs out, Unix time; None where nothing signs it."""
-        return None
+        """Number of the version that is offered and was refused; 0: none, or it is not known."""
+        return self._refused if self.refusal else 0
 
     @property
     def counts(self) -> ObjectCounts:
@@ -271,13 +428,6 @@ class _OnDisk:
         if data is None:
             raise MapMissing(f"{path} is not on the disk")
         return data
-
-
-def _save(state: TakenVersionFile, taken: TakenVersion) -> None:
-    try:
-        state.save(taken)
-    except CannotWrite as error:
-        log.warning("the version taken cannot be remembered for the next start", reason=error)
 
 
 def _same_shards(view: PublishedView, root: Root) -> dict[int, Shard]:

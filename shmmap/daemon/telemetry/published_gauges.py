@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+from shmmap.statistics.counters import REFUSALS
+
 if TYPE_CHECKING:
     from shmmap.origin.remote.object_tier import ObjectCounts
     from shmmap.origin.remote.taken_version import TakenVersion
@@ -32,6 +34,14 @@ class VersionInService(Protocol):
         """When what signs the version runs out, Unix time; None where nothing signs it."""
 
     @property
+    def signed_s(self) -> float:
+        """When that was signed, Unix time; 0: it is not."""
+
+    @property
+    def refusal(self) -> str:
+        """Why what is offered is not taken, one of `REFUSALS`; empty where it is."""
+
+    @property
     def counts(self) -> ObjectCounts:
         """What was read of the index so far."""
 
@@ -54,4 +64,6 @@ class PublishedGauges:
             statistics.set("published_version", taken.version)
             statistics.set("published_taken_unix_ns", int(taken.taken_s * 1e9))
         statistics.set("published_refused", origin.refused_version)
+        statistics.set("published_refusal", REFUSALS.index(origin.refusal))
         statistics.set("published_expires_unix_ns", int((expires_s or 0.0) * 1e9))
+        statistics.set("published_signed_unix_ns", int(origin.signed_s * 1e9))

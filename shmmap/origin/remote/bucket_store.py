@@ -265,7 +265,8 @@ def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bo
     if plain and not insecure and not is_loopback(_host(endpoint)):
         raise BadRequest(
             f"{where.text}: plain http:// can be read and changed in transit",
-            hint="use https://, or --insecure-http",
+            hint="use https://, or --insecure-http"
+            + (", or --trust ROOT.json where the map is signed" if where.scheme in WEB_SCHEMES else ""),
         )
     client: dict[str, Any] = {
         "connect_timeout": timedelta(seconds=timeouts.connect_s),

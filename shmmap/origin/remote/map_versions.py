@@ -41,7 +41,6 @@ __all__ = [
     "new_entry_now",
     "pack_json",
     "read_current",
-    "read_current_again",
     "read_entry",
     "read_root",
     "read_root_object",
@@ -133,26 +132,6 @@ def read_current(store: Store) -> CurrentState:
         data, tag = store.get_tagged(CURRENT, _MAX_JSON_BYTES)
     except MapMissing:
         return CurrentState(None, None)
-    return CurrentState(unpack_current(data, f"{store.url}/{CURRENT}"), tag)
-
-
-def read_current_again(store: Store, seen: CurrentState) -> CurrentState:
-    """Return which version is current now; what was seen before is not sent again where it still is.
-
-    Raises
-    ------
-    MapMissing
-        There is none any more.
-    MapDataError, Offline
-        As `read_current`.
-    """
-    if seen.tag is None:
-        found = None
-    else:
-        found = store.get_if_changed(CURRENT, _MAX_JSON_BYTES, seen.tag)
-        if found is None:
-            return seen
-    data, tag = found if found is not None else store.get_tagged(CURRENT, _MAX_JSON_BYTES)
     return CurrentState(unpack_current(data, f"{store.url}/{CURRENT}"), tag)
 
 

@@ -71,6 +71,8 @@ def metadata_path(role: str, number: int) -> str:
 def refused(url: str, cause: str, why: str, hint: str = "") -> MapDataError:
     """Return the error that refuses what a store offers; ``cause`` is one of the names above."""
     named = cause.replace("_", " ")
+    if not hint and cause == ALTERED:
+        hint = "was it damaged, or changed on its way? `shmmap versions URL --trust ROOT.json` looks again"
     return MapDataError(f"what is offered is refused, {named}: {why}", path=url, cause=cause, hint=hint)
 
 

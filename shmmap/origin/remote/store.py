@@ -30,6 +30,7 @@ __all__ = [
     "Timeouts",
     "is_loopback",
     "is_url",
+    "may_be_plain",
     "put_over",
     "read_url",
 ]
@@ -43,7 +44,11 @@ Tag: TypeAlias = Mapping[str, Any]
 
 
 class StoreRefused(Offline):
-    """The store answers, and refuses; ``of_credentials``: because of who asks, or how that is shown."""
+    """The store answers, and refuses.
+
+    ``of_credentials``: because of who asks, or how that is shown.  A store whose list may not be read also
+    says so of what is not there.
+    """
 
     def __init__(self, message: str, *, hint: str = "", of_credentials: bool = False) -> None:
         super().__init__(message, hint=hint)
@@ -204,6 +209,15 @@ def read_url(text: str) -> StoreUrl:
         raise BadRequest(f"{text!r} is no plain URL")
     # the host of a bucket is its name: its case stays
     return StoreUrl(scheme, f"{scheme}://{parts.netloc}{parts.path}".rstrip("/"), host=host)
+
+
+def may_be_plain(url: str, *, insecure_http: bool, trust: str | None) -> bool:
+    """Whether a map may be read over plain ``http://`` from other machines.
+
+    That is so where its user says so, and from a web server where a root of trust is named: then all that is
+    read is verified.  A bucket's requests have credentials, which the signature of a map does not protect.
+    """
+    return insecure_http or bool(trust and is_url(url) and url.partition("://")[0].lower() in WEB_SCHEMES)
 
 
 def is_loopback(host: str) -> bool:

@@ -51,7 +51,9 @@ class TakenVersion(msgspec.Struct, frozen=True):
     taken_s
         When it was taken, Unix time.
     signed_s
-        The latest time that was seen signed, Unix time; 0: none.
+        When the metadata was signed that was verified last, Unix time; 0: none was.
+    expires_s
+        When that runs out, Unix time; 0: nothing signs it.
     """
 
     instance: str
@@ -61,6 +63,7 @@ class TakenVersion(msgspec.Struct, frozen=True):
     root: bytes
     taken_s: float
     signed_s: float = 0.0
+    expires_s: float = 0.0
 
     @property
     def current(self) -> Current:
@@ -182,11 +185,14 @@ class Judgement(NamedTuple):
         It is: its root is fetched, saved, and then served.
     problem, hint
         What is wrong with the offer, for ``health``, and what to do about it; empty if nothing is.
+    cause
+        The same by a name: ``older`` or ``altered``.
     """
 
     is_taken: bool
     problem: str = ""
     hint: str = ""
+    cause: str = ""
 
 
 def judge_offer(taken: TakenVersion | None, offered: Current, *, accept: int = 0) -> Judgement:
@@ -210,6 +216,7 @@ def judge_offer(taken: TakenVersion | None, offered: Current, *, accept: int = 0
             False,
             f"{taken.url} offers another map as {before}: it is not taken",
             "a map that is published gets a number of its own: publish it again",
+            "altered",
         )
     if offered.version == accept:
         return Judgement(True)
@@ -218,4 +225,5 @@ def judge_offer(taken: TakenVersion | None, offered: Current, *, accept: int = 0
         f"{taken.url} offers version {offered.version}, older than {before}: it is not taken",
         f"if it is meant, --accept-version {offered.version}; `shmmap versions --rollback` gives an older map"
         " a greater number",
+        "older",
     )

@@ -13,15 +13,24 @@ from typing import Final
 
 import msgspec
 
-from shmmap.errors import ConfigError, InternalError, Offline
+from shmmap.errors import ConfigError, ShmmapError
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, Current
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.processes.start_child import how_ended, start_child
 
-__all__ = ["Verified", "VerifyReply", "VerifySettings", "read_trusted_root", "verify_apart"]
+__all__ = [
+    "Verified",
+    "VerifyReply",
+    "VerifySettings",
+    "memory_directory",
+    "no_root_of_trust",
+    "read_trusted_root",
+    "verify_apart",
+]
 
 _LONGEST_S: Final = 300.0
+_NO_ROOT: Final = "it is the ROOT.json that `publish --sign` makes"
 
 
 class VerifySettings(msgspec.Struct, frozen=True):
@@ -35,6 +44,8 @@ class VerifySettings(msgspec.Struct, frozen=True):
         Path of the trusted root.
     state_dir
         Where what was seen is kept: what is older is refused from then on.
+    is_serving
+        Ask as a daemon does, which must not wait long.
     """
 
     url: str
@@ -42,6 +53,7 @@ class VerifySettings(msgspec.Struct, frozen=True):
     state_dir: str
     insecure_http: bool = False
     instance_credentials: bool = False
+    is_serving: bool = False
 
 
 class Verified(msgspec.Struct, frozen=True):
@@ -80,6 +92,7 @@ class VerifyReply(msgspec.Struct):
 
 # made here, once: msgspec ends the process if threads are the first to decode a type at the same time
 _REPLY: Final = msgspec.json.Decoder(VerifyReply)
+_JSON: Final = msgspec.json.Decoder()
 
 
 def read_trusted_root(path: str) -> bytes:
@@ -88,18 +101,29 @@ def read_trusted_root(path: str) -> bytes:
     Raises
     ------
     ConfigError
-        It cannot be read, or is too large.
+        It cannot be read, or is no root of trust.
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
             data = file.read(MAX_METADATA_BYTES + 1)
     except OSError as error:
-        raise ConfigError(
-            f"{path}: {error.strerror}", key="trust", hint="it is the ROOT.json that `publish --sign` makes"
-        ) from None
+        raise ConfigError(f"{path}: {error.strerror}", key="trust", hint=_NO_ROOT) from None
     if len(data) > MAX_METADATA_BYTES:
-        raise ConfigError(f"{path} is too large for a root of trust", key="trust")
+        raise ConfigError(f"{path} is too large for a root of trust", key="trust", hint=_NO_ROOT)
+    try:
+        kind = _JSON.decode(data)["signed"]["_type"]
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, KeyError, TypeError):
+        kind = ""
+    if kind != "root":
+        raise no_root_of_trust(path)
     return data
+
+
+def no_root_of_trust(path: str, why: str = "") -> ConfigError:
+    """Return the error for a file that is no root of trust."""
+    return ConfigError(
+        f"{path}: this is no root of trust{f': {why}' if why else ''}", key="trust", hint=_NO_ROOT
+    )
 
 
 def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
@@ -108,8 +132,13 @@ def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
     return os.path.join(state_dir, "trust", sha256(of).hexdigest()[:32])
 
 
-def verify_apart(settings: VerifySettings) -> Verified:
+def verify_apart(settings: VerifySettings, *, timeout_s: float = _LONGEST_S) -> Verified:
     """Return the version that is signed.
+
+    Parameters
+    ----------
+    timeout_s
+        How long the process may take; then it is killed.
 
     Raises
     ------
@@ -124,23 +153,37 @@ def verify_apart(settings: VerifySettings) -> Verified:
         The store does not answer.
     CannotWrite
         What was seen cannot be kept.
+    ShmmapError
+        The process cannot be started, takes too long, or was killed.
     """
     read_trusted_root(settings.trust)
     words = msgspec.json.encode(settings).decode()
-    process, channel = start_child("shmmap.origin.remote.verify_version", words, new_session=False)
+    try:
+        process, channel = start_child("shmmap.origin.remote.verify_version", words, new_session=False)
+    except OSError as error:
+        raise ShmmapError(
+            f"{settings.url}: cannot start a process that verifies it: {error.strerror}",
+            hint="raise the limit of processes or memory (TasksMax=, ulimit -u, MemoryMax=)",
+        ) from error
     try:
         with channel:
-            channel.settimeout(_LONGEST_S)
+            channel.settimeout(timeout_s)
             data, _ = receive_packet(channel, packet_buffer())
             reply = _REPLY.decode(data) if data else None
     except TimeoutError:
-        raise Offline(f"{settings.url}: it took more than {_LONGEST_S:.0f} s to verify it") from None
+        raise ShmmapError(
+            f"{settings.url}: the process that verifies it has not ended within {timeout_s:.0f} s",
+            hint="has this machine too little memory or too much to do, or does the state directory hang?",
+        ) from None
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()
         code = process.wait()
     if reply is None:
-        raise InternalError(f"the process that verifies {settings.url} ended ({how_ended(code)})")
+        raise ShmmapError(
+            f"{settings.url}: the process that verifies it ended with {how_ended(code)}",
+            hint="was it killed, or is its memory too small?",
+        )
     if reply.verified is None:
         raise reply.error.raised()
     return reply.verified

@@ -11,25 +11,28 @@ import fcntl
 import os
 import socket
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from hashlib import sha256
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from shmmap.errors import ConfigError, MapMissing, ShmmapError
+from shmmap.errors import MapDataError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import writing_errors
 from shmmap.optional_packages import TO_SIGN, needed_packages
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP
 from shmmap.origin.remote.opened_store import open_store
+from shmmap.origin.remote.store import LONG_RUN, SERVING, StoreRefused
 from shmmap.origin.remote.verify_apart import (
     Verified,
     VerifyReply,
     VerifySettings,
     memory_directory,
+    no_root_of_trust,
     read_trusted_root,
 )
 from shmmap.processes.end_with_parent import die_with
@@ -42,11 +45,22 @@ if TYPE_CHECKING:
 __all__ = ["verify_version"]
 
 _URL = "map:///"  # the updater's names are URLs; what follows is a path at the store
-_ROLES = ("timestamp", "snapshot", "targets", "root")
+_ROLES: Final = ("timestamp", "snapshot", "targets", "root")
+_NICE: Final = 5
 
 
-def verify_version(store: Store, trusted: bytes, state_dir: str) -> Verified:
-    """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`."""
+class _Asked(NamedTuple):
+    """What the store failed with, and the newest metadata that it gave, by role."""
+
+    failed: list[ShmmapError]
+    found: dict[str, bytes]
+
+
+def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = "") -> Verified:
+    """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`.
+
+    Where this machine's clock is behind, what has run out is judged by when the timestamp was signed.
+    """
     from tuf.api.exceptions import DownloadError, RepositoryError
 
     from shmmap.origin.remote.signed_metadata import ALTERED, TARGET, current_of, refused
@@ -55,40 +69,54 @@ def verify_version(store: Store, trusted: bytes, state_dir: str) -> Verified:
     with writing_errors(memory):
         os.makedirs(memory, mode=0o700, exist_ok=True)
         with _locked(memory):
-            updater, failed = _updater(store, trusted, memory)
+            _remove_interim(memory)
+            updater, asked = _updater(store, trusted, memory, trust)
             try:
                 updater.refresh()
                 target = updater.get_targetinfo(TARGET)
             except (RepositoryError, DownloadError) as error:
-                raise _named(store, trusted, error, failed) from None
+                raise _named(store, trusted, error, asked, memory) from None
             try:
                 current = current_of(target)
             except ValueError as error:
                 raise refused(store.url, ALTERED, f"targets: {error}") from None
-            signed_s, expires_s = _times(memory)
+            signed_s, expires = _times(memory)
+    role = min(expires, key=lambda role: expires[role])
+    if expires[role].timestamp() <= signed_s:  # by this machine's clock it is still valid
+        raise _expired(store, role, expires[role], f"the timestamp was signed on {_text_of(signed_s)}, and ")
     return Verified(
-        current.version, current.root, current.bytes, sha256(trusted).hexdigest(), signed_s, expires_s
+        current.version,
+        current.root,
+        current.bytes,
+        sha256(trusted).hexdigest(),
+        signed_s,
+        expires[role].timestamp(),
     )
 
 
-def _updater(store: Store, trusted: bytes, memory: str) -> tuple[Updater, list[ShmmapError]]:
-    """Return TUF's client over a store, and the list of what the store failed with."""
+def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Updater, _Asked]:
+    """Return TUF's client over a store, and what the store gives it."""
     from tuf.api.exceptions import DownloadHTTPError, RepositoryError
     from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
-    failed: list[ShmmapError] = []
+    asked = _Asked([], {})
 
     class Fetcher(FetcherInterface):
         def _fetch(self, url: str) -> Iterator[bytes]:
             path = url.removeprefix(_URL)
             try:
-                return iter([bytes(store.get(path, MAX_METADATA_BYTES))])
+                data = bytes(store.get(path, MAX_METADATA_BYTES))
             except MapMissing as error:
-                failed.append(error)
+                asked.failed.append(error)
                 raise DownloadHTTPError(path, 404) from None
             except ShmmapError as error:
-                failed.append(error)
+                is_refused = isinstance(error, StoreRefused) and error.of_credentials
+                if is_refused and path.endswith(f".{_ROLES[-1]}.json"):
+                    raise DownloadHTTPError(path, 403) from None  # so a store says that there is none
+                asked.failed.append(error)
                 raise
+            asked.found[path.removesuffix(".json").rpartition(".")[2]] = data
+            return iter([data])
 
     config = UpdaterConfig(
         root_max_length=MAX_METADATA_BYTES,
@@ -97,22 +125,17 @@ def _updater(store: Store, trusted: bytes, memory: str) -> tuple[Updater, list[S
         targets_max_length=MAX_METADATA_BYTES,
     )
     try:
-        return Updater(memory, _URL, fetcher=Fetcher(), config=config, bootstrap=trusted), failed
+        return Updater(memory, _URL, fetcher=Fetcher(), config=config, bootstrap=trusted), asked
     except RepositoryError as error:
-        raise ConfigError(
-            f"this is no root of trust: {error}",
-            key="trust",
-            hint="it is the ROOT.json that `publish --sign` makes",
-        ) from None
+        raise no_root_of_trust(trust, str(error)) from None
 
 
-def _named(store: Store, trusted: bytes, error: Exception, failed: list[ShmmapError]) -> ShmmapError:
+def _named(store: Store, trusted: bytes, error: Exception, asked: _Asked, memory: str) -> ShmmapError:
     """Return the refusal, by name, for what TUF's client raised."""
     from tuf.api import exceptions
 
     from shmmap.origin.remote.signed_metadata import (
         ALTERED,
-        EXPIRED,
         FOREIGN_ROOT,
         OLDER,
         UNSIGNED,
@@ -130,6 +153,7 @@ def _named(store: Store, trusted: bytes, error: Exception, failed: list[ShmmapEr
             )
         return refused(f"{store.url}/{error}", ALTERED, "it is not there")
     if isinstance(error, exceptions.DownloadError):
+        failed = asked.failed
         if failed and not isinstance(failed[-1], MapMissing) and failed[-1].code != "bad_map_data":
             return failed[-1]
         return refused(store.url, ALTERED, failed[-1].message if failed else str(error))
@@ -141,13 +165,11 @@ def _named(store: Store, trusted: bytes, error: Exception, failed: list[ShmmapEr
             "is it the right URL, and the ROOT.json of the keys that sign it?",
         )
     if isinstance(error, exceptions.ExpiredMetadataError):
-        now = datetime.now(timezone.utc)
-        return refused(
-            store.url,
-            EXPIRED,
-            f"{error}; this machine's clock says {now:%Y-%m-%d %H:%M} UTC",
-            "is the clock right? `shmmap versions URL --refresh --sign KEYDIR` signs it again",
-        )
+        role = next(role for role in _ROLES if role in str(error))
+        if role == "root" or role not in asked.found:
+            with open(os.path.join(memory, f"{role}.json"), "rb") as file:
+                asked.found[role] = file.read()
+        return _expired(store, role, _expires(asked.found[role]))
     if isinstance(error, exceptions.BadVersionNumberError):
         return refused(
             store.url, OLDER, f"{error}", "an older state is offered than one that was seen signed here"
@@ -155,17 +177,51 @@ def _named(store: Store, trusted: bytes, error: Exception, failed: list[ShmmapEr
     return refused(store.url, ALTERED, f"{error}")
 
 
-def _times(memory: str) -> tuple[float, float]:
-    """When the timestamp was signed, and when the first of the metadata runs out."""
+def _expired(store: Store, role: str, expires: datetime, after: str = "") -> MapDataError:
+    from shmmap.origin.remote.signed_metadata import EXPIRED, refused
+
+    now = datetime.now(timezone.utc)
+    return refused(
+        store.url,
+        EXPIRED,
+        f"{role}.json was valid until {expires:%Y-%m-%d %H:%M} UTC; {after}this machine's clock says"
+        f" {now:%Y-%m-%d %H:%M} UTC",
+        "is the clock right? `shmmap versions URL --refresh --sign KEYDIR` signs it again",
+    )
+
+
+def _text_of(unix_s: float) -> str:
+    return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M} UTC"
+
+
+def _expires(data: bytes) -> datetime:
     from tuf.api.metadata import Metadata
 
-    found: list[Any] = [Metadata.from_file(os.path.join(memory, f"{role}.json")) for role in _ROLES]
-    signed = found[0].signed.unrecognized_fields.get("signed")
+    found: Any = Metadata.from_bytes(data)
+    expires: datetime = found.signed.expires
+    return expires
+
+
+def _times(memory: str) -> tuple[float, dict[str, datetime]]:
+    """When the timestamp was signed, and when the metadata of each role runs out."""
+    from tuf.api.metadata import Metadata
+
+    found: dict[str, Any] = {
+        role: Metadata.from_file(os.path.join(memory, f"{role}.json")).signed for role in _ROLES
+    }
+    signed = found["timestamp"].unrecognized_fields.get("signed")
     try:
         signed_s = datetime.fromisoformat(signed.replace("Z", "+00:00")).timestamp()
     except (AttributeError, ValueError, OverflowError):
         signed_s = 0.0
-    return signed_s, min(one.signed.expires for one in found).timestamp()
+    return signed_s, {role: one.expires for role, one in found.items()}
+
+
+def _remove_interim(memory: str) -> None:
+    """Remove what TUF's client had half written when it was killed."""
+    for name in os.listdir(memory):
+        if name.startswith(tempfile.gettempprefix()):
+            os.unlink(os.path.join(memory, name))
 
 
 @contextmanager
@@ -182,6 +238,8 @@ def main() -> int:
     """Verify, and answer."""
     die_with(int(sys.argv[2]))
     settings = msgspec.json.decode(sys.argv[3], type=VerifySettings)
+    if settings.is_serving:
+        os.nice(_NICE)
     reply = VerifyReply()
     with socket.socket(fileno=int(sys.argv[1])) as channel:
         try:
@@ -192,10 +250,12 @@ def main() -> int:
 
                 store = open_store(
                     settings.url,
+                    timeouts=SERVING if settings.is_serving else LONG_RUN,
                     insecure_http=settings.insecure_http,
                     instance_credentials=settings.instance_credentials,
                 )
-            reply.verified = verify_version(store, read_trusted_root(settings.trust), settings.state_dir)
+            trusted = read_trusted_root(settings.trust)
+            reply.verified = verify_version(store, trusted, settings.state_dir, settings.trust)
         except ShmmapError as error:
             reply.error = Outcome.of(error)
         channel.sendall(msgspec.json.encode(reply))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import socket
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,14 @@ import pytest
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.doctor import access, disk_cache, kernel, lifetime, live, memory
+from shmmap.doctor import access, disk_cache, kernel, lifetime, live, memory, signed_map
 from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
 from shmmap.protocol.live import LiveMapRow
 from shmmap.statistics.client_rows import ClientRow
+from shmmap.statistics.counters import REFUSALS
 from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
@@ -589,3 +591,57 @@ def test_reloads(ward: Ward) -> None:
     assert again.fact == "the map was read at the start and 3 times again"
     found = lifetime.check_reload(ward.patient(told(last_reload_failed=1, last_reload_unix_ns=1)))
     assert (found.state, "shmmap reload" in found.advice) == ("fail", True)
+
+
+# --- a published map that is verified -----------------------------------------------------------------
+
+
+def seconds(ago_s: float) -> int:
+    """So long before now, as counters have times."""
+    return int((time.time() - ago_s) * 1e9)
+
+
+SIGNED, UNTIL, REFUSAL = "published_signed_unix_ns", "published_expires_unix_ns", "published_refusal"
+
+
+@pytest.mark.parametrize(
+    ("counters", "state", "says"),
+    [
+        ({}, "ok", "not verified"),
+        ({SIGNED: 60, UNTIL: -3600}, "ok", "valid until"),
+        ({SIGNED: 600, UNTIL: 60}, "fail", "expired since"),
+        ({SIGNED: -600, UNTIL: -900}, "fail", "clock says"),
+        ({SIGNED: -60, UNTIL: -900}, "ok", "valid until"),
+        *(
+            ({SIGNED: 60, UNTIL: -3600, REFUSAL: value}, "warn", f"is refused, {name.replace('_', ' ')}")
+            for value, name in enumerate(REFUSALS[:-1])
+            if name
+        ),
+        ({SIGNED: 60, UNTIL: -3600, REFUSAL: len(REFUSALS) - 1}, "warn", "cannot be taken"),
+        ({REFUSAL: REFUSALS.index("older")}, "warn", "older"),
+        ({REFUSAL: 77}, "warn", "cannot be taken"),
+    ],
+)
+def test_the_signature_of_a_published_map(
+    ward: Ward, counters: dict[str, int], state: str, says: str
+) -> None:
+    """Times are given as seconds before now."""
+    counters = {name: seconds(value) if name != REFUSAL else value for name, value in counters.items()}
+    found = signed_map.check_signature(ward.patient(told(**counters)))
+    assert (found.state, says in found.fact) == (state, True)
+    assert found.skipped == (not counters)
+    assert bool(found.advice) == (state != "ok")
+    problems = signed_map.trust_problems(counters, time.time())
+    assert bool(problems) == (state != "ok" and says != "clock says")
+    assert bool(signed_map.signature_lines(counters, time.time())) == bool(counters)
+    assert signed_map.check_signature(ward.patient()).skipped, "no daemon runs"
+
+
+def test_what_has_expired_and_is_refused_is_both_said() -> None:
+    counters = {SIGNED: seconds(900), UNTIL: seconds(60), REFUSAL: REFUSALS.index("expired")}
+    expired, refused = signed_map.trust_problems(counters, time.time())
+    assert "expired since" in expired
+    assert "is refused, expired" in refused
+    # a clock that is behind changes nothing about that
+    behind = {**counters, SIGNED: seconds(30)}
+    assert len(signed_map.trust_problems(behind, time.time() - 86400)) == 2

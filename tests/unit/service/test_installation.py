@@ -132,6 +132,38 @@ def test_a_published_map_is_fetched_over_the_network(image: Path, capsys: pytest
     assert "secret" not in capsys.readouterr().err.replace("may hold a secret", "")
 
 
+def test_a_root_of_trust_is_copied_to_where_the_service_sees_it(
+    image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may lie in a home directory, which the service does not see; it is public."""
+    given = tmp_path / "home" / "ROOT.json"
+    given.parent.mkdir(mode=0o700)
+    content = b'{"signatures": [], "signed": {"_type": "root", "text": "\\u00e4 \xc3\xa4"}}\r\n'
+    given.write_bytes(content)
+    words = ["unit", "install", "--root", str(image), "--map", "s3://maps/town"]
+    assert main([*words, "--trust", str(given)]) == 0
+    copy, config = image / "etc/shmmap/ROOT.json", image / "etc/shmmap/shmmap.toml"
+    assert copy.read_bytes() == content
+    assert copy.stat().st_mode & 0o777 == 0o644
+    assert tomllib.loads(config.read_text())["trust"] == "/etc/shmmap/ROOT.json"
+    monkeypatch.chdir(given.parent)
+    given.write_bytes(content[:-2])
+    capsys.readouterr()
+    assert main([*words, "--trust", "ROOT.json"]) == 0
+    assert copy.read_bytes() == content[:-2]
+    assert "is kept: set map_path and trust there" in capsys.readouterr().out
+    assert main(words) == 0
+    assert copy.read_bytes() == content[:-2], "an installation without it leaves it there"
+    given.write_text("{}")
+    assert main([*words, "--trust", str(given)]) == 78
+    assert "no root of trust" in capsys.readouterr().err
+    assert main(["unit", "install", "--root", str(image), "--trust", str(given)]) == 2
+    given.write_bytes(content)
+    user = {one.path.name: one.text for one in plan_user("s3://maps/town", str(tmp_path), trust=str(given))}
+    assert user["ROOT.json"].encode() == content
+    assert tomllib.loads(user["shmmap.toml"])["trust"] == str(tmp_path / "shmmap/ROOT.json")
+
+
 def test_links_do_not_lead_out_of_an_image(image: Path, tmp_path: Path) -> None:
     """An absolute link starts at the image's root, and `..` ends there; what is linked to is not written."""
     elsewhere = tmp_path / "etc"

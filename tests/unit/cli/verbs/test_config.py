@@ -41,6 +41,9 @@ def test_from_init_to_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         ("workers = 1", 78, "no map is named"),
         ("map_path = '/'\ngroup = 'no such group'", 78, "there is no group"),
         ("map_path = ", 78, "Invalid value"),
+        ("map_path = 's3://maps/town'\ntrust = '/no/ROOT.json'", 78, "/no/ROOT.json: No such file"),
+        ("map_path = 's3://maps/town'\ntrust = '/proc/self/stat'", 78, "no root of trust"),
+        ("map_path = 's3://maps/town'\ntrust = true", 78, ":2: trust must be text"),
     ],
 )
 def test_mistakes(

@@ -19,10 +19,12 @@ from hypothesis import strategies as st
 
 from shmmap.errors import CannotWrite
 from shmmap.origin.remote.map_versions import Current
-from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
+from shmmap.origin.remote.taken_version import Judgement, TakenVersion, TakenVersionFile, judge_offer
 
 URL = "s3://bucket/town"
-TAKEN = TakenVersion("default", URL, "", 7, b"root of seven", 1_800_000_000.5, 1_799_999_000.0)
+TAKEN = TakenVersion(
+    "default", URL, "", 7, b"root of seven", 1_800_000_000.5, 1_799_999_000.0, 1_800_500_000.0
+)
 
 
 def file(directory: Path, *, instance: str = "default", url: str = URL, trust: str = "") -> TakenVersionFile:
@@ -66,7 +68,7 @@ def test_the_file_byte_by_byte(tmp_path: Path) -> None:
     assert data[-32:] == hashlib.sha256(data[:-32]).digest()
     assert msgspec.msgpack.decode(data[12:-32]) == {
         "instance": "default", "url": URL, "trust": "", "version": 7, "root": b"root of seven",
-        "taken_s": 1_800_000_000.5, "signed_s": 1_799_999_000.0,
+        "taken_s": 1_800_000_000.5, "signed_s": 1_799_999_000.0, "expires_s": 1_800_500_000.0,
     }  # fmt: skip
 
 
@@ -209,7 +211,7 @@ def test_which_offers_are_taken(offered: Current, accept: int, is_taken: bool, p
 
 def test_the_first_one_is_taken_whatever_its_number() -> None:
     for offered, accept in itertools.product((Current(1, OTHER, 9), Current(1 << 62, OTHER, 9)), (0, 1, 5)):
-        assert judge_offer(None, offered, accept=accept) == (True, "", "")
+        assert judge_offer(None, offered, accept=accept) == Judgement(True)
 
 
 @given(offers=st.lists(st.tuples(st.integers(1, 9), st.sampled_from(["aa" * 32, "bb" * 32])), max_size=20))
