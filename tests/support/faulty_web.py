@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A web server on loopback that serves a directory, and fails as a test wants it: for published maps.
 
-It answers conditional and range requests, keeps connections open, and writes down what was asked.
+What it serves may also be made as it is asked for.  It answers conditional and range requests, keeps connections open, and writes down what was asked.
 """
 
 from __future__ import annotations
 
 import hashlib
 import http.server
+import os
 import re
 import socket
 import threading
@@ -15,8 +16,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["FaultyWeb", "faulty_web"]
+__all__ = ["FaultyWeb", "Read", "faulty_web"]
 
+Read = Callable[[str], bytes]
+"""Returns what lies at a path; OSError: nothing."""
 Fault = Callable[[str], str]
 """What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
 ``truncate``, ``corrupt``, a status such as ``503``; or nothing."""
@@ -28,6 +31,7 @@ def _no_fault(_path: str) -> str:
 
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128
     web: FaultyWeb
 
     def get_request(self) -> tuple[socket.socket, object]:
@@ -59,7 +63,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._answer(int(fault), b"")
             return
         try:
-            data = (web.folder / path).read_bytes()
+            data = web.read(path)
         except OSError:
             self._answer(404, b"")
             return
@@ -102,8 +106,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 class FaultyWeb:
     """A running server; `fault` says what becomes of each request."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, source: Path | Read) -> None:
+        self.folder = source if isinstance(source, Path) else Path(os.devnull)
+        self.read: Read = self._read_file if isinstance(source, Path) else source
         self.fault: Fault = _no_fault
         self.connections: set[socket.socket] = set()
         self._requests: list[tuple[str, int]] = []
@@ -112,6 +117,9 @@ class FaultyWeb:
         self._server: _Server | None = None
         self._thread: threading.Thread | None = None
         self.listen()
+
+    def _read_file(self, path: str) -> bytes:
+        return (self.folder / path).read_bytes()
 
     @property
     def url(self) -> str:
@@ -160,9 +168,9 @@ class FaultyWeb:
 
 
 @contextmanager
-def faulty_web(folder: Path) -> Iterator[FaultyWeb]:
-    """Run a server until the end of the block."""
-    web = FaultyWeb(folder)
+def faulty_web(source: Path | Read) -> Iterator[FaultyWeb]:
+    """Run a server of a directory, or of what is read otherwise, until the end of the block."""
+    web = FaultyWeb(source)
     try:
         yield web
     finally:
