@@ -36,7 +36,7 @@ DATA binary
 def make_many_cells(out: Path, side: int, points: int = 1, *, distinct: bool = False) -> None:
     """Write ``side`` x ``side`` cells of so many points and their metadata into the new directory ``out``.
 
-    With ``distinct`` each file has bytes of its own: its points lie in its middle, their intensity is its number.
+    With ``distinct`` each file has bytes of its own: its points lie in its middle.
     """
     cells = out / "pointcloud_map.pcd"
     cells.mkdir(parents=True)

@@ -65,6 +65,7 @@ class Run:
     queries: int = 0
     warm: int = 0
     late: int = 0
+    late_at_s: list[float] = field(default_factory=list)
     cold_ms: list[float] = field(default_factory=list)
     warm_ms: list[float] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
@@ -158,6 +159,8 @@ def vehicle(client: shmmap.Client, kind: str, origin: Origin, args: argparse.Nam
         if time.monotonic() - begin_s > LEAVE_OUT_S:
             missing = len(answer.pending) + len(answer.failed) + (not answer.covered)
             run.queries, run.warm, run.late = run.queries + 1, run.warm + (not missing), run.late + missing
+            if missing:
+                run.late_at_s.append(time.monotonic() - begin_s)
 
 
 def beside(client: shmmap.Client, over: threading.Event, run: Run) -> None:
@@ -236,13 +239,15 @@ def main() -> None:
             over = counters["bytes_loaded"] / counters["bytes_used"]
             longest_ms = max(value for name, value in counters.items() if name.startswith("longest")) / 1e6
             print(
-                f"{kind:13} requests {run.queries:4}, all in memory {100 * run.warm / run.queries:5.1f} %,"
+                f"{kind:13} requests {run.queries:4}, all in memory {100 * run.warm / run.queries:6.2f} %,"
                 f" late cells {run.late:5}; loaded/used {over:.2f};"
                 f" p99 of single cold cells {p99(run.cold_ms):7.0f} ms ({len(run.cold_ms)}),"
                 f" of warm requests {p99(run.warm_ms):6.2f} ms; longest turn {longest_ms:.1f} ms;"
                 f" load {os.getloadavg()[0]:.1f}",
                 flush=True,
             )
+            if run.late_at_s and kind != "nothing ahead":
+                print("  seconds at which cells were late:", *(f"{at_s:.1f}" for at_s in run.late_at_s))
     if not args.only:
         nothing, poses, route = (runs[kind] for kind in KINDS)
         print(f"with the route {route.late} cells are late (limit 0)")

@@ -52,10 +52,11 @@ from tests.support.faulty_web import faulty_web
 if TYPE_CHECKING:
     from hashlib import _Hash
 
-__all__ = ["CELL_M", "MadeMap", "ServedMadeMap", "serve_made_map"]
+__all__ = ["CELL_M", "SHARD_M", "MadeMap", "ServedMadeMap", "serve_made_map"]
 
 CELL_M: Final = 20.0
 SHARD_CELLS: Final = 32
+SHARD_M: Final = SHARD_CELLS * CELL_M
 PATTERNS: Final = 16
 NAME_BYTES: Final = 12
 """Of the hash in a cell's name: so the index has as many bytes a cell as a recorded map's (89), although here
@@ -201,7 +202,7 @@ class MadeMap:
             encoding=EXACT,
             cells=self.side**2,
             bounds=(0.0, 0.0, extent, extent),
-            shard_m=SHARD_CELLS * CELL_M,
+            shard_m=SHARD_M,
             largest_m=(CELL_M, CELL_M),
             mean_m=(CELL_M, CELL_M),
             layers={POINTS: layer_spec(POINTS).builder_version},
