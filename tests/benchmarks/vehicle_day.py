@@ -39,6 +39,7 @@ import numpy as np
 
 import shmmap
 from shmmap.statistics.reader import read_statistics
+from tests.benchmarks.hostile.stage import lift
 from tests.benchmarks.slow_origin_drives import Drive, city_drive, travelled_m
 from tests.support.daemon_process import DaemonProcess
 from tests.support.made_map import serve_made_map
@@ -224,6 +225,9 @@ def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> 
         day.way_km = len(times) * STEP_M / 1e3
         client.area(shmmap.Circle(*way.at(0.0), RADIUS_M), wait=300.0)
         client.release()
+        if args.lift:
+            for pid in (one.pid, *one.loaders()):
+                lift(pid)
         begin_s = time.monotonic()
         link.go_out([(begin_s + from_s, begin_s + to_s) for from_s, to_s in day.outages])
         due = (begin_s + np.append(times, end_s) / factor).tolist()
@@ -272,7 +276,12 @@ def main() -> None:
     parser.add_argument(
         "--scratch", type=Path, help="directory for the disk tiers (default: a temporary one)"
     )
+    parser.add_argument(
+        "--lift", action="store_true", help="let all of this go before unrelated work (needs root)"
+    )
     args = parser.parse_args()
+    if args.lift:
+        lift(os.getpid())
     if not 10.0 <= args.minutes <= 60.0:
         parser.error(
             "--minutes: 10 to 60; in less, the vehicle would be faster than the daemon takes one to be"
