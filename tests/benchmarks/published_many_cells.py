@@ -12,11 +12,10 @@ published   a daemon that never saw the published map, with an empty disk, until
 
 Then, of the latter: from when it is ready until all cells are known to a client that connects, within 200 m
 of a place where four parts of the list meet, far from the middle of the map, where the daemon begins to fetch
-the rest of the list; and the daemon's memory then, without its loaders.  While it runs
-on, it fetches more of the list, as far as `--catalogue-budget` (256 MiB) allows: what it has after a minute
-is printed, too.
+the rest of the list; and the daemon's memory then, without its loaders.  While it runs on, it fetches more of
+the list, as far as `--catalogue-budget` (256 MiB) allows: what it has after a minute is printed, too.
 
-Limits: ready at most 0.6 s after the local one, cells known in 0.6 s, 100 MB; times are the least of the rounds.
+Limits: ready at most 0.6 s after the local one, cells known in 0.6 s, 100 MB; the least of the rounds.
 """
 
 from __future__ import annotations
@@ -106,7 +105,8 @@ def main() -> int:
                     found = start_published(served, link, later=number == args.repeats - 1)
                     rounds.append({"local": local_s, **found})
                     print(
-                        f"local {local_s:.2f} s, published {found['ready']:.2f} s; known {found['known']:.2f} s,"
+                        f"local {local_s:.2f} s, published {found['ready']:.2f} s;"
+                        f" known {found['known']:.2f} s,"
                         f" {found['memory']:.0f} MB, {found['received']:.2f} MB received;"
                         f" processor {found['processor']:.2f} s; load {os.getloadavg()[0]:.1f}",
                         flush=True,

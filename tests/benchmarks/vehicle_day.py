@@ -3,12 +3,12 @@
 
     python -m tests.benchmarks.vehicle_day [--minutes 20] [--at-once] [--picture DAY.png]
 
-The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects are made when they are asked for
-(`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, 15 m/s at most)
-and asks for a circle of 200 m every 20 m.  Two daemons: one is told the vehicle's places alone, one its route,
-the next kilometres of it, too.  Each has 2 GiB of memory for cells and 8 GiB of disk, empty at the start, and
-bridges outages of 20 s (`--ride-out`).  The link: an answer takes a log-normal time (mean 0.2 s, sigma 0.8),
-all share 100 Mbit/s, and by chance, every four minutes on average, nothing passes for 2 to 20 s.
+The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects are made when they are asked
+for (`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, 15 m/s at
+most) and asks for a circle of 200 m every 20 m.  Two daemons: one is told the vehicle's places alone, one its
+route, too (the next kilometres of it).  Each has 2 GiB of memory for cells and 8 GiB of disk, empty at the
+start, and bridges outages of 20 s (`--ride-out`).  The link: an answer takes a log-normal time (mean 0.2 s,
+sigma 0.8), all share 100 Mbit/s, and by chance, every four minutes on average, nothing passes for 2 to 20 s.
 
 The hour is driven in ``--minutes``: the vehicle is 60 / minutes times as fast, the link as much wider, and
 outages as much more frequent.  How long answers and outages take is not shortened, nor is anything in the
@@ -291,9 +291,9 @@ def main() -> None:
     way = city_drive(args.seed, 45_000.0, BLOCKS)
     kinds = [args.only] if args.only else list(KINDS)
     print(f"load {os.getloadavg()[0]:.1f}; an hour takes {args.minutes:g} minutes", flush=True)
-    with tempfile.TemporaryDirectory(dir=args.scratch) as folder:
-        with ThreadPoolExecutor(len(kinds) if args.at_once else 1) as pool:
-            days = list(pool.map(lambda kind: drive_day(way, kind, args, Path(folder)), kinds))
+    at_once = len(kinds) if args.at_once else 1
+    with tempfile.TemporaryDirectory(dir=args.scratch) as folder, ThreadPoolExecutor(at_once) as pool:
+        days = list(pool.map(lambda kind: drive_day(way, kind, args, Path(folder)), kinds))
     for day in days:
         print(row(day))
     print(f"load {os.getloadavg()[0]:.1f}")

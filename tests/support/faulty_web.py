@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A web server on loopback that serves a directory, and fails as a test wants it: for published maps.
 
-What it serves may also be made as it is asked for.  It answers conditional and range requests, keeps connections open, and writes down what was asked.
+What it serves may also be made as it is asked for.  It answers conditional and range requests, keeps
+connections open, and writes down what was asked.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A published map of any number of cells, each of whose objects is made when it is asked for.
 
-``python -m tests.support.made_map CELLS POINTS`` serves one until stdin is closed: it prints its port and what
-else `ServedMadeMap` has to know, and answers each line of stdin with how many cells' objects it has sent whole.
+``python -m tests.support.made_map CELLS POINTS`` serves one until stdin is closed.  It prints its port and
+what else `ServedMadeMap` has to know, and answers each line of stdin with how many cells' objects it has sent
+whole.
 
 An object is a pure function of its cell's number.  The points are those of one of a few patterns, in the box
 of the first cell wherever the cell lies; the last bytes of the object, which only fill it up to a multiple of
@@ -238,6 +239,10 @@ class MadeMap:
         except (KeyError, ValueError):
             raise FileNotFoundError(path) from None
         return self._pattern(cell).frame(cell)
+
+    def cells(self) -> Iterator[bytes]:
+        """SHA-256 of the objects of all cells whose shards were read."""
+        yield from list(self._cells)
 
     def is_cell(self, path: str) -> bool:
         """Whether it is the path of a cell's object."""

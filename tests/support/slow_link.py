@@ -16,6 +16,7 @@ import asyncio
 import contextlib
 import json
 import math
+import os
 import random
 import subprocess
 import sys
@@ -125,16 +126,16 @@ class _Direction:
 
     def __init__(self, mbit_s: float, outages: _Outages) -> None:
         self._s_per_byte = 8e-6 / mbit_s if mbit_s else 0.0
-        self._free_s = 0.0
         self._outages = outages
+        self.free_s = 0.0
         self.passed_bytes = 0
 
     def pass_through(self, nbytes: int, now_s: float) -> float:
         """Take the link for these bytes; when the last of them has entered it."""
         self.passed_bytes += nbytes
-        began_s = self._outages.end_of(max(self._free_s, now_s))
-        self._free_s = began_s + nbytes * self._s_per_byte
-        return self._outages.end_of(self._free_s)
+        began_s = self._outages.end_of(max(self.free_s, now_s))
+        self.free_s = began_s + nbytes * self._s_per_byte
+        return self._outages.end_of(self.free_s)
 
 
 class _Connection:
@@ -210,17 +211,19 @@ async def _serve(plan: Plan) -> None:
         with contextlib.suppress(OSError), contextlib.closing(writer):
             await _Connection(plan, up, down, took).run((reader, writer))
 
-    def command() -> None:
-        line = sys.stdin.readline()
-        if line.startswith("["):
-            outages.set([(begin, end) for begin, end in json.loads(line)])
-        elif line:
-            print(down.passed_bytes, flush=True)
-        else:
+    def commands() -> None:
+        data = os.read(sys.stdin.fileno(), 1 << 20)  # what a text file buffers would not be seen again
+        if not data:
             loop.remove_reader(sys.stdin)
+        for line in data.decode().splitlines():
+            if line.startswith("["):
+                outages.set([(begin, end) for begin, end in json.loads(line)])
+                up.free_s = down.free_s = 0.0
+            else:
+                print(down.passed_bytes, flush=True)
 
     server = await asyncio.start_server(accept, "127.0.0.1", 0, limit=CHUNK_BYTES, backlog=1024)
-    loop.add_reader(sys.stdin, command)
+    loop.add_reader(sys.stdin, commands)
     print(server.sockets[0].getsockname()[1], flush=True)
     async with server:
         await server.serve_forever()

@@ -149,7 +149,8 @@ class Prefetch:
     def _is_back(self, now_s: float) -> bool:
         """Whether loads succeed again; and for how long they did not."""
         if self.health.is_out:
-            self._out_since_s = min(self._out_since_s, now_s)
+            # a server that says nothing is found out late: it was away when the loads were begun that fail
+            self._out_since_s = min(self._out_since_s, now_s - self.health.waited_s)
             return False
         if self._out_since_s == math.inf:
             return False
