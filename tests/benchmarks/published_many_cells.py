@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A published map of ten million cells over 20 Mbit/s and 50 ms: ready, the cells nearby known, memory.
 
-    python -m tests.benchmarks.published_many_cells [--cells 10000000] [--repeats 7]
+    python -m tests.benchmarks.published_many_cells [--cells 10000000] [--repeats 7] [--lift]
 
 The map is that of `tests.support.made_map`: its list of cells has the size of a recorded map's, and each part
 of it is made when it is asked for (a root of ten million cells takes a minute or two before the first round).
@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Final
 
 import shmmap
+from tests.benchmarks.hostile.stage import lift
 from tests.benchmarks.make_many_cells import make_many_cells
 from tests.benchmarks.many_cells import processor_s, seconds_to_start
 from tests.support.daemon_process import DaemonProcess
@@ -47,21 +48,21 @@ LIMITS: Final = {"ready": 0.6, "known": 0.6, "memory": 100.0}
 """Seconds after the local one, seconds, megabytes."""
 
 
-def start_local(one: DaemonProcess) -> float:
+def start_local(one: DaemonProcess, *, lifted: bool) -> float:
     """Seconds until a daemon is ready that knows its map's list."""
-    took_s = seconds_to_start(one, lifted=False)
+    took_s = seconds_to_start(one, lifted=lifted)
     one.stop()
     return took_s
 
 
-def start_published(served: ServedMadeMap, link: SlowLink, *, later: bool) -> dict[str, float]:
+def start_published(served: ServedMadeMap, link: SlowLink, *, later: bool, lifted: bool) -> dict[str, float]:
     """Start a daemon that knows nothing, and a client that knows nothing; what it took."""
     corner_m = served.side * CELL_M // SHARD_M // 4 * SHARD_M
     area = shmmap.Circle(corner_m, corner_m, RADIUS_M)
     before = link.received_bytes()
     one = DaemonProcess(link.endpoint)
     try:
-        found = {"ready": seconds_to_start(one, lifted=False)}
+        found = {"ready": seconds_to_start(one, lifted=lifted)}
         begin_s = time.perf_counter()
         with shmmap.connect(one.endpoint) as client:
             while not client.area(area, wait=0, strict=None).covered:
@@ -87,13 +88,16 @@ def main() -> int:
     )
     parser.add_argument("--cells", type=int, default=10_000_000)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--lift", action="store_true", help="go before unrelated work (needs root)")
     args = parser.parse_args()
+    if args.lift:
+        lift(os.getpid())
     with tempfile.TemporaryDirectory(dir="/dev/shm") as folder, serve_made_map(args.cells, POINTS) as served:
         make_many_cells(Path(folder, "map"), LOCAL_SIDE)
         local = DaemonProcess(Path(folder, "map"))
         rounds = []
         try:
-            start_local(local)
+            start_local(local, lifted=args.lift)
             print(
                 f"{served.side**2} cells, {served.index_bytes_per_cell:.0f} bytes of list for each;"
                 f" load {os.getloadavg()[0]:.1f}",
@@ -101,8 +105,9 @@ def main() -> int:
             )
             with slow_link(Plan(served.port, MBIT_S, DELAY_S)) as link:
                 for number in range(args.repeats):
-                    local_s = start_local(local)
-                    found = start_published(served, link, later=number == args.repeats - 1)
+                    local_s = start_local(local, lifted=args.lift)
+                    is_last = number == args.repeats - 1
+                    found = start_published(served, link, later=is_last, lifted=args.lift)
                     rounds.append({"local": local_s, **found})
                     print(
                         f"local {local_s:.2f} s, published {found['ready']:.2f} s;"
