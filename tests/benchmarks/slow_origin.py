@@ -30,12 +30,12 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -82,52 +82,38 @@ def at(along_m: float) -> tuple[float, float, float, float]:
     return x + along_m * hx, y + along_m * hy, hx, hy
 
 
-class Origin(Protocol):
-    """Where cells come from, slowly."""
+class Origin(NamedTuple):
+    """Where a daemon has its cells from, slowly; ``set_off`` counts the outages from a time on."""
 
     map_path: Path | str
-    options: Sequence[str]
-    environment: Mapping[str, str]
-
-    def set_off(self, now_s: float) -> None:
-        """Count the outages from now on."""
+    options: tuple[str, ...]
+    environment: dict[str, str]
+    set_off: Callable[[float], object]
 
 
-class Files:
+def files(root: Path, kind: str, args: argparse.Namespace) -> Origin:
     """Files, which loaders read slowly."""
-
-    def __init__(self, root: Path, kind: str, args: argparse.Namespace) -> None:
-        self.map_path, self.options = root, ("--workers", str(LOADERS))
-        self._begin = root.parent / f"{kind} begins"
-        plan = {
-            "mean_s": args.mean,
-            "throttle_bytes_s": args.throttle,
-            "outage_s": args.outage,
-            "every_s": args.every,
-            "begin": str(self._begin),
-        }
-        self.environment = {"SLOW_ORIGIN": json.dumps(plan), "PYTHONPATH": f"{SHIM}:{ROOT}"}
-
-    def set_off(self, now_s: float) -> None:
-        """Say when the first period begins."""
-        self._begin.write_text(str(now_s))
+    begin = root.parent / f"{kind} begins"
+    plan = {
+        "mean_s": args.mean,
+        "throttle_bytes_s": args.throttle,
+        "outage_s": args.outage,
+        "every_s": args.every,
+        "begin": str(begin),
+    }
+    environment = {"SLOW_ORIGIN": json.dumps(plan), "PYTHONPATH": f"{SHIM}:{ROOT}"}
+    return Origin(root, ("--workers", str(LOADERS)), environment, lambda now_s: begin.write_text(str(now_s)))
 
 
-class Bucket:
+def bucket(server: BucketServer, link: SlowLink, args: argparse.Namespace) -> Origin:
     """A map in a bucket behind a slow link."""
 
-    options = ("--workers", "1")
-
-    def __init__(self, server: BucketServer, link: SlowLink, args: argparse.Namespace) -> None:
-        self.map_path = server.url(BUCKET_MAP)
-        self.environment = {**server.environment, "AWS_ENDPOINT_URL": link.endpoint}
-        self._link, self._args = link, args
-
-    def set_off(self, now_s: float) -> None:
-        """Say when nothing passes."""
-        args = self._args
+    def set_off(now_s: float) -> None:
         begins = [now_s + args.every * number for number in range(1, 1 + int(args.seconds // args.every))]
-        self._link.go_out([(begin_s, begin_s + args.outage) for begin_s in begins])
+        link.go_out([(begin_s, begin_s + args.outage) for begin_s in begins])
+
+    environment = {**server.environment, "AWS_ENDPOINT_URL": link.endpoint}
+    return Origin(server.url(BUCKET_MAP), ("--workers", "1"), environment, set_off)
 
 
 @contextmanager
@@ -135,13 +121,13 @@ def origins(root: Path, args: argparse.Namespace) -> Iterator[Callable[[str], Or
     """Make the map; what is returned makes the origin of each drive."""
     make_many_cells(root, SIDE, distinct=args.bucket)
     if not args.bucket:
-        yield lambda kind: Files(root, kind, args)
+        yield lambda kind: files(root, kind, args)
         return
     with bucket_server(root.parent) as server:
         publish(root, server.url(BUCKET_MAP), environment=server.environment)
         port = int(server.endpoint.rpartition(":")[2])
         with slow_link(Plan(port, 8e-6 * args.throttle, 0.0, args.mean)) as link:
-            yield lambda _kind: Bucket(server, link, args)
+            yield lambda _kind: bucket(server, link, args)
 
 
 def vehicle(client: shmmap.Client, kind: str, origin: Origin, args: argparse.Namespace, run: Run) -> None:
