@@ -154,8 +154,9 @@ class Prefetch:
             return False
         if self._out_since_s == math.inf:
             return False
-        self._away_s = max(now_s - self._out_since_s, 0.5 * self._away_s)
-        self._out_since_s = math.inf
+        away_s, self._out_since_s = now_s - self._out_since_s, math.inf
+        if away_s > SLACK_S:  # one answer that was lost says nothing of how long outages are
+            self._away_s = max(away_s, 0.5 * self._away_s)
         return True
 
     def _begin_if_due(self, way: WayAhead, now_s: float) -> None:
