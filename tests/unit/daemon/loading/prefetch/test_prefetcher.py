@@ -18,7 +18,6 @@ from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, KEPT, MOST_WAYS
 from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
-from shmmap.segment.layout import SourceStamp
 from tests.support.daemon_process import stop
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.moving import says
@@ -100,7 +99,7 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     one.run_until(lambda: idle(one))
     prefetcher, now_s = one.scheduler.prefetcher, one.now_s()
     health = prefetcher.prefetch.health
-    load = Load(Key("a", "points"), 0, 0.0, 1, sources=(SourceStamp(1, 1, 1),))
+    load = Load(Key("a", "points"), 0, 0.0, 1, sources=(bytes(24),))
 
     def end(after_s: float, took_s: float, out: bool) -> tuple[bool, int]:
         prefetcher.ended.append((load, True, took_s, out))
