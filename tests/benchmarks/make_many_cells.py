@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
+import struct
 from pathlib import Path
 
 CELL_METRES = 20
@@ -32,8 +33,11 @@ DATA binary
 """
 
 
-def make_many_cells(out: Path, side: int, points: int = 1) -> None:
-    """Write ``side`` x ``side`` cells of so many points and their metadata into the new directory ``out``."""
+def make_many_cells(out: Path, side: int, points: int = 1, *, distinct: bool = False) -> None:
+    """Write ``side`` x ``side`` cells of so many points and their metadata into the new directory ``out``.
+
+    With ``distinct`` each file has bytes of its own: its points lie in its middle.
+    """
     cells = out / "pointcloud_map.pcd"
     cells.mkdir(parents=True)
     lines = [f"x_resolution: {CELL_METRES}\n", f"y_resolution: {CELL_METRES}\n"]
@@ -43,7 +47,10 @@ def make_many_cells(out: Path, side: int, points: int = 1) -> None:
         span = range(0, side * CELL_METRES, CELL_METRES)
         for number, (x, y) in enumerate(itertools.product(span, span)):
             name = f"city_{x}_{y}.pcd"
-            if number % _LINKS == 0:
+            if distinct:
+                middle = struct.pack("<4f", x + 0.5 * CELL_METRES, y + 0.5 * CELL_METRES, 0.0, number)
+                (cells / name).write_bytes(_PCD.format(points=points).encode() + points * middle)
+            elif number % _LINKS == 0:
                 (cells / name).write_bytes(_PCD.format(points=points).encode() + bytes(16 * points))
                 first = name
             else:

@@ -89,10 +89,10 @@ def town_drive(seed: int = 0, length_m: float = 8000.0, speed_mps: float = 12.0)
     return Drive("town", travelled / speed_mps, _beside(path, seed), _told(path))
 
 
-def city_drive(seed: int = 0, length_m: float = 10_000.0) -> Drive:
+def city_drive(seed: int = 0, length_m: float = 10_000.0, blocks: int = 20) -> Drive:
     """Through streets 160 m apart, by chance straight on, left or right, with some red lights."""
     random = np.random.Generator(np.random.PCG64([seed, 17]))
-    path = city_path(seed, length_m)
+    path = city_path(seed, length_m, blocks)
     red = [float(at) for at in np.arange(160.0, length_m, 160.0) if random.random() < 0.06]
     times = _times(path, red, random)
     # a stop is a time without a move: both ends of it are in the table
@@ -107,10 +107,10 @@ def square_drive(side_m: float = 2400.0, speed_mps: float = 12.0, length_s: floa
     return Drive("square", travelled_m(path) / speed_mps, _beside(path, 0), _told(path))
 
 
-def city_path(seed: int, length_m: float) -> Floats:
-    """Where such a drive goes: (N, 2) about a metre apart."""
+def city_path(seed: int, length_m: float, blocks: int = 20) -> Floats:
+    """Where such a drive goes: (N, 2) about a metre apart; the city has so many blocks along each side."""
     random = np.random.Generator(np.random.PCG64([seed, 18]))
-    crossings = _walk(random, 20, math.ceil(length_m / 160.0) + 2)
+    crossings = _walk(random, blocks, math.ceil(length_m / 160.0) + 2)
     # streets lie across the cells as it happens
     path = rounded(np.array(crossings, dtype=np.float64) * 160.0 + (7.3, 11.9), 12.0)
     return path[travelled_m(path) <= length_m]

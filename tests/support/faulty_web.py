@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A web server on loopback that serves a directory, and fails as a test wants it: for published maps.
 
-It answers conditional and range requests, keeps connections open, and writes down what was asked.
+What it serves may also be made as it is asked for.  It answers conditional and range requests, keeps
+connections open, and writes down what was asked.
 """
 
 from __future__ import annotations
 
 import hashlib
 import http.server
+import os
 import re
 import socket
 import threading
@@ -16,8 +18,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["Fault", "FaultyWeb", "faulty_web"]
+__all__ = ["Fault", "FaultyWeb", "Read", "faulty_web"]
 
+Read = Callable[[str], bytes]
+"""Returns what lies at a path; OSError: nothing."""
 Fault = Callable[[str], str]
 """What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
 ``truncate``, ``corrupt``, a status such as ``503``, or one with Amazon's code such as ``403 ExpiredToken``;
@@ -30,6 +34,7 @@ def _no_fault(_path: str) -> str:
 
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128
     web: FaultyWeb
 
     def get_request(self) -> tuple[socket.socket, object]:
@@ -43,6 +48,7 @@ class _Server(http.server.ThreadingHTTPServer):
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
     server: _Server
 
     def log_message(self, *arguments: object) -> None:
@@ -66,7 +72,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._answer(int(status), f"<Error><Code>{code}</Code></Error>".encode() if code else b"")
             return
         try:
-            data = (web.folder / path).read_bytes()
+            data = web.read(path)
         except OSError:
             self._answer(404, b"")
             return
@@ -109,8 +115,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 class FaultyWeb:
     """A running server; `fault` says what becomes of each request."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, source: Path | Read) -> None:
+        self.folder = source if isinstance(source, Path) else Path(os.devnull)
+        self.read: Read = self._read_file if isinstance(source, Path) else source
         self.fault: Fault = _no_fault
         self.clock_ahead_s = 0.0
         self.connections: set[socket.socket] = set()
@@ -120,6 +127,9 @@ class FaultyWeb:
         self._server: _Server | None = None
         self._thread: threading.Thread | None = None
         self.listen()
+
+    def _read_file(self, path: str) -> bytes:
+        return (self.folder / path).read_bytes()
 
     @property
     def url(self) -> str:
@@ -168,9 +178,9 @@ class FaultyWeb:
 
 
 @contextmanager
-def faulty_web(folder: Path) -> Iterator[FaultyWeb]:
-    """Run a server until the end of the block."""
-    web = FaultyWeb(folder)
+def faulty_web(source: Path | Read) -> Iterator[FaultyWeb]:
+    """Run a server of a directory, or of what is read otherwise, until the end of the block."""
+    web = FaultyWeb(source)
     try:
         yield web
     finally:

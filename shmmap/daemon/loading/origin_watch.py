@@ -47,7 +47,7 @@ class OriginWatch:
         health = self.scheduler.prefetcher.prefetch.health
         health.unreachable = self.link.is_out
         if news.back:
-            health.failed_in_a_row = 0
+            health.failed_in_a_row, health.waited_s = 0, 0.0
             self.scheduler.loads.forget_failures()
             self.scheduler.prefetcher.restart()
             self.try_again()

@@ -125,9 +125,9 @@ class KeepingAhead:
         statistics.set("loadable_per_1000s", int(1e3 * loaders / health.mean_s) if health.mean_s else 0)
         statistics.set("origin_out", int(health.is_out))
         if health.is_out and self._out_since_s is None:
-            self._out_since_s = now_s
+            self._out_since_s = now_s - health.waited_s
             statistics.add("origin_outages")
-            statistics.set("origin_out_since_unix_ns", time.time_ns())
+            statistics.set("origin_out_since_unix_ns", time.time_ns() - int(health.waited_s * 1e9))
         if self._out_since_s is not None:
             statistics.set("last_outage_ns", int((now_s - self._out_since_s) * 1e9))
             if not health.is_out:

@@ -627,7 +627,7 @@ def test_the_signature_of_a_published_map(
 ) -> None:
     """Times are given as seconds before now."""
     counters = {name: seconds(value) if name != REFUSAL else value for name, value in counters.items()}
-    found = signed_map.check_signature(ward.patient(told(**counters)))
+    found = signed_map.check_signature(ward.patient(told("healthy", version="", **counters)))
     assert (found.state, says in found.fact) == (state, True)
     assert found.skipped == (not counters)
     assert bool(found.advice) == (state != "ok")

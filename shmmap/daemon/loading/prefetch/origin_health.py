@@ -26,6 +26,8 @@ class OriginHealth:
     ----------
     failed_in_a_row
         Loads that failed since the last one that succeeded.
+    waited_s
+        The longest time that one of these took: for so long, about, nothing has answered.
     unreachable
         It is known otherwise that it does not answer.
     slow_s, mean_s
@@ -33,6 +35,7 @@ class OriginHealth:
     """
 
     failed_in_a_row: int = 0
+    waited_s: float = 0.0
     unreachable: bool = False
     slow_s: float = 0.0
     mean_s: float = 0.0
@@ -59,8 +62,9 @@ class OriginHealth:
         """A load ended; whether that tells that loads succeed again, after they did not."""
         if failed:
             self.failed_in_a_row += 1
+            self.waited_s = max(self.waited_s, took_s)
             return False
-        again, self.failed_in_a_row = self.is_out, 0
+        again, self.failed_in_a_row, self.waited_s = self.is_out, 0, 0.0
         self._took_s.append(took_s)
         ordered = sorted(self._took_s)
         self.slow_s = ordered[(len(ordered) * 19) // 20]

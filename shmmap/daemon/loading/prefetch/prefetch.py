@@ -149,12 +149,14 @@ class Prefetch:
     def _is_back(self, now_s: float) -> bool:
         """Whether loads succeed again; and for how long they did not."""
         if self.health.is_out:
-            self._out_since_s = min(self._out_since_s, now_s)
+            # a server that says nothing is found out late: it was away when the loads were begun that fail
+            self._out_since_s = min(self._out_since_s, now_s - self.health.waited_s)
             return False
         if self._out_since_s == math.inf:
             return False
-        self._away_s = max(now_s - self._out_since_s, 0.5 * self._away_s)
-        self._out_since_s = math.inf
+        away_s, self._out_since_s = now_s - self._out_since_s, math.inf
+        if away_s > SLACK_S:  # one answer that was lost says nothing of how long outages are
+            self._away_s = max(away_s, 0.5 * self._away_s)
         return True
 
     def _begin_if_due(self, way: WayAhead, now_s: float) -> None:

@@ -70,7 +70,7 @@ class Prefetcher:
         self.prefetch = Prefetch(self._is_absent, ride_out_s)
         self._now_s = 0.0
         self._next_s = -math.inf
-        self._full_until_s = self._followed_s = -math.inf
+        self._full_until_s = self._followed_s = self._answered_s = -math.inf
         self._running: dict[Load, int] = {}
         self._no_room = False
 
@@ -195,10 +195,15 @@ class Prefetcher:
     def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
         """A load has ended: what that tells of where it comes from.
 
-        A file that is broken was read all the same.
+        A file that is broken was read all the same.  One that was begun before another load succeeded tells
+        of an outage that is over.
         """
         self._running.pop(load, None)
-        if ran and load.sources and self.prefetch.health.ended(took_s, failed=out):
+        if not ran or not load.sources or (out and self._now_s - took_s < self._answered_s):
+            return
+        if not out:
+            self._answered_s = self._now_s
+        if self.prefetch.health.ended(took_s, failed=out):
             self._loads.forget_failures()
 
     def lacks_room(self, now_s: float) -> bool:

@@ -25,8 +25,8 @@ from tests.support.patience import Patience
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.daemon.map.published_view import PublishedView
-from shmmap.daemon.map.shard_fetcher import ShardFetcher
-from shmmap.daemon.map.shard_pages import ShardPages
+from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
+from shmmap.daemon.map.shard_pages import BACKGROUND_AT_ONCE, ShardPages
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.published_index import (
     Root,
@@ -36,6 +36,7 @@ from shmmap.origin.remote.published_index import (
     published_layer_version,
     unpack_root,
 )
+from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.published_source import stamp_of, unpack_source
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
@@ -313,6 +314,27 @@ def test_the_rest_comes_in_the_background_while_it_fits(served: Served) -> None:
         spared += 1
     assert spared
     assert view.query(Circle(-1200, -1200, 500))[1]
+
+
+def test_what_an_area_needs_comes_before_the_background(served: Served) -> None:
+    root = publish(served.store, some_cells(np.random.default_rng(5), 3000, width=3000.0))
+    served.store.open.clear()
+    view = served.view(root)
+    view.pages.collect()
+    begun = Patience()
+    while begun(len(served.store.asked) < BACKGROUND_AT_ONCE):
+        time.sleep(0.001)
+    needed = view.pages.of_area(Circle(-1200, -1200, 300))
+    assert len(needed) > THREADS
+    view.pages.want(needed, 0.0)
+    served.store.open.set()
+    while not all(map(view.pages.is_here, needed)):
+        collect(view.pages)
+    paths = {blob_path(root.shard_sha256(number)) for number in needed}
+    asked = list(served.store.asked)
+    last = max(map(asked.index, paths))
+    assert len(asked[: last + 1]) - len(paths) == BACKGROUND_AT_ONCE
+    assert BACKGROUND_AT_ONCE < THREADS / 2
 
 
 def test_few_shards_are_kept_whatever_they_take(served: Served) -> None:

@@ -167,8 +167,9 @@ def test_times_without_the_origin(one: InnerDaemon) -> None:
     health.ended(0.1, failed=False)
     assert look(106.0) == (0, 1, 5_000_000_000)
     assert look(200.0) == (0, 1, 5_000_000_000)
-    health.failed_in_a_row = IN_A_ROW
-    assert look(300.0) == (1, 2, 0)
+    for _ in range(IN_A_ROW):
+        health.ended(3.0, failed=True)
+    assert look(300.0) == (1, 2, 3_000_000_000), "it was away when what has failed was begun"
 
 
 def test_a_beat_looks_at_a_few_steps_only(one: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:

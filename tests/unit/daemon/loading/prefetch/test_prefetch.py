@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW, PROBE_S
-from shmmap.daemon.loading.prefetch.prefetch import COMPARED_AT_ONCE, LOOKS_AT_ONCE, Prefetch, Wish
+from shmmap.daemon.loading.prefetch.prefetch import COMPARED_AT_ONCE, LOOKS_AT_ONCE, SLACK_S, Prefetch, Wish
 from shmmap.daemon.loading.prefetch.way_ahead import PASS_S, WayAhead
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
@@ -180,9 +180,9 @@ def test_a_long_pass_begins_again_too() -> None:
     assert [wish.cell for wish in daemon.wishes(1.0 + PASS_S, 1)] == [first.cell]
 
 
-def failing(daemon: Daemon) -> None:
+def failing(daemon: Daemon, took_s: float = 0.0) -> None:
     for _ in range(IN_A_ROW):
-        daemon.prefetch.health.ended(0.1, failed=True)
+        daemon.prefetch.health.ended(took_s, failed=True)
 
 
 def test_in_an_outage_one_try_now_and_then() -> None:
@@ -220,12 +220,30 @@ def test_without_a_route_outages_are_prepared_for_after_the_first() -> None:
     after = daemon.prefetch.look_ahead
     assert after.straight_s == pytest.approx(after.sides_s + 8.5)
     assert after.sides_s == pytest.approx(before.sides_s, abs=0.5)
-    for begin_s in (100.0, 200.0, 300.0, 400.0, 500.0):  # short ones: the long one is forgotten
-        failing(daemon)
-        daemon.next(begin_s)
-        daemon.prefetch.health.ended(0.1, failed=False)
-        daemon.next(begin_s + 0.1)
-    assert daemon.prefetch.look_ahead.straight_s == pytest.approx(after.sides_s, abs=0.6)
+    for away_s, expected_s in ((0.5 * SLACK_S, 8.5), (SLACK_S + 0.1, SLACK_S + 0.1)):
+        for begin_s in (100.0, 200.0, 300.0, 400.0, 500.0):
+            failing(daemon)
+            daemon.next(begin_s)
+            daemon.prefetch.health.ended(0.1, failed=False)
+            daemon.next(begin_s + away_s)
+        straight_s = daemon.prefetch.look_ahead.straight_s
+        assert straight_s == pytest.approx(after.sides_s + expected_s, abs=0.6), "only longer ones count"
+
+
+def test_an_outage_begins_with_the_loads_that_fail_not_when_they_have() -> None:
+    """A server that says nothing is found out after seconds: the next outage is as long for all that."""
+    daemon = Daemon()
+    daemon.client("a", route=False)
+    before = daemon.prefetch.look_ahead
+    failing(daemon, took_s=4.0)  # begun at 10 s
+    daemon.next(14.0)
+    failing(daemon, took_s=0.1)
+    daemon.next(18.0)
+    daemon.prefetch.health.ended(0.1, failed=False)
+    daemon.next(19.0)
+    after = daemon.prefetch.look_ahead
+    assert after.straight_s == pytest.approx(after.sides_s + 9.0)
+    assert after.sides_s == pytest.approx(before.sides_s, abs=0.5)
 
 
 def test_slow_loads_are_wished_for_earlier() -> None:

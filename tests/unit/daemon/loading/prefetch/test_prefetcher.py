@@ -12,8 +12,10 @@ import pytest
 
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import PREFETCH
+from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
 from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
 from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, KEPT, MOST_WAYS
+from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
 from tests.support.daemon_process import stop
@@ -86,6 +88,34 @@ def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[...
     assert len(seen) > 5
     assert one.ledger.prefetched_bytes == sum(r.nbytes for r in one.ledger.residents() if r.prefetched)
     assert count(one, "bytes_used") < count(one, "bytes_loaded")
+
+
+def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
+    prefetching: Callable[..., InnerDaemon],
+) -> None:
+    """They fail seconds after others have succeeded, where the origin says nothing."""
+    one = prefetching()
+    Drive(one)
+    one.run_until(lambda: idle(one))
+    prefetcher, now_s = one.scheduler.prefetcher, one.now_s()
+    health = prefetcher.prefetch.health
+    load = Load(Key("a", "points"), 0, 0.0, 1, sources=(bytes(24),))
+
+    def end(after_s: float, took_s: float, out: bool) -> tuple[bool, int]:
+        prefetcher.ended.append((load, True, took_s, out))
+        prefetcher.turn(now_s + after_s)
+        return health.is_out, health.failed_in_a_row
+
+    for number in range(IN_A_ROW):
+        found = end(10.0 + 0.01 * number, 4.0, True)
+    assert found == (True, IN_A_ROW)
+    assert end(20.0, 0.5, False) == (False, 0)
+    for _ in range(2 * IN_A_ROW):
+        found = end(21.0, 4.0, True)
+    assert found == (False, 0), "they were begun at 17 s"
+    for _ in range(IN_A_ROW):
+        found = end(26.0, 4.0, True)
+    assert found == (True, IN_A_ROW)
 
 
 def test_layers_are_fetched_as_the_client_asks_for_them(prefetching: Callable[..., InnerDaemon]) -> None:

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An hour of driving over a published map of a million cells, over a mobile link that fails now and then.
+
+    python -m tests.benchmarks.vehicle_day [--minutes 20] [--at-once] [--picture DAY.png]
+
+The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects are made when they are asked
+for (`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, 15 m/s at
+most) and asks for a circle of 200 m every 20 m.  Two daemons: one is told the vehicle's places alone, one its
+route, too (the next kilometres of it).  Each has 2 GiB of memory for cells and 8 GiB of disk, empty at the
+start, and bridges outages of 20 s (`--ride-out`).  The link: an answer takes a log-normal time (mean 0.2 s,
+sigma 0.8), all share 100 Mbit/s, and by chance, every four minutes on average, nothing passes for 2 to 20 s.
+
+The hour is driven in ``--minutes``: the vehicle is 60 / minutes times as fast, the link as much wider, and
+outages as much more frequent.  How long answers and outages take is not shortened, nor is anything in the
+daemon: an outage covers more of the way than in a real hour.  ``--minutes 60`` is a real hour.
+
+misses          queries that lacked a cell, or did not know all cells; the first 30 s do not count
+longest wait    from when a cell was first needed until it was there
+MB/km           bytes over the link, index and retries included, for each kilometre
+over-fetch      bytes loaded for each one that was asked for
+disk hits       loads whose object was on the disk, of all loads
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+import shmmap
+from shmmap.statistics.reader import read_statistics
+from tests.benchmarks.hostile.stage import lift
+from tests.benchmarks.slow_origin_drives import Drive, city_drive, travelled_m
+from tests.support.daemon_process import DaemonProcess
+from tests.support.made_map import serve_made_map
+from tests.support.slow_link import Plan, slow_link
+
+CELLS: Final = 1_000_000
+POINTS: Final = 40_000
+RADIUS_M: Final = 200.0
+STEP_M: Final = 20.0
+LEAVE_OUT_S: Final = 30.0
+RIDE_OUT_S: Final = 20.0
+HOUR_S: Final = 3600.0
+BLOCKS: Final = 120
+STRETCH_M: Final = 1000.0
+TOLD_M: Final = 5000.0
+"""So much of the route, and more, is told; another stretch of it every kilometre."""
+VERTEX_M: Final = 15.0
+KINDS: Final = ("places", "route")
+
+
+class Sample(NamedTuple):
+    """The state at one query: seconds since the start, bytes over the link, bytes of memory."""
+
+    asked_s: float
+    received_bytes: int
+    resident_bytes: int
+
+
+@dataclass
+class Query:
+    """One time that the vehicle asks: where, what lacked, and how long until it was there."""
+
+    asked_s: float
+    x: float
+    y: float
+    late: int
+    wait_s: float = 0.0
+
+
+@dataclass
+class Day:
+    """What came of one drive.
+
+    Attributes
+    ----------
+    outages
+        From when to when, seconds since the start.
+    counters
+        The daemon's, at the end.
+    cells_sent
+        Objects of cells that the server has sent whole.
+    """
+
+    kind: str
+    outages: Sequence[tuple[float, float]]
+    way_km: float = 0.0
+    queries: list[Query] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+    counters: dict[str, int] = field(default_factory=dict)
+    cells_sent: int = 0
+    disk_bytes: int = 0
+    peak_bytes: int = 0
+
+    @cached_property
+    def counted(self) -> list[Query]:
+        """Queries that count."""
+        return [query for query in self.queries if query.asked_s >= LEAVE_OUT_S]
+
+    @property
+    def misses(self) -> int:
+        """Queries that lacked something."""
+        return sum(query.late > 0 for query in self.counted)
+
+    @property
+    def longest_wait_s(self) -> float:
+        """The longest that a cell was waited for."""
+        return max((query.wait_s for query in self.counted), default=0.0)
+
+    @property
+    def mb_per_km(self) -> float:
+        """Megabytes over the link for each kilometre."""
+        first, last = self.samples[0], self.samples[-1]
+        return (last.received_bytes - first.received_bytes) / 1e6 / self.way_km
+
+    @property
+    def over_fetch(self) -> float:
+        """Bytes loaded for each one that was asked for."""
+        return self.counters["bytes_loaded"] / max(1, self.counters["bytes_used"])
+
+    @property
+    def disk_hits(self) -> float:
+        """Share of loads whose object was on the disk."""
+        loads = self.counters["loads_finished"]
+        return max(0.0, 1.0 - self.cells_sent / loads) if loads else 0.0
+
+
+def outages(seed: int, factor: float, length_s: float) -> list[tuple[float, float]]:
+    """When the link is out in a drive of this length: every four minutes of the real hour on average."""
+    rng = np.random.default_rng([seed, 7])
+    found: list[tuple[float, float]] = []
+    at_s = LEAVE_OUT_S
+    while (at_s := at_s + float(rng.exponential(240.0 / factor))) < length_s:
+        out_s = float(np.exp(rng.uniform(np.log(2.0), np.log(RIDE_OUT_S))))
+        found.append((at_s, at_s + out_s))
+        at_s += out_s
+    return found
+
+
+class Told:
+    """What the vehicle tells of its route: a stretch of it, another one every kilometre."""
+
+    def __init__(self, drive: Drive) -> None:
+        self._route, self._along = drive.route, travelled_m(drive.route)
+
+    def at(self, along_m: float) -> tuple[tuple[float, float], ...]:
+        """Return the stretch that is told so far along the way."""
+        begin_m = max(0.0, along_m // STRETCH_M * STRETCH_M - STEP_M)
+        marks = np.arange(begin_m, min(begin_m + STRETCH_M + TOLD_M, self._along[-1]), VERTEX_M)
+        x, y = (np.interp(marks, self._along, column).tolist() for column in self._route.T)
+        return tuple(zip(x, y, strict=True))
+
+
+class Vehicle:
+    """Drives, asks, and waits for what it lacks until it asks again."""
+
+    def __init__(self, client: shmmap.Client, day: Day, told: Told | None) -> None:
+        self._client, self._day, self._told = client, day, told
+        self._lacking: dict[str, tuple[float, Query]] = {}
+
+    def ask(self, x: float, y: float, along_m: float, begin_s: float, until_s: float) -> None:
+        """Ask for what is around; where something lacks, wait for it until a time."""
+        route = self._told.at(along_m) if self._told is not None else ()
+        intent = shmmap.Intent(x, y, route=route)
+        area = shmmap.Circle(x, y, RADIUS_M)
+        asked_s = time.monotonic()
+        answer = self._client.area(area, wait=0, intent=intent, strict=None)
+        query = Query(asked_s - begin_s, x, y, self._missing(answer))
+        self._day.queries.append(query)
+        self._note(answer, query, asked_s)
+        while self._lacking and (left_s := until_s - time.monotonic()) > 0:
+            again_s = time.monotonic()
+            answer = self._client.area(area, wait=left_s, strict=None)
+            self._note(answer, query, asked_s)
+            if answer.failed or not answer.covered:  # out of reach: the answer comes at once
+                time.sleep(max(0.0, min(until_s, again_s + 0.1) - time.monotonic()))
+        self._client.release()
+
+    @staticmethod
+    def _missing(answer: shmmap.CellSet) -> int:
+        return len(answer.pending) + len(answer.failed) + (not answer.covered)
+
+    def _note(self, answer: shmmap.CellSet, query: Query, asked_s: float) -> None:
+        """Keep who lacks what since when; what has come, or is needed no more, has waited till now."""
+        now_s = time.monotonic()
+        missing = {each.id for each in answer.pending} | {each.cell_id for each in answer.failed}
+        if not answer.covered:
+            missing.add("cells that are not known")
+        for cell in list(self._lacking):
+            since_s, first = self._lacking[cell]
+            first.wait_s = max(first.wait_s, now_s - since_s)
+            if cell not in missing:
+                del self._lacking[cell]
+        for cell in missing:
+            self._lacking.setdefault(cell, (asked_s, query))
+
+
+def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> Day:
+    """One daemon, its link and its vehicle."""
+    factor, end_s = 60.0 / args.minutes, HOUR_S * args.hours
+    day = Day(kind, outages(args.seed, factor, end_s / factor))
+    with ExitStack() as stack:
+        served = stack.enter_context(serve_made_map(CELLS, POINTS))
+        plan = Plan(served.port, args.mbit * factor, 0.0, args.mean, args.seed)
+        link = stack.enter_context(slow_link(plan))
+        options = ["--budget", "2G", "--cache-size", "8G", "--ride-out", str(RIDE_OUT_S)]
+        cache = folder / kind
+        one = DaemonProcess(link.endpoint, *options, "--workers", "2", "--cache-dir", str(cache))
+        stack.enter_context(one)
+        client = stack.enter_context(shmmap.connect(one.endpoint))
+        vehicle = Vehicle(client, day, Told(way) if kind == "route" else None)
+        times = way.times_each(STEP_M)
+        times = times[times < end_s]
+        day.way_km = len(times) * STEP_M / 1e3
+        client.area(shmmap.Circle(*way.at(0.0), RADIUS_M), wait=300.0)
+        client.release()
+        if args.lift:
+            for pid in (one.pid, *one.loaders()):
+                lift(pid)
+        begin_s = time.monotonic()
+        link.go_out([(begin_s + from_s, begin_s + to_s) for from_s, to_s in day.outages])
+        due = (begin_s + np.append(times, end_s) / factor).tolist()
+        for number, real_s in enumerate(times.tolist()):
+            time.sleep(max(0.0, due[number] - time.monotonic()))
+            vehicle.ask(*way.at(real_s), number * STEP_M, begin_s, due[number + 1])
+            counters = read_statistics(one.instance, one.shm_dir).counters
+            now_s = time.monotonic() - begin_s
+            day.samples.append(Sample(now_s, link.received_bytes(), counters["bytes_resident"]))
+            day.peak_bytes = max(day.peak_bytes, counters["bytes_resident"] + counters["bytes_zombie"])
+        day.counters = dict(read_statistics(one.instance, one.shm_dir).counters)
+        day.cells_sent = served.cells_sent()
+        day.disk_bytes = sum(path.stat().st_blocks * 512 for path in cache.rglob("*") if path.is_file())
+    assert not one.leftovers()
+    return day
+
+
+def row(day: Day) -> str:
+    """Return a row of the table."""
+    out_s = sum(end - begin for begin, end in day.outages)
+    return (
+        f"{day.kind:7} {len(day.counted):5} queries, {day.misses} misses"
+        f" ({100 - 100 * day.misses / max(1, len(day.counted)):.2f} % warm),"
+        f" {day.counters['cells_late']} cells late, longest wait {day.longest_wait_s:.1f} s;"
+        f" {day.mb_per_km:.0f} MB/km, over-fetch {day.over_fetch:.2f}, disk hits {100 * day.disk_hits:.1f} %;"
+        f" memory {day.peak_bytes / 2**30:.2f} GiB, disk {day.disk_bytes / 2**30:.2f} GiB;"
+        f" {len(day.outages)} outages, {out_s:.0f} s"
+    )
+
+
+def main() -> None:
+    """Drive with and without a route, and print what came of it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=20.0, help="that an hour takes (default: 20)")
+    parser.add_argument("--hours", type=float, default=1.0, help="of driving, 1 at most (default: 1)")
+    parser.add_argument("--mean", type=float, default=0.2, help="seconds that an answer takes (default: 0.2)")
+    parser.add_argument(
+        "--mbit", type=float, default=100.0, help="of the link, Mbit/s; 0: any (default: 100)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the way, the link and its outages")
+    parser.add_argument("--only", choices=KINDS, help="one of the two")
+    parser.add_argument("--at-once", action="store_true", help="both drives at the same time")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the drives")
+    parser.add_argument(
+        "--scratch", type=Path, help="directory for the disk tiers (default: a temporary one)"
+    )
+    parser.add_argument(
+        "--lift", action="store_true", help="let all of this go before unrelated work (needs root)"
+    )
+    args = parser.parse_args()
+    if args.lift:
+        lift(os.getpid())
+    if not 10.0 <= args.minutes <= 60.0:
+        parser.error(
+            "--minutes: 10 to 60; in less, the vehicle would be faster than the daemon takes one to be"
+        )
+    if not 0.0 < args.hours <= 1.0:
+        parser.error("--hours: the way takes one hour")
+    way = city_drive(args.seed, 45_000.0, BLOCKS)
+    kinds = [args.only] if args.only else list(KINDS)
+    print(f"load {os.getloadavg()[0]:.1f}; an hour takes {args.minutes:g} minutes", flush=True)
+    at_once = len(kinds) if args.at_once else 1
+    with tempfile.TemporaryDirectory(dir=args.scratch) as folder, ThreadPoolExecutor(at_once) as pool:
+        days = list(pool.map(lambda kind: drive_day(way, kind, args, Path(folder)), kinds))
+    for day in days:
+        print(row(day))
+    print(f"load {os.getloadavg()[0]:.1f}")
+    if args.picture is not None:
+        from tests.benchmarks.vehicle_day_picture import day_picture
+
+        day_picture(days, 60.0 / args.minutes).save(args.picture)
+
+
+if __name__ == "__main__":
+    main()
