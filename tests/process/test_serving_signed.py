@@ -414,7 +414,7 @@ def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
     one.stop()
     # neither under another root of trust, nor what was taken without one
     one.arguments = list(trusting(made_once / "others"))
-    assert one.run_to_end() == 75
+    assert one.run_to_end() == 71
     assert "no answer" in one.log
     web.listen()
     assert one.run_to_end() == 65
@@ -425,7 +425,7 @@ def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
     two.stop()
     web.refuse()
     two.arguments = list(trusting(keys))
-    assert two.run_to_end() == 75
+    assert two.run_to_end() == 71
     web.listen()
     two.start()
     assert versions_of(two) == served

@@ -18,7 +18,15 @@ from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.map.published_view import PublishedView
 from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
 from shmmap.daemon.map.shard_pages import FEW_SHARDS, ShardPages
-from shmmap.errors import CannotWrite, ConfigError, MapDataError, MapMissing, Offline, ShmmapError
+from shmmap.errors import (
+    CannotStart,
+    CannotWrite,
+    ConfigError,
+    MapDataError,
+    MapMissing,
+    Offline,
+    ShmmapError,
+)
 from shmmap.logfmt import log
 from shmmap.origin.remote.map_versions import (
     CURRENT,
@@ -165,6 +173,8 @@ class PublishedOrigin:
             under the root of trust, see `verify_apart`, whose other errors come, too.
         Offline
             It is out of reach.
+        CannotStart
+            So it is at the start, and nothing was taken before.
         """
         view = before if isinstance(before, PublishedView) else None
         self._is_loading = True
@@ -177,6 +187,11 @@ class PublishedOrigin:
                         self._problem = None  # the next poll says it
                 return self._restored(*taken)
             return self._offered(view)
+        except Offline as error:
+            if fresh:
+                raise
+            # of this the service manager knows that it may get better
+            raise CannotStart(error.message, hint=error.hint) from None
         finally:
             self._is_loading = False
 
