@@ -45,7 +45,9 @@ inside() { # run a command on the machine as root, with processes and mounts of 
   unshare --mount --pid --ipc --fork --kill-child bash -euc '
     mount -t proc proc "$1/proc"
     mount -t tmpfs -o mode=1777 tmpfs "$1/tmp"
-    mkdir -p "$1/dev/shm"
+    mkdir -p "$1/dev/shm" "$1/dev/pts"
+    mount -t devpts -o newinstance,ptmxmode=0666 devpts "$1/dev/pts"
+    ln -sfn pts/ptmx "$1/dev/ptmx"
     mount -t tmpfs -o mode=1777,size=2g tmpfs "$1/dev/shm"
     root=$1; shift
     exec chroot "$root" "$@"

@@ -26,6 +26,7 @@ from tests.support.divided_map import make_map
 from tests.support.doctor_verb import doctor
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
+from tests.support.preloaded import built_preload
 from tests.support.publishing import publish
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -209,9 +210,7 @@ def test_no_other_address_is_asked(
     """Nor the cloud's metadata address, also where there are no credentials."""
     made = make_map(tmp_path / "files", columns=2, rows=2, points=300)
     publish(made.root, buckets.url("examined"))
-    shim, seen = tmp_path / "connects.so", tmp_path / "connects"
-    source = ROOT / "tests/support/connects.c"
-    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(shim), str(source), "-ldl"], check=True)
+    shim, seen = built_preload("connects", tmp_path), tmp_path / "connects"
     file = tmp_path / "shmmap.toml"
     file.write_text(f'map_path = "{buckets.url("examined")}"\n')
     one = daemon("", start=False)

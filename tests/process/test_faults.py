@@ -214,7 +214,8 @@ def test_a_header_that_promises_the_moon_costs_no_memory(
     ):
         (divided_map.pcd_dir / name).write_bytes(header + tail)
         reply = client.selected([name])
-        assert [f.code for f in reply.failed] == ["load_failed"]
+        (failure,) = reply.failed
+        assert failure.code in ("load_failed", "over_budget"), "the latter with little shared memory"
     assert one.loaders() == [loader]
     assert peak_bytes(loader) - idle < 100 << 20
 

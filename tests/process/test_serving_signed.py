@@ -25,6 +25,7 @@ from tests.support.divided_map import make_map
 from tests.support.doctor_verb import doctor
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
+from tests.support.preloaded import built_preload
 from tests.support.publishing_verbs import Shmmap as Verbs
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -454,12 +455,7 @@ def test_another_root_of_trust_while_it_runs(
 
 @pytest.fixture(scope="session")
 def _shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if shutil.which("gcc") is None:
-        pytest.skip("gcc is not installed")
-    built = tmp_path_factory.mktemp("clock") / "clock.so"
-    source = ROOT / "tests/support/clock.c"
-    subprocess.run(["gcc", "-shared", "-fPIC", "-o", str(built), str(source), "-ldl"], check=True)
-    return built
+    return built_preload("clock", tmp_path_factory.mktemp("clock"))
 
 
 @pytest.fixture

@@ -29,6 +29,7 @@ from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from tests.support.cpp_client import CppClient
 from tests.support.divided_map import DividedMap
+from tests.support.open3d_package import open3d_or_skip
 from tests.unit.daemon.paging_view import MemoryPages, PagedOrigin, PagedView
 from tests.unit.daemon.whole_daemon import WholeDaemon
 
@@ -376,6 +377,8 @@ def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
     whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, layer: str
 ) -> None:
     """Pages come in any order while it waits, some cannot be had, and the map may change meanwhile."""
+    if layer == HALO:
+        open3d_or_skip()
     chance = random.Random(7)
     corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
     strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
@@ -646,6 +649,7 @@ def test_a_list_that_cannot_be_had_is_an_error(
 
 
 def test_a_layer_that_looks_around_waits_for_the_pages_of_what_it_looks_into(paged: Paged) -> None:
+    open3d_or_skip()
     beside = m.BoxMessage(-15.0, -35.0, -5.0, -25.0)  # one cell, on the border of the unknown page
     reply = paged.ask(lambda n: m.Area(n, m.BoxMessage(-35.0, -35.0, -25.0, -25.0), (HALO,), wait=LONG_S))
     assert (names(reply.cells), reply.covered) == (["-40_-40.pcd"], True)
@@ -664,6 +668,7 @@ def test_a_layer_that_looks_around_waits_for_the_pages_of_what_it_looks_into(pag
 
 
 def test_a_layer_that_looks_into_what_is_out_of_reach_is_offline(paged: Paged) -> None:
+    open3d_or_skip()
     paged.pages.fail(EAST)
     paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
     reply = paged.ask(lambda n: m.Selected(n, ("-20_-40.pcd",), (HALO,), wait=LONG_S))
