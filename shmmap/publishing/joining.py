@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joining a run: what its slices have made becomes the current version, at once.
+"""Joining a run: the parts of its slices become the current version, in one step.
 
-Slices never switch a version; this alone does.  Killed at any moment, the version that was current is whole;
-run again, it finishes.
+Only a join switches the version, slices never do.  A join that is killed at any moment leaves the current
+version whole; run again, it finishes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Joined", "join_slices", "numbers_text"]
 
-_OLD_S: Final = 6 * 86_400.0  # pruning may remove what no version names after seven days
+_OLD_S: Final = 6 * 86_400.0  # pruning may remove an object that no version names after seven days
 _READ_AT_ONCE: Final = 16
 
 
@@ -70,7 +70,7 @@ class Joined:
     cells, layers
         Of that version.
     objects
-        How many were looked for.
+        How many were checked.
     """
 
     run: RunName
@@ -86,24 +86,24 @@ class Joined:
 def join_slices(
     store: Store, run: str, *, progress: PrepareProgress, signer: MapSigner | None = None
 ) -> Joined:
-    """Make a version of what all slices of a run have made, and make it current.
+    """Make a version of the parts of all slices of a run, and make it current.
 
     Parameters
     ----------
     run
-        Its name, as `prepare_slice` gives it.
+        Its name, as `prepare_slice` returns it.
     signer
         Signs the version; needed for a map that is signed.
 
     Raises
     ------
     BadRequest
-        It is no name of a run; the run is of another version than the current one; the store is read-only,
-        or the map is signed and there is no signer.
+        The name is not one of a run; the run was made from another version than the current one; the store is
+        read-only; or the map is signed and there is no signer.
     MapMissing
-        Nothing is published there, or some slices are not made, which are named.
+        Nothing is published there, or slices are missing; the message names them.
     MapDataError
-        A part or what it names is damaged, gone, or of another builder than other parts.
+        A part or an object that it names is damaged or gone, or the parts are of different builders.
     InstanceBusy
         Another publisher was quicker: its version is current.
     CannotWrite, Offline
@@ -156,7 +156,7 @@ class _Join:
         step("join.root")
         send_object(self._store, blob_path(digest), frame)
         step("join.entry")
-        # from here on pruning spares its objects; what had been removed before is found to be absent
+        # from here on pruning spares its objects; objects removed before are found absent below
         entry = new_entry(self._store, digest.hex(), len(frame), self._base.current)
         objects = self._look_for_objects(root, layers)
         step("join.looked")
@@ -226,7 +226,7 @@ class _Join:
             raise changed_meanwhile(self._store)
 
     def _are_joined(self, parts: Mapping[int, Part]) -> bool:
-        """Whether the current version has all that these parts say: a join was killed after its switch."""
+        """Whether the current version has all of these parts: then a join was killed after its switch."""
         root = self._base.root
         has_shards = False
         for part in parts.values():
@@ -244,7 +244,7 @@ class _Join:
         return has_shards and all(part.root_content != self._base.content for part in parts.values())
 
     def _check(self, parts: Mapping[int, Part]) -> None:
-        """Refuse parts that are not those of all slices, of the current version, by one builder."""
+        """Refuse the parts unless they are of all slices, of the current version, and by one builder."""
         run, store, base = self._run, self._store, self._base
         if not parts:
             self._refuse_if_changed()
@@ -253,7 +253,7 @@ class _Join:
                 hint="`shmmap prepare URL --layer ... --shards I/N` makes them; of a joined run none is left",
             )
         first = next(iter(parts.values()))
-        if first.root_content != base.content:  # that of all: the name of the run has it
+        if first.root_content != base.content:  # equal in all parts: the name of the run contains it
             same = first.version == base.current.version
             raise BadRequest(
                 f"run {run} was made from {'another ' * same}version {first.version},"
@@ -285,7 +285,7 @@ class _Join:
                 )
 
     def _remove(self, parts: Mapping[int, Part]) -> None:
-        """Remove the parts; those without shards first: they alone would not say that the run was joined."""
+        """Remove the parts, those without shards first: they alone do not show that the run was joined."""
         for number, _ in sorted(parts.items(), key=lambda one: len(one[1].keys)):
             step("join.part")
             self._store.delete(self._run.part_path(number))
@@ -293,11 +293,11 @@ class _Join:
     # --- objects --------------------------------------------------------------------------------
 
     def _look_for_objects(self, root: Root, layers: Collection[str]) -> int:
-        """Look for every object of a root, which may differ from the current one in these layers alone."""
+        """Check that all objects of a root are there; it may differ from the current one in these layers."""
         base = self._base.root
         belongs = slice_of_shards(base, self._run.slices).tolist()
         since_s = time.time() - _OLD_S
-        absent: dict[int, int] = {}  # how many, by slice; 0: of the version before
+        absent: dict[int, int] = {}  # number of objects by slice; 0: of the version before
         looked = 0
         self._progress.stage("look for objects", root.cells)
         shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)

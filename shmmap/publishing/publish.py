@@ -161,7 +161,7 @@ def publish_map(
 
 
 def packed_root(root: Root, url: str) -> bytes:
-    """Return what is in a root's frame; `MapDataError` where that is too large to be read."""
+    """Return a root unpacked; `MapDataError` if it is too large for readers."""
     unpacked = pack_root(root)
     if len(unpacked) > MAX_ROOT_BYTES:
         raise MapDataError(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A slice's worker: a process that makes layers of cells of a published map and sends their objects.
 
-Points are fetched for the next cells while one is made; they are made and sent as `shmmap.publishing.worker`
-does it with files.
+Points of the next cells are fetched while a cell is made.  Cells are made and sent as in
+`shmmap.publishing.worker`, which reads files.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from shmmap.segment.version import Stamp
 __all__ = ["HELD_BYTES", "PublishedPoints", "main"]
 
 HELD_BYTES: Final = 128 << 20
-"""Of fetched objects in memory: of neighbours those that the next cells look into as well."""
+"""Fetched objects held in memory: the next cells look into some of the same neighbours."""
 _OF_THE_STORE: Final = (Offline.code, MapMissing.code)
-"""What one cell meets there, each other one would: the run ends."""
+"""Any other cell would fail in the same way: the run ends."""
 
 
 class PublishedPoints:
@@ -64,11 +64,11 @@ class PublishedPoints:
         self._objects = objects
         self._threads = threads
         self._max_bytes = max_bytes
-        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # used last, last
+        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # the last used comes last
         self._bytes = 0
 
     def begin(self, sources: Sequence[Source]) -> None:
-        """Begin to fetch the points of cells, as far as there is room; returns at once."""
+        """Begin to fetch the points of cells while there is room; returns at once."""
         for source in sources:
             name = unpack_source(source)[LAYER].name
             if name not in self._held and self._bytes + name.size <= self._max_bytes:
@@ -149,7 +149,7 @@ class PublishedPoints:
 
 
 class _Tasks:
-    """The tasks of a worker: those that have come are begun while the one before is worked on."""
+    """The tasks of a worker: tasks that have arrived are begun while the one before is made."""
 
     def __init__(self, channel: socket.socket, begin: Callable[[CellTask], None]) -> None:
         self._channel = channel
@@ -167,7 +167,7 @@ class _Tasks:
             yield waiting.popleft()
 
     def _receive(self, *, wait: bool) -> bytes | None:
-        """The next packet; empty: the channel is closed; None: there is none yet."""
+        """Return the next packet; empty: the channel is closed; None: none has arrived yet."""
         try:
             return self._channel.recv(MAX_PACKET_BYTES, 0 if wait else socket.MSG_DONTWAIT)
         except BlockingIOError:

@@ -92,9 +92,9 @@ class CellMaker:
     known
         Objects that need not be made again.
     cache, keep
-        Where layers may be made already, and whether to keep there what is made.
+        Where layers may already be, and whether to keep new ones there.
     millimetres
-        Points are rounded.
+        Round points to millimetres.
     reader
         Reads the cells' points; None: they are files.
     """

@@ -47,7 +47,7 @@ def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
 
 
 def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
-    """Return the same in short pieces, and whether each is trouble."""
+    """Return the same as short texts, each with whether it is a problem."""
     if not counters.get("published_version"):
         return []
     problems = trust_problems(counters, time.time())
@@ -58,7 +58,7 @@ def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
 
 
 def since(counters: Mapping[str, int]) -> str:
-    """Return since when the origin is out of reach, in brackets with a blank before; or nothing."""
+    """Return `` (since TIME)`` while the origin is out of reach, else an empty string."""
     began_ns = counters.get("origin_out_since_unix_ns", 0)
     return f" (since {_date(began_ns, seconds=True)})" if began_ns else ""
 

@@ -50,7 +50,7 @@ _NICE: Final = 5
 
 
 class _Asked(NamedTuple):
-    """What the store failed with, and the newest metadata that it gave, by role."""
+    """Errors of the store, and the newest metadata that it returned, by role."""
 
     failed: list[ShmmapError]
     found: dict[str, bytes]
@@ -59,7 +59,7 @@ class _Asked(NamedTuple):
 def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = "") -> Verified:
     """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`.
 
-    Where this machine's clock is behind, what has run out is judged by when the timestamp was signed.
+    Expiry is judged by the later of this machine's clock and the time at which the timestamp was signed.
     """
     from tuf.api.exceptions import DownloadError, RepositoryError
 
@@ -95,7 +95,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
 
 
 def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Updater, _Asked]:
-    """Return TUF's client over a store, and what the store gives it."""
+    """Return TUF's client for a store, and a record of what the store returns to it."""
     from tuf.api.exceptions import DownloadHTTPError, RepositoryError
     from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
@@ -112,7 +112,7 @@ def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Upd
             except ShmmapError as error:
                 is_refused = isinstance(error, StoreRefused) and error.of_credentials
                 if is_refused and path.endswith(f".{_ROLES[-1]}.json"):
-                    raise DownloadHTTPError(path, 403) from None  # so a store says that there is none
+                    raise DownloadHTTPError(path, 403) from None  # the store may say so of an absent object
                 asked.failed.append(error)
                 raise
             asked.found[path.removesuffix(".json").rpartition(".")[2]] = data
@@ -203,7 +203,7 @@ def _expires(data: bytes) -> datetime:
 
 
 def _times(memory: str) -> tuple[float, dict[str, datetime]]:
-    """When the timestamp was signed, and when the metadata of each role runs out."""
+    """When the timestamp was signed, and when the metadata of each role expires."""
     from tuf.api.metadata import Metadata
 
     found: dict[str, Any] = {
@@ -218,7 +218,7 @@ def _times(memory: str) -> tuple[float, dict[str, datetime]]:
 
 
 def _remove_interim(memory: str) -> None:
-    """Remove what TUF's client had half written when it was killed."""
+    """Remove files that TUF's client had half written when it was killed."""
     for name in os.listdir(memory):
         if name.startswith(tempfile.gettempprefix()):
             os.unlink(os.path.join(memory, name))
