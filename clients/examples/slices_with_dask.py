@@ -61,7 +61,7 @@ def main() -> int:
     parser.add_argument("--slices", metavar="N", type=int, default=8, help="how many slices (default: 8)")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="of a cluster (default: start workers here)")
     parser.add_argument(
-        "--workers", metavar="N", type=int, help="how many to start here (default: one per core)"
+        "--workers", metavar="N", type=int, help="how many start here (default: one per core)"
     )
     args = parser.parse_args()
     if args.scheduler:

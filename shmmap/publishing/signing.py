@@ -229,7 +229,7 @@ class MapSigner:
         return Rotated(roles, self._key_path(name), self._root.signed.version)
 
     def _add_root(self, roles: Sequence[str], following: CryptoSigner, *, keep: bool) -> None:
-        """Write the next root, which gives roles this key: beside their old ones if ``keep``, else instead."""
+        """Write the next root, which gives roles this key, beside their old ones if ``keep``."""
         signers = self._signers(Root.type)
         root = copy.deepcopy(self._root.signed)
         root.version += 1

@@ -111,7 +111,7 @@ def test_an_older_offer(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
     assert "--accept-version 1" in found["advice"]
     with shmmap.connect(one.endpoint) as client, suppress(shmmap.ShmmapError):
         client.reload()
-    found = until_row(one, "versions", "version 1 is offered and refused")
+    found = until_row(one, "versions", "version 1, which is offered, is refused, older")
     assert found["versions"]["state"] == "warn"
 
 

@@ -95,7 +95,7 @@ def verb(one: DaemonProcess, line: str) -> tuple[int, str]:
 
 
 def is_shown(line: str, text: str) -> bool:
-    """Whether a line of the page is printed, whatever its numbers, times and blanks are."""
+    """Whether a line of the page is printed, apart from its numbers, times and blanks."""
     fixed = re.split(r"\d+(?:\.\d+)? [smhd]\b|\d+", " ".join(line.split()))
     pattern = r"[\w. ]+?".join(re.escape(part) for part in fixed)
     return re.search(pattern, " ".join(text.split())) is not None
@@ -122,13 +122,13 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             cells = client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=60.0)
             assert {failure.code for failure in cells.failed} == {"offline"}
             assert {cell.id for cell in cells} == {cell.id for cell in near}
-            told = dict(zip(("health", "status", "doctor", "tail"), PAGE.commands("down"), strict=True))
+            commands = dict(zip(("health", "status", "doctor", "tail"), PAGE.commands("down"), strict=True))
             for name in ("health", "status", "doctor"):
-                code, text = verb(one, told[name])
+                code, text = verb(one, commands[name])
                 assert code == (1 if name == "health" else 0), text
                 for line in PAGE.blocks[name]:
                     assert is_shown(line, text), f"{line}\n\n{text}"
-            assert "offline" in verb(one, told["tail"])[1]
+            assert "offline" in verb(one, commands["tail"])[1]
             with pytest.raises(shmmap.Offline):
                 client.reload()
             del cells

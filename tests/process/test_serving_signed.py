@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -18,7 +17,6 @@ import pytest
 import shmmap
 from shmmap.doctor.signed_map import trust_problems
 from shmmap.errors import Offline, ShmmapError
-from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess, stop
 from tests.support.divided_map import make_map
@@ -26,6 +24,8 @@ from tests.support.doctor_verb import doctor
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
 from tests.support.publishing_verbs import Shmmap as Verbs
+from tests.support.statistics_verbs import health, verb
+from tests.support.waiting import counters
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -119,26 +119,9 @@ def versions_of(one: DaemonProcess) -> dict[str, int]:
         return {cell.id: cell.version for cell in cells}
 
 
-def counters(one: DaemonProcess) -> dict[str, int]:
-    return dict(read_statistics(one.instance, one.shm_dir).counters)
-
-
 def problems(one: DaemonProcess) -> str:
-    """What the statistics say is wrong with the signature and the offer."""
+    """Problems with the signature and the offer, by the statistics."""
     return "; ".join(trust_problems(counters(one), time.time()))
-
-
-def verb(one: DaemonProcess, *words: str, env: dict[str, str] | None = None) -> tuple[int, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *words, "--instance", one.instance,
-         "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir],
-        env={**os.environ, "PYTHONPATH": str(ROOT), **(env or {})}, capture_output=True, text=True,
-    )  # fmt: skip
-    return done.returncode, done.stdout
-
-
-def health(one: DaemonProcess, env: dict[str, str] | None = None) -> tuple[int, str]:
-    return verb(one, "health", "--strict", env=env)
 
 
 def until_remembered(one: DaemonProcess) -> None:
@@ -148,7 +131,7 @@ def until_remembered(one: DaemonProcess) -> None:
 
 
 def until_polled(web: FaultyWeb, times: int) -> list[tuple[str, int]]:
-    """Wait until the origin was asked for its timestamp so often; returns all that was asked."""
+    """Wait for ``times`` requests of the timestamp; returns all requests."""
     asked, waiting = web.requests(), Patience()
     while waiting(sum(path == "timestamp.json" for path, _ in asked) < times):
         time.sleep(0.02)
@@ -326,9 +309,10 @@ def test_a_refusal_is_seen_by_every_verb_also_after_a_restart(
         time.sleep(0.02)
     assert verb(one, "health")[0] == 0, "clients lack nothing"
     assert says in verb(one, "status")[1]
-    found = doctor(one)[1]["signature"]
-    assert says in found["fact"]
-    assert (found["state"], found["advice"] != "") == ("warn", True)
+    found = doctor(one)[1]
+    assert says in found["versions"]["fact"]
+    assert (found["versions"]["state"], found["versions"]["advice"] != "") == ("warn", True)
+    assert found["signature"]["state"] == "ok"
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError, match="refused, altered"):
         client.reload()
     (web.folder / "timestamp.json").write_bytes(whole)
@@ -464,7 +448,7 @@ def _shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clock(_shim: Path) -> Callable[[float], dict[str, str]]:
-    """Environment of a process whose clock is so many days ahead."""
+    """Environment of a process whose clock is ``days`` days ahead."""
 
     def off(days: float) -> dict[str, str]:
         return {"LD_PRELOAD": str(_shim), "CLOCK_AHEAD_S": str(int(days * DAY_S))}

@@ -76,8 +76,8 @@ class Nginx:
         """How it is started: as root its workers stay root, who owns the directories of tests."""
         user = " user root;" if os.geteuid() == 0 else ""
         log = str(self.folder / "error.log")
-        told = ["-p", str(self.folder), "-c", str(self._file), "-e", log, "-g", f"daemon off;{user}"]
-        return [needed_nginx(), *told]
+        options = ["-p", str(self.folder), "-c", str(self._file), "-e", log, "-g", f"daemon off;{user}"]
+        return [needed_nginx(), *options]
 
     def configure(self, configuration: str) -> None:
         """Take another configuration, from the next start on."""

@@ -240,7 +240,7 @@ def _reason(text: str) -> str:
 
 
 def server_url(where: StoreUrl) -> str:
-    """Return the URL of a store's server, for questions that need no credentials; empty if it is not known."""
+    """Return the URL of a store's server, for requests without credentials; empty if it is not known."""
     if where.scheme in WEB_SCHEMES:
         return where.text
     if endpoint := _endpoint(where.scheme):

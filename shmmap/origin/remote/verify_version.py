@@ -36,6 +36,7 @@ from shmmap.origin.remote.verify_apart import (
     read_trusted_root,
 )
 from shmmap.processes.end_with_parent import die_with
+from shmmap.quantities import format_utc
 
 if TYPE_CHECKING:
     from tuf.ngclient import Updater
@@ -83,7 +84,9 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
             signed_s, expires = _times(memory)
     role = min(expires, key=lambda role: expires[role])
     if expires[role].timestamp() <= signed_s:  # by this machine's clock it is still valid
-        raise _expired(store, role, expires[role], f"the timestamp was signed on {_text_of(signed_s)}, and ")
+        raise _expired(
+            store, role, expires[role], f"the timestamp was signed on {format_utc(signed_s)}, and "
+        )
     return Verified(
         current.version,
         current.root,
@@ -188,10 +191,6 @@ def _expired(store: Store, role: str, expires: datetime, after: str = "") -> Map
         f" {now:%Y-%m-%d %H:%M} UTC",
         "is the clock right? `shmmap versions URL --refresh --sign KEYDIR` signs it again",
     )
-
-
-def _text_of(unix_s: float) -> str:
-    return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M} UTC"
 
 
 def _expires(data: bytes) -> datetime:
