@@ -17,16 +17,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
+from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import (
     CurrentState,
-    add_version,
     changed_meanwhile,
     new_entry,
     read_current,
     read_shards,
-    refuse_if_signed,
 )
 from shmmap.origin.remote.published_index import Root, map_version_of, pack_root
 from shmmap.origin.remote.published_object import blob_path
@@ -36,6 +34,7 @@ from shmmap.origin.remote.slice_part import (
     RunName,
     part_number,
     read_run,
+    shards_of,
     slice_of_shards,
     unpack_part,
     with_parts,
@@ -43,10 +42,11 @@ from shmmap.origin.remote.slice_part import (
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
-from shmmap.publishing.publish import LONGEST_S, packed_root
+from shmmap.publishing.publish import packed_root
 from shmmap.publishing.restore import object_sizes
 from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
-from shmmap.publishing.slicing import BaseVersion, changed_layers, read_base
+from shmmap.publishing.slicing import BaseVersion, changed_layers, new_objects, read_base
+from shmmap.publishing.switching import begin_version, refuse_if_late, switch_version
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -112,9 +112,7 @@ def join_slices(
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")
     name = read_run(run)
-    if signer is None:
-        refuse_if_signed(store, "join with the keys that signed it: --sign KEYDIR")
-    seen = read_current(store) if signer is None else signer.begin()
+    seen = begin_version(store, signer, "join")
     if seen.current is None:
         raise MapMissing(f"no map is published at {store.url}")
     base = read_base(store, seen.current)
@@ -160,15 +158,8 @@ class _Join:
         entry = new_entry(self._store, digest.hex(), len(frame), self._base.current)
         objects = self._look_for_objects(root, layers)
         step("join.looked")
-        if time.monotonic() - self._began_s > LONGEST_S:
-            raise CannotWrite(
-                f"joining at {self._store.url} took longer than a day: the version is not made current",
-                hint="run the same command again",
-            )
-        if self._signer is None:
-            add_version(self._store, entry, self._seen)
-        else:
-            self._signer.switch(entry)
+        refuse_if_late(self._began_s, f"joining at {self._store.url}", "run the same command again")
+        switch_version(self._store, entry, self._seen, self._signer)
         self._remove(parts)
         self._progress.done(root.cells)
         return Joined(
@@ -230,12 +221,11 @@ class _Join:
         root = self._base.root
         has_shards = False
         for part in parts.values():
-            numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
-            has_shards |= len(numbers) > 0
+            numbers = shards_of(root, part)
+            has_shards |= len(part.keys) > 0
             is_in = (
                 part.layers.items() <= root.layers.items()
-                and np.array_equal(root.keys[numbers], part.keys)
-                and np.array_equal(root.counts[numbers], part.counts)
+                and numbers is not None
                 and np.array_equal(root.sizes[numbers], part.sizes)
                 and np.array_equal(root.hashes[numbers], part.hashes)
             )
@@ -305,11 +295,9 @@ class _Join:
             for number, (of_slice, before, after) in enumerate(shards):
                 path = f"{self._store.url}/{self._run.part_path(of_slice)}"
                 changed = changed_layers(before, after, layers, name=path)
-                named = {name: set(object_sizes(layer)) for name, layer in after.layers.items()}
-                old = {one for name, objects in named.items() if name not in changed for one in objects}
-                new = {one for name in changed for one in named[name]} - old
-                if changed:
-                    new.add((root.shard_sha256(number), int(root.sizes[number])))
+                kept = after.layers.keys() - set(changed)
+                old = {one for name in kept for one in object_sizes(after.layers[name])}
+                new = new_objects(root, number, after, changed) - old
                 for key, objects, since in ((0, old, 0.0), (of_slice, new, since_s)):
                     looked += len(objects)
                     gone = absent_objects(self._store, sorted(objects), threads, since_s=since)

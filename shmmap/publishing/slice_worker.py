@@ -33,7 +33,7 @@ from shmmap.prepare.work import CellTask, Ready, decode_task, encode
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import CellSent, NotSent, decode_slice_settings
-from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, LayerRefused, Sender, run_worker
+from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, Sender, make_and_send, run_worker
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
 
@@ -193,10 +193,7 @@ def _work(channel: socket.socket, argument: str) -> None:
 
     sender = Sender(store, send, is_first=False)
     channel.send(encode(Ready()))
-    with (
-        ThreadPoolExecutor(TASKS_AHEAD, "fetch") as fetching,
-        ThreadPoolExecutor(TASKS_AHEAD, "send") as pool,
-    ):
+    with ThreadPoolExecutor(TASKS_AHEAD, "fetch") as fetching:
         points = PublishedPoints(KeptObjects(store, tier, keep=settings.keep_points), fetching)
         maker = CellMaker(KnownObjects(""), cache, keep=True, reader=points)
 
@@ -205,17 +202,7 @@ def _work(channel: socket.socket, argument: str) -> None:
                 near = {one.source: None for around in task.around for one in around}
                 points.begin([task.source, *near])
 
-        def make(task: CellTask) -> None:
-            try:
-                cell = maker.make(task)
-            except LayerRefused as error:
-                layer = "" if error.code in _OF_THE_STORE else error.layer
-                send(NotSent(task.number, layer, error.code, error.message[:2000], error.hint))
-            else:
-                pool.submit(sender.send, task.number, cell)
-
-        for task in _Tasks(channel, begin):
-            make(task)
+        make_and_send(_Tasks(channel, begin), maker, sender, ending=_OF_THE_STORE)
 
 
 def _is_kept(task: CellTask, cache: LayerCache | None, points: PublishedPoints) -> bool:

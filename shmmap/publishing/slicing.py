@@ -65,7 +65,7 @@ from shmmap.publishing.shards import CellObjects
 from shmmap.publishing.worker import TASKS_AHEAD
 from shmmap.segment.source import Source
 
-__all__ = ["BaseVersion", "Sliced", "changed_layers", "prepare_slice", "read_base"]
+__all__ = ["BaseVersion", "Sliced", "changed_layers", "new_objects", "prepare_slice", "read_base"]
 
 _THERE_S: Final = 4 * 86_400.0  # most age of a slice that need not be made again; joining accepts six days
 _SHARDS_HELD: Final = 16
@@ -116,6 +116,14 @@ def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, nam
     if foreign:
         raise MapDataError(f"a shard has another layer {foreign[0]}", path=name, cause=DAMAGED)
     return changed
+
+
+def new_objects(root: Root, number: int, shard: Shard, changed: Collection[str]) -> set[tuple[bytes, int]]:
+    """Hash and size of the objects of a shard's changed layers, and of the shard if there are any."""
+    if not changed:
+        return set()
+    found = {one for name in changed for one in object_sizes(shard.layers[name])}
+    return found | {(root.shard_sha256(number), int(root.sizes[number]))}
 
 
 def _are_equal(one: object, other: object, columns: Sequence[str]) -> bool:
@@ -350,9 +358,7 @@ class _Slice:
                 changed = changed_layers(self._shard(number), shard, self._lacking, name="")
                 if sorted(changed) != sorted(self._lacking):
                     return False
-                new = {one for name in changed for one in object_sizes(shard.layers[name])}
-                if changed:
-                    new.add((root.shard_sha256(number), int(root.sizes[number])))
+                new = new_objects(root, number, shard, changed)
                 if absent_objects(self._store, sorted(new), threads, since_s=since_s):
                     return False
                 self._progress.advance(len(shard))

@@ -17,6 +17,7 @@ import pytest
 
 from shmmap.dividing.progress import NoProgress
 from shmmap.errors import InstanceBusy, MapDataError, ShmmapError
+from tests.process.conftest import Meanwhile
 from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
@@ -32,7 +33,7 @@ import zstandard
 from shmmap.origin.remote import map_versions
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.slice_part import Part, pack_part, read_run, unpack_part
-from shmmap.publishing import joining, prune, publish, sending
+from shmmap.publishing import joining, prune
 from tests.support.message_pack import pack, unpack
 
 LAYERS = ("sample(every=2)", "around(radius=3.0)")
@@ -395,32 +396,6 @@ def test_a_join_that_is_killed_is_finished_by_the_same_command(label: str, town:
 
 
 # --- two at a time ------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Callable[[], object]], list[object]]:
-    """Have something done when a step is come to for the first time; returns what came of it."""
-
-    def arrange(label: str, act: Callable[[], object]) -> list[object]:
-        outcome: list[object] = []
-        acting: list[bool] = []
-
-        def step(at: str) -> None:
-            if at == label and not acting:
-                acting.append(True)
-                try:
-                    outcome.append(act())
-                except ShmmapError as error:
-                    outcome.append(error)
-
-        for module in (map_versions, publish, sending, joining, prune):
-            monkeypatch.setattr(module, "step", step)
-        return outcome
-
-    return arrange
-
-
-Meanwhile = Callable[[str, Callable[[], object]], list[object]]
 
 
 @pytest.mark.parametrize("label", [*JOIN_STEPS, "publish.send"])

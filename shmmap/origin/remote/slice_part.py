@@ -43,6 +43,7 @@ __all__ = [
     "part_number",
     "read_run",
     "run_of",
+    "shards_of",
     "slice_of_shards",
     "unpack_part",
     "with_parts",
@@ -263,6 +264,13 @@ def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: s
     return part
 
 
+def shards_of(root: Root, part: Part) -> NDArray[np.intp] | None:
+    """Return the numbers of a part's shards in a root, ascending; None if its slice has others there."""
+    numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
+    same = np.array_equal(root.keys[numbers], part.keys) and np.array_equal(root.counts[numbers], part.counts)
+    return numbers if same else None
+
+
 def with_parts(root: Root, parts: Sequence[Part]) -> Root:
     """Return the root that has the shards of these parts, and the layers of their run.
 
@@ -274,11 +282,8 @@ def with_parts(root: Root, parts: Sequence[Part]) -> Root:
     sizes, hashes = root.sizes.copy(), root.hashes.copy()
     layers = dict(root.layers)
     for part in parts:
-        numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
-        same = np.array_equal(root.keys[numbers], part.keys) and np.array_equal(
-            root.counts[numbers], part.counts
-        )
-        if not same:
+        numbers = shards_of(root, part)
+        if numbers is None:
             wrong = Damage(part.run.part_path(part.slice))
             raise wrong(f"its shards are not those of slice {part.slice} of {part.slices}")
         sizes[numbers], hashes[numbers] = part.sizes, part.hashes

@@ -93,8 +93,8 @@ def test_the_daemon_may_be_worse_off(ward: Ward) -> None:
 
 @pytest.mark.parametrize("refusal", [*range(1, len(REFUSALS)), 77])
 def test_a_refused_offer_is_in_the_row_of_versions(ward: Ward, refusal: int) -> None:
-    counts = {"published_refused": 9, "published_refusal": refusal}
-    state, text = look(ward, StoreAnswer(**ANSWERS), **counts)["versions"]
+    found = look(ward, StoreAnswer(**ANSWERS), published_refused=9, published_refusal=refusal)
+    state, text = found["versions"]
     cause = REFUSALS[min(refusal, len(REFUSALS) - 1)].replace("_", " ")
     why = "cannot be taken" if cause == "other" else f"is refused, {cause}"
     assert (state, f"version 9, which is offered, {why}: what was taken is served" in text) == ("warn", True)
