@@ -126,7 +126,7 @@ class Day:
 
     @property
     def over_fetch(self) -> float:
-        """Bytes loaded for each one that was asked for."""
+        """Bytes loaded for each requested byte."""
         return self.counters["bytes_loaded"] / max(1, self.counters["bytes_used"])
 
     @property

@@ -163,7 +163,7 @@ def _heading(sheet: _Sheet, day: Day, left: float) -> None:
 
 
 def _way(sheet: _Sheet, day: Day, left: float) -> None:
-    """The way from above: where queries were complete at once, and where not, wider for longer waits."""
+    """The way from above: where queries were complete at once and where not, wider for longer waits."""
     at = np.array([(query.x, query.y) for query in day.queries])
     low, high = at.min(axis=0), at.max(axis=0)
     scale = min((_COLUMN - 16) / max(high[0] - low[0], 1.0), (_MAP_HEIGHT - 40) / max(high[1] - low[1], 1.0))
@@ -183,7 +183,7 @@ def _way(sheet: _Sheet, day: Day, left: float) -> None:
 
 
 def _rates(day: Day) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Seconds since the start, and the megabytes a second that came over the link about then."""
+    """Seconds since the start, and the link's megabytes per second around then."""
     at_s = np.array([sample.asked_s for sample in day.samples])
     mb = np.array([sample.received_bytes for sample in day.samples]) / 1e6
     marks = np.arange(0.0, at_s[-1], _RATE_S / 4)

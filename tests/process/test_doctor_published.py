@@ -206,7 +206,7 @@ def test_credentials_that_cannot_be_used(bucket: DaemonProcess, web: FaultyWeb, 
 def test_no_other_address_is_asked(
     buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor the cloud's metadata address, also where there are no credentials."""
+    """Nor the cloud's metadata address, even if there are no credentials."""
     made = make_map(tmp_path / "files", columns=2, rows=2, points=300)
     publish(made.root, buckets.url("examined"))
     shim, seen = tmp_path / "connects.so", tmp_path / "connects"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What operators see of a published map: counters, screens, metrics; what they do not see of files."""
+"""What operators see of a published map: counters, screens, metrics; none of it for a map of files."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def load_all(one: DaemonProcess) -> shmmap.CellSet:
 
 
 def evict_all(one: DaemonProcess, client: shmmap.Client) -> None:
-    """Drop all cells, and wait until none is left that could be taken back."""
+    """Evict all cells, and wait until none could be reused."""
     client.evict()
     until(one, lambda counts: not counts["cells_resident"] and not counts["zombies"])
 

@@ -60,7 +60,7 @@ def until_in_memory(one: DaemonProcess, *names: str) -> None:
 
 
 def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
-    """Drive as far as is to be ridden out; no step is made before a vehicle could have come so far."""
+    """Drive through the outage, no faster than a vehicle could."""
     for x in range(STEP, DRIVEN_M, STEP):
         until_in_memory(one, f"{x - STEP}_0.pcd", f"{x}_0.pcd")
         update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S)
@@ -77,7 +77,7 @@ def until_out(one: DaemonProcess) -> None:
 
 
 def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, web: FaultyWeb) -> None:
-    """Of the list of cells there is room for a part only; what lies along the route stays."""
+    """Only a part of the list of cells fits; the pages along the route stay."""
     words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--catalogue-budget", "64K")
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:

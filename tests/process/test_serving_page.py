@@ -83,7 +83,7 @@ def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFact
 
 
 def verb(one: DaemonProcess, line: str) -> tuple[int, str]:
-    """Run a command of the page for this daemon; returns exit code and what is printed."""
+    """Run a command of the page for this daemon; returns its exit code and output."""
     words = shlex.split(line)[1:]
     place = ["--instance", one.instance, "--runtime-dir", one.runtime_dir]
     place += ["--shm-dir", one.shm_dir] if words[0] != "tail" else []
@@ -102,7 +102,7 @@ def is_shown(line: str, text: str) -> bool:
 
 
 def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
-    """Commands, what they print, and what is served meanwhile."""
+    """The page's commands, their output, and which cells are served meanwhile."""
     pytest.importorskip("obstore", reason="obstore is not installed")
     pytest.importorskip("zstandard", reason="zstandard is not installed")
     made = make_map(tmp_path / "files", columns=2, rows=2, points=300)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole daemons that serve a published map under a root of trust: what is taken, refused, and served on."""
+"""Whole daemons that serve a published map under a root of trust: what they take, refuse, and still serve."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def flip(path: Path) -> None:
 
 
 def sign_timestamp(web: FaultyWeb, keys: Path, **fields: object) -> Signed:
-    """Sign the timestamp that is offered again, as the next one, with other fields."""
+    """Sign the offered timestamp again, as the next one, with other fields."""
     signed = Signed(web.folder, keys)
     sign_timestamp_of(signed, **fields)
     return signed
@@ -171,7 +171,7 @@ def test_a_first_start_refuses_what_is_older_or_altered_in_its_root(
     assert one.run_to_end() == 65
     assert "its SHA-256 is not its name" in one.log
     assert not list(one.state_dir.rglob("*.taken"))
-    offer("one")  # what was signed later was seen, although it was not taken
+    offer("one")  # newer metadata was seen, although it was not taken
     assert one.run_to_end() == 65
     assert "refused, older" in one.log
 
@@ -396,7 +396,7 @@ def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
     one.start()
     assert versions_of(one) == served
     one.stop()
-    # neither under another root of trust, nor what was taken without one
+    # no version taken under another root of trust, or without one
     one.arguments = list(trusting(made_once / "others"))
     assert one.run_to_end() == 71
     assert "no answer" in one.log
@@ -510,7 +510,7 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
 
 
 def test_a_clock_a_day_behind(daemon: DaemonFactory, web: FaultyWeb, keys: Path, clock: Clock) -> None:
-    """It is named; and what had expired when the timestamp was signed is found to have."""
+    """It is named; metadata that had expired when the timestamp was signed counts as expired."""
     sign_timestamp(web, keys, expires=in_days(1))
     one = daemon(web.url, *trusting(keys), "--poll", "1", environment=clock(-1))
     assert len(versions_of(one)) == 2
@@ -609,7 +609,7 @@ def test_a_daemon_ends_while_it_verifies(daemon: DaemonFactory, web: FaultyWeb, 
 
 
 def test_where_a_store_hides_what_it_does_not_have(daemon: DaemonFactory, web: FaultyWeb, keys: Path) -> None:
-    """A bucket whose user may read objects and not list them answers 403 for one that is not there."""
+    """A bucket whose user may read but not list objects answers 403 for an absent one."""
     web.fault = lambda path: "" if (web.folder / path).exists() else "403"
     one = daemon(web.url, *trusting(keys))
     assert len(versions_of(one)) == 2

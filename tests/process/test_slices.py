@@ -42,7 +42,7 @@ DAY_S = 86_400
 
 
 class Town:
-    """A published town of four shards, and what makes slices of it."""
+    """A published town of four shards, and the commands that make slices of it."""
 
     def __init__(self, folder: Path, made: DividedMap, shmmap: Shmmap, kept: Path) -> None:
         self.folder = folder
@@ -69,7 +69,7 @@ class Town:
         )  # fmt: skip
 
     def slices(self, count: int) -> str:
-        """Make all, the last first, or take them as they were made before; returns the run."""
+        """Make all slices, the last first, or copy those made before; returns the run."""
         kept = self.kept / f"in {count}"
         if not kept.exists():
             for number in range(count, 0, -1):
@@ -87,7 +87,7 @@ class Town:
         return joining.join_slices(open_store(str(self.url)), run, progress=NoProgress())
 
     def refused(self, run: str, code: int) -> str:
-        """What a join says that has changed nothing."""
+        """Error of a join, which has to change nothing."""
         before = self.files()
         with pytest.raises(ShmmapError) as refused:
             self.join_here(run)
@@ -151,7 +151,7 @@ def root(_made: tuple[Path, str, str]) -> str:
 
 @pytest.fixture
 def map_version(_made: tuple[Path, str, str]) -> str:
-    """The map version of that."""
+    """The map version of the town, published with its layers in one go."""
     return _made[2]
 
 
@@ -200,7 +200,7 @@ def test_in_a_bucket_nothing_is_sent_twice(town: Town, root: str, buckets: Bucke
 
 
 def test_layers_of_all_kinds_of_points_in_millimetres_too(town: Town) -> None:
-    """Halos whose order counts, cells without points, points outside their box, some that stay exact."""
+    """Halos whose order matters, cells without points, points outside their box, some that stay exact."""
     open3d_or_skip()
     empty = {name: values[:0] for name, values in town.made.points("0_0.pcd").items()}
     town.made.write_cell("20_0.pcd", (20, 0), empty)
@@ -452,7 +452,7 @@ def test_of_a_join_and_a_publisher_one_wins(label: str, town: Town, root: str, m
 def test_pruning_meanwhile_takes_nothing_that_is_served(
     label: str, town: Town, root: str, meanwhile: Meanwhile
 ) -> None:
-    """All that slices have sent is as old as what pruning removes."""
+    """All objects that slices have sent are old enough to be pruned."""
     before = set((town.store / "blobs/sha256").iterdir())
     run = town.slices(2)
     for path in {*(town.store / "blobs/sha256").iterdir()} - before:

@@ -85,7 +85,7 @@ class _Pattern:
         return self.begin + _RAW_BLOCK + _NUMBER.pack(number)
 
     def digests(self, number: int) -> tuple[bytes, bytes]:
-        """Return the SHA-256 of an object and of what is in it."""
+        """Return the SHA-256 of an object and of its unpacked content."""
         end = _NUMBER.pack(number)
         name, content = self.begin_sha256.copy(), self.content_sha256.copy()
         name.update(_RAW_BLOCK + end)
@@ -189,7 +189,7 @@ class MadeMap:
 
     @cached_property
     def root(self) -> Root:
-        """What the map is; all shards are made for it once."""
+        """The map's root; all shards are made for it once."""
         numbers = range(self._shards_along**2)
         rows = [self._shard_row(number) for number in numbers]
         extent = self.side * CELL_M

@@ -97,7 +97,7 @@ class _Outages:
         self._periods = sorted(periods)
 
     def end_of(self, now_s: float) -> float:
-        """When what would pass now does."""
+        """When bytes that would pass now do pass."""
         for from_s, to_s in self._periods:
             if from_s <= now_s < to_s:
                 now_s = to_s
@@ -151,7 +151,7 @@ class _Connection:
             server[1].close()
 
     async def _take_up(self, client: asyncio.StreamReader, queue: _Queue) -> None:
-        """Read requests, until the client wants nothing more: then what is on its way is lost."""
+        """Read requests until the client closes; answers still on their way are then lost."""
         while data := await client.read(CHUNK_BYTES):
             entered_s = self._up.pass_through(len(data), time.monotonic())
             if not self._is_asked:  # the first bytes of a request: no client here sends the next one before
@@ -170,7 +170,7 @@ class _Connection:
         queue.put_nowait((0.0, b""))
 
     def _longer_s(self) -> float:
-        """What an answer takes more."""
+        """Delay of an answer, seconds."""
         mean_s = self._plan.mean_s
         # the mean of a log-normal distribution is exp(mu + sigma^2 / 2)
         return self._took.lognormvariate(math.log(mean_s) - SIGMA**2 / 2, SIGMA) if mean_s else 0.0
@@ -195,7 +195,7 @@ async def _serve(plan: Plan) -> None:
             await _Connection(plan, up, down, took).run((reader, writer))
 
     def commands() -> None:
-        data = os.read(sys.stdin.fileno(), 1 << 20)  # what a text file buffers would not be seen again
+        data = os.read(sys.stdin.fileno(), 1 << 20)  # bytes that a text file buffers would be lost
         if not data:
             loop.remove_reader(sys.stdin)
         for line in data.decode().splitlines():
