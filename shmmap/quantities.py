@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-__all__ = ["counted", "format_bytes", "format_duration", "format_metres"]
+from datetime import datetime, timezone
+
+__all__ = ["counted", "format_bytes", "format_duration", "format_metres", "format_utc"]
 
 
 def counted(count: int, noun: str) -> str:
@@ -35,6 +37,12 @@ def format_duration(duration_s: float) -> str:
     if duration_s < 2 * 86400:
         return f"{duration_s / 3600:.0f} h"
     return f"{duration_s / 86400:.0f} d"
+
+
+def format_utc(unix_s: float, *, seconds: bool = False) -> str:
+    """Return a moment, Unix time, as text: ``"2026-01-31 23:59 UTC"``."""
+    form = "%Y-%m-%d %H:%M:%S UTC" if seconds else "%Y-%m-%d %H:%M UTC"
+    return datetime.fromtimestamp(unix_s, timezone.utc).strftime(form)
 
 
 def format_metres(value: float) -> str:

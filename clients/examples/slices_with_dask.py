@@ -20,7 +20,7 @@ from dask.distributed import Client, as_completed
 
 
 def prepare_slice(url: str, layers: list[str], number: int, slices: int) -> dict[str, Any]:
-    """Make one slice; returns what `shmmap prepare` says of it, its run among that."""
+    """Make one slice; returns the report of `shmmap prepare`, which names the run."""
     done = subprocess.run(
         [
             *(sys.executable, "-m", "shmmap.cli", "prepare", url, "--layer", *layers),
@@ -38,7 +38,7 @@ def prepare_slice(url: str, layers: list[str], number: int, slices: int) -> dict
 
 def prepare_on(client: Client, url: str, layers: list[str], slices: int) -> str:
     """Make all slices on a cluster; returns the name of the run."""
-    # a slice is the same wherever and however often it is made: dask may repeat it as it likes
+    # the same slice gives the same bytes on any worker: dask may repeat it
     futures = [
         client.submit(prepare_slice, url, layers, number, slices, retries=2, pure=False)
         for number in range(1, slices + 1)
@@ -59,8 +59,10 @@ def main() -> int:
     parser.add_argument("url", metavar="URL", help="where the map is published")
     parser.add_argument("--layer", metavar="SPEC", nargs="+", required=True, help="such as 'ndt(leaf=2.0)'")
     parser.add_argument("--slices", metavar="N", type=int, default=8, help="how many slices (default: 8)")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="a cluster's (default: workers of its own)")
-    parser.add_argument("--workers", metavar="N", type=int, help="how many of its own (default: one a core)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a cluster (default: start workers here)")
+    parser.add_argument(
+        "--workers", metavar="N", type=int, help="how many start here (default: one per core)"
+    )
     args = parser.parse_args()
     if args.scheduler:
         client = Client(args.scheduler)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs share that make layers of every cell of a map, `prepare` and `publish`."""
+"""Options and output that `prepare` and `publish` share: both make layers of every cell of a map."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str] = ()) -> None:
-    """Refuse options about how files are read, and others, where none are; ``what`` says why."""
+    """Refuse options about reading files, and ``others``, where no file is read; ``what`` says why."""
     from shmmap.errors import BadRequest
 
     for option in ("metadata", "strict", "unit", "vertical_unit", *others):
@@ -78,7 +78,7 @@ def failure_rows(failures: Sequence[Failure]) -> list[dict[str, str]]:
 
 
 def print_failures(failures: Sequence[Failure]) -> None:
-    """Print layers that could not be made, the first of many."""
+    """Print layers that could not be made; of many, only the first."""
     for failure in failures[:_SHOWN_FAILURES]:
         print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
     if len(failures) > _SHOWN_FAILURES:

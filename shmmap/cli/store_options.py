@@ -31,7 +31,7 @@ def add_store_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_access_options(group: argparse._ArgumentGroup, *, default: bool | None) -> None:
-    """Add ``--insecure-http`` and ``--instance-credentials``; ``default`` is what they are if not given."""
+    """Add ``--insecure-http`` and ``--instance-credentials``, with this default."""
     group.add_argument(
         "--insecure-http",
         action="store_true",

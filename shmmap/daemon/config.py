@@ -114,8 +114,8 @@ class DaemonConfig:
         What the list of cells of a large published map may take of memory; beyond, what was needed least
         recently is fetched again when it is needed.
     trust
-        Root of trust, ``ROOT.json``: of a published map only what is signed under it is taken; empty: what
-        the origin says.
+        Root of trust, ``ROOT.json``: only versions of a published map that are signed under it are taken;
+        empty: any version that the origin names.
     accept_version
         A version of a published map that is taken although a later one was taken before; 0: none.
     insecure_http

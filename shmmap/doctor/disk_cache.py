@@ -39,7 +39,7 @@ def check_disk_cache(patient: Patient) -> Finding:
     if why := _why_not_used(patient, place, status.st_uid):
         return warn(
             name,
-            f"{why}: objects of published maps are not kept there: no map without a connection",
+            f"{why}: objects of published maps are not kept there: without a connection there is no map",
             f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS}, or name another cache_dir",
         )
     budget = DiskBudget(str(directory), patient.config.cache_bytes, owner=uid)

@@ -13,6 +13,7 @@ from shmmap.doctor.access import account_name
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.doctor.patient import Patient
+from shmmap.doctor.signed_map import refused_offer
 from shmmap.doctor.store_probe import ASKED_S
 from shmmap.origin.remote.store import is_url
 from shmmap.quantities import format_duration
@@ -20,7 +21,7 @@ from shmmap.quantities import format_duration
 __all__ = ["check_clock", "check_credentials", "check_link", "check_versions"]
 
 MOST_OFF_S: Final = 60.0
-"""A minute is no matter of the link any more; from five or fifteen on stores refuse what is signed."""
+"""The link cannot explain a minute; a difference of 5 or 15 makes stores refuse signed requests."""
 FILES: Final = "the map is files"
 
 
@@ -91,7 +92,7 @@ def _hidden(patient: Patient) -> str:
 
 
 def check_clock(patient: Patient) -> Finding:
-    """Is this machine's clock that of the store?"""
+    """Does this machine's clock agree with the store's?"""
     name = "clock"
     if not _is_published(patient):
         return skip(name, FILES)
@@ -116,35 +117,25 @@ def check_versions(patient: Patient) -> Finding:
         return skip(name, FILES)
     answer, counters = patient.store, _counters(patient)
     served, offered = counters.get("published_version", 0), answer.version
-    told = "what is offered is not known"
+    offer = "what is offered is not known"
     if offered:
-        told = f"version {offered}{_published(answer.created_s)} is offered"
+        offer = f"version {offered}{_published(answer.created_s)} is offered"
     if not served:
-        return ok(name, told) if offered else skip(name, f"{told}; no daemon says what it serves")
+        return ok(name, offer) if offered else skip(name, f"{offer}; no daemon says what it serves")
     taken_s = counters["published_taken_unix_ns"] * 1e-9
     fact = f"version {served}{_published(answer.served_created_s)} is served, taken {_ago(taken_s)}"
-    expires_s = counters["published_expires_unix_ns"] * 1e-9
-    if expires_s and expires_s <= time.time():
-        return warn(
-            name,
-            f"{fact}; what signs it has expired {_ago(expires_s)}",
-            "where it is signed: `shmmap versions URL --refresh --sign KEYDIR`; is the clock right?",
-        )
-    if refused := counters["published_refused"]:
-        return warn(
-            name,
-            f"{fact}; version {refused} is offered and refused",
-            "`shmmap reload` says why; if it is meant, serve it once with --accept-version",
-        )
+    refused, advice = refused_offer(counters)
+    if refused:
+        return warn(name, f"{fact}; {refused}", advice)
     if not offered or offered == served:
-        return ok(name, f"{fact}; {told}" if not offered else f"{fact}; it is what is offered")
+        return ok(name, f"{fact}; {offer}" if not offered else f"{fact}; it is what is offered")
     if offered < served:
         return warn(
             name,
-            f"{fact}; {told}, which is older",
+            f"{fact}; {offer}, which is older",
             f"if it is meant: shmmap serve --accept-version {offered}; else publish again",
         )
-    return ok(name, f"{fact}; {told}", "it is taken at the next --poll; `shmmap reload` takes it now")
+    return ok(name, f"{fact}; {offer}", "it is taken at the next --poll; `shmmap reload` takes it now")
 
 
 def _published(created_s: float | None) -> str:

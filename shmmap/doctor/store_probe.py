@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks the store of a published map in a process apart, as the daemon would ask it, and within a time.
+"""Asks the store of a published map in a separate process, as the daemon would ask it, within a time limit.
 
 Only the configured URL is asked, with the daemon's credentials where this account may see where they come
-from.  Whatever hangs, a credentials file or a server that sends a byte a second, hangs that process; it is
-ended, and what it has said so far counts.
+from.  A credentials file that hangs, or a server that sends a byte a second, can block only that process; it
+is killed, and its last report counts.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OTHERS: Final = (
 
 
 class StoreQuestion(msgspec.Struct):
-    """What is asked: a store, and the entry of the version that is served (0: none)."""
+    """A store to ask, and the number of the version that is served (0: none)."""
 
     url: str
     insecure_http: bool = False
@@ -53,15 +53,15 @@ class StoreAnswer(msgspec.Struct):
     is_refused
         The store refuses them.
     answers
-        Whether anything answers, if only with a refusal.
+        Whether anything answers, be it a refusal.
     first_s, next_s
-        Of one small object over a new connection, and of the next one.
+        How long one small object takes over a new connection, and the next one.
     error, hint
         Why it could not be read.
     version
-        Number of what is offered; 0: not known.
+        Number of the version that is offered; 0: not known.
     created_s, served_created_s
-        When that one was published, and when the one that is served was.
+        When the offered version was published, and when the served one was.
     clock_s
         By how much the store's clock is ahead of this machine's.
     is_late
@@ -90,8 +90,8 @@ def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) ->
     Parameters
     ----------
     environment
-        Of the daemon: what says where its credentials are is taken from it, and nothing else; None: it cannot
-        be seen, this process's own is used.
+        Of the daemon: only variables that say where its credentials are, or how to reach the store, are used;
+        None: it cannot be seen, and this process's own is used.
     """
     given = dict(os.environ)
     if environment is not None:
@@ -124,11 +124,11 @@ def _is_of_a_store(name: str) -> bool:
     return name.startswith(_NAMED) or name in _OTHERS
 
 
-# --- in the process apart -----------------------------------------------------------------------------
+# --- in the separate process --------------------------------------------------------------------------
 
 
 def main(words: str) -> None:
-    """Ask, and write down after each step what is known: the last line counts."""
+    """Ask, and print after each step what is known: the last line counts."""
     question, answer = msgspec.json.decode(words, type=StoreQuestion), StoreAnswer()
     for step in (_ask_credentials, _ask_objects, _ask_clock):
         step(question, answer)

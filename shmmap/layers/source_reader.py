@@ -83,7 +83,7 @@ class SourceReader(Protocol):
         """Say why a source could not be read, in such words."""
 
     def take_counts(self) -> tuple[int, ...]:
-        """Return what was read of objects since the last call, as statistics count it; empty for nothing."""
+        """Return counts of objects read since the last call, in the order of `OBJECTS_READ`; empty: none."""
 
 
 class Files:
@@ -147,7 +147,7 @@ class Files:
         return self._named(message)
 
     def take_counts(self) -> tuple[int, ...]:
-        """Return nothing: files are no objects."""
+        """Return nothing: files are not objects."""
         return ()
 
 

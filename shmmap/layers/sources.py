@@ -98,7 +98,7 @@ def read_segment(
     Parameters
     ----------
     header
-        Of a segment that was not published; None: it was, and is read.
+        Header of a segment that is not published yet; None: read it from the segment.
 
     Raises
     ------

@@ -140,7 +140,7 @@ def prepare_map(
 def task_of(
     catalogue: Catalogue, versions: LayerVersions, index: int, layers: Sequence[str]
 ) -> tuple[work.CellTask, list[Failure]]:
-    """Return the task of making these layers of a cell, without those that would look into too many cells."""
+    """Return the task of making layers of a cell, without those that would look into too many cells."""
     around: dict[str, tuple[Neighbour, ...]] = {}
     crowded: list[Failure] = []
     for layer in layers:

@@ -39,7 +39,7 @@ _BLOCK_BYTES: Final = 1 << 20
 def _prepare_cell(task: work.CellTask, cache: LayerCache, *, recognise: bool) -> work.CellDone:
     """Have every layer of a cell in the cache; the file is read once for all computed layers.
 
-    ``recognise``: the cache may hold them under other states of the same files.
+    ``recognise``: look in the cache for layers of other states of the same files.
     """
     done: dict[str, work.LayerDone] = {}
     missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joining a run: what its slices have made becomes the current version, at once.
+"""Joining a run: the parts of its slices become the current version, in one step.
 
-Slices never switch a version; this alone does.  Killed at any moment, the version that was current is whole;
-run again, it finishes.
+Only a join switches the version, slices never do.  A join that is killed at any moment leaves the current
+version whole; run again, it finishes.
 """
 
 from __future__ import annotations
@@ -17,16 +17,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
+from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import (
     CurrentState,
-    add_version,
     changed_meanwhile,
     new_entry,
     read_current,
     read_shards,
-    refuse_if_signed,
 )
 from shmmap.origin.remote.published_index import Root, map_version_of, pack_root
 from shmmap.origin.remote.published_object import blob_path
@@ -36,6 +34,7 @@ from shmmap.origin.remote.slice_part import (
     RunName,
     part_number,
     read_run,
+    shards_of,
     slice_of_shards,
     unpack_part,
     with_parts,
@@ -43,17 +42,18 @@ from shmmap.origin.remote.slice_part import (
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
-from shmmap.publishing.publish import LONGEST_S, packed_root
+from shmmap.publishing.publish import packed_root
 from shmmap.publishing.restore import object_sizes
 from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
-from shmmap.publishing.slicing import BaseVersion, changed_layers, read_base
+from shmmap.publishing.slicing import BaseVersion, changed_layers, new_objects, read_base
+from shmmap.publishing.switching import begin_version, refuse_if_late, switch_version
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
 __all__ = ["Joined", "join_slices", "numbers_text"]
 
-_OLD_S: Final = 6 * 86_400.0  # pruning may remove what no version names after seven days
+_OLD_S: Final = 6 * 86_400.0  # pruning may remove an object that no version names after seven days
 _READ_AT_ONCE: Final = 16
 
 
@@ -70,7 +70,7 @@ class Joined:
     cells, layers
         Of that version.
     objects
-        How many were looked for.
+        How many were checked.
     """
 
     run: RunName
@@ -86,24 +86,24 @@ class Joined:
 def join_slices(
     store: Store, run: str, *, progress: PrepareProgress, signer: MapSigner | None = None
 ) -> Joined:
-    """Make a version of what all slices of a run have made, and make it current.
+    """Make a version of the parts of all slices of a run, and make it current.
 
     Parameters
     ----------
     run
-        Its name, as `prepare_slice` gives it.
+        Its name, as `prepare_slice` returns it.
     signer
         Signs the version; needed for a map that is signed.
 
     Raises
     ------
     BadRequest
-        It is no name of a run; the run is of another version than the current one; the store is read-only,
-        or the map is signed and there is no signer.
+        The name is not one of a run; the run was made from another version than the current one; the store is
+        read-only; or the map is signed and there is no signer.
     MapMissing
-        Nothing is published there, or some slices are not made, which are named.
+        Nothing is published there, or slices are missing; the message names them.
     MapDataError
-        A part or what it names is damaged, gone, or of another builder than other parts.
+        A part or an object that it names is damaged or gone, or the parts are of different builders.
     InstanceBusy
         Another publisher was quicker: its version is current.
     CannotWrite, Offline
@@ -112,9 +112,7 @@ def join_slices(
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")
     name = read_run(run)
-    if signer is None:
-        refuse_if_signed(store, "join with the keys that signed it: --sign KEYDIR")
-    seen = read_current(store) if signer is None else signer.begin()
+    seen = begin_version(store, signer, "join")
     if seen.current is None:
         raise MapMissing(f"no map is published at {store.url}")
     base = read_base(store, seen.current)
@@ -156,19 +154,12 @@ class _Join:
         step("join.root")
         send_object(self._store, blob_path(digest), frame)
         step("join.entry")
-        # from here on pruning spares its objects; what had been removed before is found to be absent
+        # from here on pruning spares its objects; objects removed before are found absent below
         entry = new_entry(self._store, digest.hex(), len(frame), self._base.current)
         objects = self._look_for_objects(root, layers)
         step("join.looked")
-        if time.monotonic() - self._began_s > LONGEST_S:
-            raise CannotWrite(
-                f"joining at {self._store.url} took longer than a day: the version is not made current",
-                hint="run the same command again",
-            )
-        if self._signer is None:
-            add_version(self._store, entry, self._seen)
-        else:
-            self._signer.switch(entry)
+        refuse_if_late(self._began_s, f"joining at {self._store.url}", "run the same command again")
+        switch_version(self._store, entry, self._seen, self._signer)
         self._remove(parts)
         self._progress.done(root.cells)
         return Joined(
@@ -226,16 +217,15 @@ class _Join:
             raise changed_meanwhile(self._store)
 
     def _are_joined(self, parts: Mapping[int, Part]) -> bool:
-        """Whether the current version has all that these parts say: a join was killed after its switch."""
+        """Whether the current version has all of these parts: then a join was killed after its switch."""
         root = self._base.root
         has_shards = False
         for part in parts.values():
-            numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
-            has_shards |= len(numbers) > 0
+            numbers = shards_of(root, part)
+            has_shards |= len(part.keys) > 0
             is_in = (
                 part.layers.items() <= root.layers.items()
-                and np.array_equal(root.keys[numbers], part.keys)
-                and np.array_equal(root.counts[numbers], part.counts)
+                and numbers is not None
                 and np.array_equal(root.sizes[numbers], part.sizes)
                 and np.array_equal(root.hashes[numbers], part.hashes)
             )
@@ -244,7 +234,7 @@ class _Join:
         return has_shards and all(part.root_content != self._base.content for part in parts.values())
 
     def _check(self, parts: Mapping[int, Part]) -> None:
-        """Refuse parts that are not those of all slices, of the current version, by one builder."""
+        """Refuse the parts unless they are of all slices, of the current version, and by one builder."""
         run, store, base = self._run, self._store, self._base
         if not parts:
             self._refuse_if_changed()
@@ -253,7 +243,7 @@ class _Join:
                 hint="`shmmap prepare URL --layer ... --shards I/N` makes them; of a joined run none is left",
             )
         first = next(iter(parts.values()))
-        if first.root_content != base.content:  # that of all: the name of the run has it
+        if first.root_content != base.content:  # equal in all parts: the name of the run contains it
             same = first.version == base.current.version
             raise BadRequest(
                 f"run {run} was made from {'another ' * same}version {first.version},"
@@ -285,7 +275,7 @@ class _Join:
                 )
 
     def _remove(self, parts: Mapping[int, Part]) -> None:
-        """Remove the parts; those without shards first: they alone would not say that the run was joined."""
+        """Remove the parts, those without shards first: they alone do not show that the run was joined."""
         for number, _ in sorted(parts.items(), key=lambda one: len(one[1].keys)):
             step("join.part")
             self._store.delete(self._run.part_path(number))
@@ -293,11 +283,11 @@ class _Join:
     # --- objects --------------------------------------------------------------------------------
 
     def _look_for_objects(self, root: Root, layers: Collection[str]) -> int:
-        """Look for every object of a root, which may differ from the current one in these layers alone."""
+        """Check that all objects of a root are there; it may differ from the current one in these layers."""
         base = self._base.root
         belongs = slice_of_shards(base, self._run.slices).tolist()
         since_s = time.time() - _OLD_S
-        absent: dict[int, int] = {}  # how many, by slice; 0: of the version before
+        absent: dict[int, int] = {}  # number of objects by slice; 0: of the version before
         looked = 0
         self._progress.stage("look for objects", root.cells)
         shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)
@@ -305,11 +295,9 @@ class _Join:
             for number, (of_slice, before, after) in enumerate(shards):
                 path = f"{self._store.url}/{self._run.part_path(of_slice)}"
                 changed = changed_layers(before, after, layers, name=path)
-                named = {name: set(object_sizes(layer)) for name, layer in after.layers.items()}
-                old = {one for name, objects in named.items() if name not in changed for one in objects}
-                new = {one for name in changed for one in named[name]} - old
-                if changed:
-                    new.add((root.shard_sha256(number), int(root.sizes[number])))
+                kept = after.layers.keys() - set(changed)
+                old = {one for name in kept for one in object_sizes(after.layers[name])}
+                new = new_objects(root, number, after, changed) - old
                 for key, objects, since in ((0, old, 0.0), (of_slice, new, since_s)):
                     looked += len(objects)
                     gone = absent_objects(self._store, sorted(objects), threads, since_s=since)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What publishing workers are given and answer; their tasks are `shmmap.prepare.work.CellTask`."""
+"""Messages to and from publishing workers; their tasks are `shmmap.prepare.work.CellTask`."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class SliceSettings(msgspec.Struct, array_like=True):
     Attributes
     ----------
     cache_dir, cache_bytes
-        Where computed layers are kept, and how much of that; 0: nothing.
+        Where computed layers are kept, and at most how many bytes; 0: none are.
     keep_points
-        Points that were fetched are kept there, too: several cells need them.
+        Keep fetched points there, too: several cells need them.
     """
 
     url: str

@@ -3,7 +3,7 @@
 
 Entries go first; then the entries are listed again, and only objects that none of these has, and that are as
 old, are removed.  So whatever is being published, restored or read meanwhile keeps its objects.  Parts of
-slices that are as old were never joined, and go as well.
+slices that are as old were never joined, and are removed as well.
 """
 
 from __future__ import annotations

@@ -19,22 +19,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import msgspec
 import numpy as np
 
-from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing, error_from_wire
+from shmmap.errors import BadRequest, MapDataError, MapMissing, error_from_wire
 from shmmap.failpoints import step
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import canonical_layers, layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.remote.map_versions import (
-    CurrentState,
-    Entry,
-    add_version,
-    new_entry,
-    read_current,
-    read_root,
-    read_shards,
-    refuse_if_signed,
-)
+from shmmap.origin.remote.map_versions import Entry, new_entry, read_root, read_shards
 from shmmap.origin.remote.published_index import (
     EXACT,
     MAX_ROOT_BYTES,
@@ -56,14 +47,14 @@ from shmmap.publishing.known_objects import write_known_objects
 from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent
 from shmmap.publishing.sending import send_object
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
+from shmmap.publishing.switching import begin_version, refuse_if_late, switch_version
 from shmmap.publishing.worker import TASKS_AHEAD
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["LONGEST_S", "Published", "packed_root", "publish_map"]
+__all__ = ["Published", "packed_root", "publish_map"]
 
-LONGEST_S: Final = 86_400.0  # what a run reuses must not be as old as what pruning removes
 _SENT_AT_ONCE: Final = 16
 
 
@@ -161,7 +152,7 @@ def publish_map(
 
 
 def packed_root(root: Root, url: str) -> bytes:
-    """Return what is in a root's frame; `MapDataError` where that is too large to be read."""
+    """Return a root unpacked; `MapDataError` if it is too large for readers."""
     unpacked = pack_root(root)
     if len(unpacked) > MAX_ROOT_BYTES:
         raise MapDataError(
@@ -193,9 +184,7 @@ class _Run:
         self._resend = resend
         self._began_s = time.monotonic()
         self._signer = signer
-        if signer is None:
-            refuse_if_signed(store, "publish it with the keys that signed it: --sign KEYDIR")
-        self._seen: CurrentState = read_current(store) if signer is None else signer.begin()
+        self._seen = begin_version(store, signer, "publish it")
         self._before: Root | None = self._read_root()
         self._shards: dict[tuple[int, int], tuple[bytes, int]] = {}  # before: key, content, row of the root
         has_none = self._before is None and next(iter(store.list("blobs/")), None) is None
@@ -228,10 +217,7 @@ class _Run:
             self._progress.done(len(self._catalogue))
             return result
         entry = self._send_root(unpacked)
-        if self._signer is None:
-            add_version(self._store, entry, seen)
-        else:
-            self._signer.switch(entry)
+        switch_version(self._store, entry, seen, self._signer)
         result.version = result.current = entry.version
         self._progress.done(len(self._catalogue))
         return result
@@ -385,10 +371,10 @@ class _Run:
         self._result.root = digest.hex()
         step("publish.root")
         self._count(len(frame) * send_object(self._store, blob_path(digest), frame, look=self._look))
-        if time.monotonic() - self._began_s > LONGEST_S:
-            raise CannotWrite(
-                f"publishing to {self._store.url} took longer than a day: the version is not made current",
-                hint="run the same command again: what was sent within a day is not sent again",
-            )
+        refuse_if_late(
+            self._began_s,
+            f"publishing to {self._store.url}",
+            "run the same command again: what was sent within a day is not sent again",
+        )
         step("version.entry")
         return new_entry(self._store, self._result.root, len(frame), self._seen.current)

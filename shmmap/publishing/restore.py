@@ -12,20 +12,18 @@ from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import (
     Current,
     Entry,
-    add_version,
     earlier_versions,
     new_entry,
-    read_current,
     read_entry,
     read_root,
     read_shards,
-    refuse_if_signed,
 )
 from shmmap.origin.remote.published_index import LayerObjects, Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects
+from shmmap.publishing.switching import begin_version, switch_version
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -60,9 +58,7 @@ def restore_version(
     InstanceBusy
         Another publisher has switched meanwhile.
     """
-    if signer is None:
-        refuse_if_signed(store, "go back with the keys that signed it: --sign KEYDIR")
-    seen = read_current(store) if signer is None else signer.begin()
+    seen = begin_version(store, signer, "go back")
     if seen.current is None:
         raise MapMissing(f"no map is published at {store.url}")
     served = {entry.version: entry for entry in earlier_versions(store, seen.current)}
@@ -86,10 +82,7 @@ def restore_version(
     _require_entry(store, old)
     objects = _look_for_objects(store, old.current, progress)
     step("restore.looked")
-    if signer is None:
-        add_version(store, entry, seen)
-    else:
-        signer.switch(entry)
+    switch_version(store, entry, seen, signer)
     return Restored(entry.version, version, entry.version, objects)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sending an object, unless a run that was cut short has sent it lately; looking for those that were sent."""
+"""Sending objects, unless a run that was cut short sent them lately; looking for objects that are absent."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def absent_objects(
     Parameters
     ----------
     since_s
-        Unix time: those that were written before count as absent, too.
+        Unix time: objects written before it count as absent, too.
     """
 
     def is_absent(named: tuple[bytes, int]) -> bool:

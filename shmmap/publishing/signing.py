@@ -6,10 +6,10 @@ Three keys: ``root.pem`` names the others, is needed to make and to rotate them,
 that a refresh needs.  What vehicles trust is ``ROOT.json``.  A version is current as soon as the timestamp
 names it; ``CURRENT`` follows, for vehicles that verify nothing, and is repaired when the map is signed next.
 
-A key is rotated so that the map is valid all the while, also for a vehicle that reads in the middle of it,
-and wherever it is killed.  The next key lies beside the old one, as ``<name>.next.pem``.  A new root names
-both of them; what they sign is signed again by both; then another root names the next key alone, which takes
-the old one's place.  The root's own key needs one root only, signed by the old key and the next.
+A rotation keeps the map valid at each moment, also for a vehicle that reads in the middle of it, and wherever
+it is killed.  The next key lies beside the old one, as ``<name>.next.pem``.  A new root names
+both of them; what they sign is signed again by both; then another root names the next key alone, which
+replaces the old one.  The root's own key needs one root only, signed by the old key and the next.
 """
 
 from __future__ import annotations
@@ -189,16 +189,16 @@ class MapSigner:
         )
 
     def rotate(self, role: str) -> Rotated:
-        """Give a role another key; snapshot and timestamp have one key, so that is both of them.
+        """Give a role another key; snapshot and timestamp share one, so both get it.
 
-        The old key is removed.  A rotation that was killed is carried on with.
+        The old key is removed.  A rotation that was killed continues.
 
         Raises
         ------
         MapMissing
             Nothing is signed there.
         ConfigError
-            A key that this needs is not here: ``root.pem`` in any case.
+            A key that is needed is not here; ``root.pem`` always is needed.
         InstanceBusy
             Another rotation came between.
         """
@@ -223,13 +223,13 @@ class MapSigner:
         self._add_root(roles, following, keep=False)
         step("sign.rotated")
         if role != Root.type:
-            # a publisher with the old key may have signed meanwhile, and cannot any more after this
+            # a publisher with the old key may have signed meanwhile; after this none can
             self._sign(None, 0, read_under=before)
         self._finish_rotation(name)
         return Rotated(roles, self._key_path(name), self._root.signed.version)
 
     def _add_root(self, roles: Sequence[str], following: CryptoSigner, *, keep: bool) -> None:
-        """Write the next root, in which a key is that of roles, beside the ones before or instead of them."""
+        """Write the next root, which gives roles this key, beside their old ones if ``keep``."""
         signers = self._signers(Root.type)
         root = copy.deepcopy(self._root.signed)
         root.version += 1
@@ -249,7 +249,7 @@ class MapSigner:
         self._root = Metadata.from_bytes(data)
 
     def _finish_rotation(self, name: str) -> None:
-        """Have the next key take the place of the one before, once no root names that any more."""
+        """Replace the old key by the next one, once the root no longer names the old one."""
         following = self._key_path(f"{name}.next")
         if not os.path.lexists(following):
             return
@@ -270,8 +270,8 @@ class MapSigner:
         """Have ``current`` named by targets, snapshot and timestamp; None: what is named already.
 
         ``before`` is the version that was current when this one was made: if another one is by now, that
-        one stays.  ``read_under`` is the root under which the keys are that signed what is there, if that is
-        not the newest one.
+        one stays.  ``read_under`` is the root whose keys signed the present state, if that is not the
+        newest one.
         """
         made: tuple[Current, int, Metadata[Targets]] | None = None
         for _ in range(_MAX_TRIES):
@@ -339,13 +339,13 @@ class MapSigner:
         return _signed_by(signed, self._signers(signed.type))
 
     def _has_newer_root(self) -> bool:
-        """Whether keys were rotated since the root was read, which is then that one."""
+        """Read the newest root; True if keys were rotated since it was last read."""
         newest = newest_root(self._store, self.trusted)
         before, self._root = self._root, newest
         return newest.signed.version != before.signed.version
 
     def _is_signed(self, metadata: Metadata[_Role]) -> bool:
-        """Whether all keys that are here have signed it: not so in the middle of a rotation."""
+        """Whether all keys that are here have signed it; False in the middle of a rotation."""
         here = self._keys_here(metadata.signed.type)
         return all(signer.public_key.keyid in metadata.signatures for signer in here)
 
@@ -424,7 +424,7 @@ class MapSigner:
         return os.path.join(self._directory, f"{name}.pem")
 
     def _next_key(self, name: str) -> CryptoSigner:
-        """Return the key that follows; the one of a rotation that was killed, or a new one."""
+        """Return the next key: that of a rotation that was killed, or a new one."""
         path = self._key_path(f"{name}.next")
         with writing_errors(self._directory):
             if not os.path.lexists(path):
@@ -433,13 +433,13 @@ class MapSigner:
         return _read_key(self._directory, f"{name}.next")
 
     def _keys_here(self, role: str) -> list[CryptoSigner]:
-        """Keys of a role that are here and that the root names: in a rotation the old one, and the next."""
+        """Keys of a role that are here and that the root names; in a rotation the old one and the next."""
         names = (_KEYS[role], f"{_KEYS[role]}.next")
         here = [_read_key(self._directory, name) for name in names if os.path.lexists(self._key_path(name))]
         return [signer for signer in here if signer.public_key.keyid in self._root.signed.roles[role].keyids]
 
     def _signers(self, role: str) -> list[CryptoSigner]:
-        """Return what a role signs with, one at least."""
+        """Return the keys that a role signs with, at least one."""
         if not (here := self._keys_here(role)):
             _read_key(self._directory, _KEYS[role])  # says why, if it cannot be read
             raise ConfigError(

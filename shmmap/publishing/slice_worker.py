@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A slice's worker: a process that makes layers of cells of a published map and sends their objects.
 
-Points are fetched for the next cells while one is made; they are made and sent as `shmmap.publishing.worker`
-does it with files.
+Points of the next cells are fetched while a cell is made.  Cells are made and sent as in
+`shmmap.publishing.worker`, which reads files.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from shmmap.prepare.work import CellTask, Ready, decode_task, encode
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import CellSent, NotSent, decode_slice_settings
-from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, LayerRefused, Sender, run_worker
+from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, Sender, make_and_send, run_worker
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
 
 __all__ = ["HELD_BYTES", "PublishedPoints", "main"]
 
 HELD_BYTES: Final = 128 << 20
-"""Of fetched objects in memory: of neighbours those that the next cells look into as well."""
+"""Fetched objects held in memory: the next cells look into some of the same neighbours."""
 _OF_THE_STORE: Final = (Offline.code, MapMissing.code)
-"""What one cell meets there, each other one would: the run ends."""
+"""Any other cell would fail in the same way: the run ends."""
 
 
 class PublishedPoints:
@@ -64,11 +64,11 @@ class PublishedPoints:
         self._objects = objects
         self._threads = threads
         self._max_bytes = max_bytes
-        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # used last, last
+        self._held: OrderedDict[ObjectName, Future[memoryview]] = OrderedDict()  # the last used comes last
         self._bytes = 0
 
     def begin(self, sources: Sequence[Source]) -> None:
-        """Begin to fetch the points of cells, as far as there is room; returns at once."""
+        """Begin to fetch the points of cells while there is room; returns at once."""
         for source in sources:
             name = unpack_source(source)[LAYER].name
             if name not in self._held and self._bytes + name.size <= self._max_bytes:
@@ -149,7 +149,7 @@ class PublishedPoints:
 
 
 class _Tasks:
-    """The tasks of a worker: those that have come are begun while the one before is worked on."""
+    """The tasks of a worker: tasks that have arrived are begun while the one before is made."""
 
     def __init__(self, channel: socket.socket, begin: Callable[[CellTask], None]) -> None:
         self._channel = channel
@@ -167,7 +167,7 @@ class _Tasks:
             yield waiting.popleft()
 
     def _receive(self, *, wait: bool) -> bytes | None:
-        """The next packet; empty: the channel is closed; None: there is none yet."""
+        """Return the next packet; empty: the channel is closed; None: none has arrived yet."""
         try:
             return self._channel.recv(MAX_PACKET_BYTES, 0 if wait else socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -193,10 +193,7 @@ def _work(channel: socket.socket, argument: str) -> None:
 
     sender = Sender(store, send, is_first=False)
     channel.send(encode(Ready()))
-    with (
-        ThreadPoolExecutor(TASKS_AHEAD, "fetch") as fetching,
-        ThreadPoolExecutor(TASKS_AHEAD, "send") as pool,
-    ):
+    with ThreadPoolExecutor(TASKS_AHEAD, "fetch") as fetching:
         points = PublishedPoints(KeptObjects(store, tier, keep=settings.keep_points), fetching)
         maker = CellMaker(KnownObjects(""), cache, keep=True, reader=points)
 
@@ -205,17 +202,7 @@ def _work(channel: socket.socket, argument: str) -> None:
                 near = {one.source: None for around in task.around for one in around}
                 points.begin([task.source, *near])
 
-        def make(task: CellTask) -> None:
-            try:
-                cell = maker.make(task)
-            except LayerRefused as error:
-                layer = "" if error.code in _OF_THE_STORE else error.layer
-                send(NotSent(task.number, layer, error.code, error.message[:2000], error.hint))
-            else:
-                pool.submit(sender.send, task.number, cell)
-
-        for task in _Tasks(channel, begin):
-            make(task)
+        make_and_send(_Tasks(channel, begin), maker, sender, ending=_OF_THE_STORE)
 
 
 def _is_kept(task: CellTask, cache: LayerCache | None, points: PublishedPoints) -> bool:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making one slice of a run: layers of a published map's cells are computed and sent, and noted in its part.
+"""Making one slice of a run: layers of a published map's cells are computed, sent, and listed in its part.
 
-A slice needs no other one: it reads the version, and of other slices' cells those that its own look into.
-Made again, it is the same bytes; what is there already is neither computed nor sent again.
+A slice needs no other slice: it reads the version, and those cells of other slices that its own look into.
+Made again, it gives the same bytes; what is already there is neither computed nor sent again.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ from shmmap.publishing.shards import CellObjects
 from shmmap.publishing.worker import TASKS_AHEAD
 from shmmap.segment.source import Source
 
-__all__ = ["BaseVersion", "Sliced", "changed_layers", "prepare_slice", "read_base"]
+__all__ = ["BaseVersion", "Sliced", "changed_layers", "new_objects", "prepare_slice", "read_base"]
 
-_THERE_S: Final = 4 * 86_400.0  # of a slice that was made before: joining takes what is up to six days old
+_THERE_S: Final = 4 * 86_400.0  # most age of a slice that need not be made again; joining accepts six days
 _SHARDS_HELD: Final = 16
 _STRIP_CELLS: Final = 4
 _MAX_TRIES: Final = 100
@@ -89,14 +89,14 @@ def read_base(store: Store, current: Current) -> BaseVersion:
 
 
 def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, name: str) -> list[str]:
-    """Return which layers of a shard are new, or others than before.
+    """Return which layers of a shard are new or have changed.
 
     Parameters
     ----------
     allowed
-        Those that may be.
+        Layers that may be new or may have changed.
     name
-        Of the part that has the later shard, for messages.
+        Name of the part with the later shard, for messages.
 
     Raises
     ------
@@ -118,26 +118,33 @@ def changed_layers(before: Shard, after: Shard, allowed: Collection[str], *, nam
     return changed
 
 
+def new_objects(root: Root, number: int, shard: Shard, changed: Collection[str]) -> set[tuple[bytes, int]]:
+    """Hash and size of the objects of a shard's changed layers, and of the shard if there are any."""
+    if not changed:
+        return set()
+    found = {one for name in changed for one in object_sizes(shard.layers[name])}
+    return found | {(root.shard_sha256(number), int(root.sizes[number]))}
+
+
 def _are_equal(one: object, other: object, columns: Sequence[str]) -> bool:
-    """Whether columns have the same bytes: heights may be no numbers."""
+    """Whether columns have the same bytes; heights may be NaN."""
     return all(getattr(one, column).tobytes() == getattr(other, column).tobytes() for column in columns)
 
 
 @dataclass(slots=True)
 class Sliced:
-    """What a slice came to.
+    """Result of making a slice.
 
     Attributes
     ----------
     version
-        The version that layers are added to.
+        Number of the version that layers are added to.
     layers
-        Those of the run, by spec.
+        Specs of the run's layers.
     there
-        It had been made before, whole: nothing was done.
+        It had been made before and is whole: nothing was done.
     kept, made
-        Layers of cells that the version has already; that were made now, which includes those that were
-        kept in the cache.
+        Layers of cells that the version already has; layers made now, those from the cache included.
     sent_objects, sent_bytes
         What was sent, shards included.
     """
@@ -177,23 +184,23 @@ def prepare_slice(
     number, slices
         Which slice of how many; the first is 1.
     settings
-        How workers open the store, and where layers are kept.
+        How workers open the store, and where they keep layers.
     current
-        What is current, where that was verified; None: what ``CURRENT`` says.
+        The current version, if it was verified; None: the one in ``CURRENT``.
     workers
         How many processes make layers.
 
     Returns
     -------
-    What came of it.  With failures no part was written.
+    The result.  If it has failures, no part was written.
 
     Raises
     ------
     BadRequest
         A layer is unknown, there is none, there is no such slice, or the store is read-only.
     MapMissing, MapDataError, Offline, CannotWrite
-        Nothing is published there, it is damaged, or the store does not answer or refuses; nothing can be
-        kept in the cache directory.
+        Nothing is published there, the map is damaged, the store does not answer or refuses, or the cache
+        directory cannot be written.
     """
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")
@@ -214,7 +221,7 @@ def prepare_slice(
 
 @dataclass(slots=True)
 class _Making:
-    """A shard whose cells are being made; ``left`` of them are not done."""
+    """A shard whose cells are being made; ``left`` counts those that are not done."""
 
     shard: Shard
     objects: CellObjects
@@ -227,7 +234,7 @@ class _ShardRow(NamedTuple):
 
 
 class _Cells(Catalogue):
-    """The cells of some shards: those of one, and those around it."""
+    """The cells of a shard and of the shards around it."""
 
     def __init__(self, root: Root, shards: Sequence[Shard]) -> None:
         places = [(name, shard, row) for shard in shards for row, name in enumerate(shard.names)]
@@ -254,10 +261,10 @@ class _Cells(Catalogue):
         return pack_source(self.id(index), {POINTS: points})
 
     def rows_of(self, shard: Shard) -> list[tuple[int, int]]:
-        """Index and row of the cells of one shard, neighbours near one another."""
+        """Index and row of each cell of one shard, so ordered that neighbours follow closely."""
         found = [(index, row) for index, (other, row) in enumerate(self._places) if other is shard]
         x, y = np.floor(shard.boxes[:, :2] / [size or 1.0 for size in self.mean_size]).T
-        strips = np.floor(x / _STRIP_CELLS)  # so that what a halo needs is still held from the row before
+        strips = np.floor(x / _STRIP_CELLS)  # so a halo's cells are still held from the row before
         return sorted(found, key=lambda one: (strips[one[1]], y[one[1]], x[one[1]]))
 
 
@@ -323,7 +330,7 @@ class _Slice:
     # --- the part -------------------------------------------------------------------------------
 
     def _part_there(self, path: str) -> tuple[Part | None, Tag | None]:
-        """The part that was written before, None if there is none that is sound; and the object's tag."""
+        """Return the part that was written before, None if there is no sound one; and the object's tag."""
         tag = None
         try:
             frame, tag = self._store.get_tagged(path, MAX_PART_BYTES)
@@ -336,7 +343,7 @@ class _Slice:
             return None, tag
 
     def _is_whole(self, part: Part) -> bool:
-        """Whether a part is what would be made now, and all that it names is there and not old."""
+        """Whether a part is what would be made now, and all objects that it names are there and recent."""
         if part.layers != self._layers:
             return False
         since_s = time() - _THERE_S
@@ -351,9 +358,7 @@ class _Slice:
                 changed = changed_layers(self._shard(number), shard, self._lacking, name="")
                 if sorted(changed) != sorted(self._lacking):
                     return False
-                new = {one for name in changed for one in object_sizes(shard.layers[name])}
-                if changed:
-                    new.add((root.shard_sha256(number), int(root.sizes[number])))
+                new = new_objects(root, number, shard, changed)
                 if absent_objects(self._store, sorted(new), threads, since_s=since_s):
                     return False
                 self._progress.advance(len(shard))
@@ -435,7 +440,7 @@ class _Slice:
 
     def _finished(self, task: CellTask, done: CellSent | NotSent) -> None:
         if isinstance(done, NotSent):
-            if not done.layer:  # the store refuses: so it would each other cell
+            if not done.layer:  # the store refuses, and would refuse every other cell
                 raise error_from_wire(done.code, done.message, done.hint)
             self._failed(task, [Failure(task.cell_id, done.layer, done.message)])
             return

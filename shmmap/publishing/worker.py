@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
@@ -53,7 +53,16 @@ from shmmap.publishing.sending import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 
-__all__ = ["TASKS_AHEAD", "CellMaker", "LayerRefused", "MadeCell", "Sender", "main", "run_worker"]
+__all__ = [
+    "TASKS_AHEAD",
+    "CellMaker",
+    "LayerRefused",
+    "MadeCell",
+    "Sender",
+    "main",
+    "make_and_send",
+    "run_worker",
+]
 
 _NICENESS: Final = 5
 TASKS_AHEAD: Final = 8
@@ -92,9 +101,9 @@ class CellMaker:
     known
         Objects that need not be made again.
     cache, keep
-        Where layers may be made already, and whether to keep there what is made.
+        Where layers may already be, and whether to keep new ones there.
     millimetres
-        Points are rounded.
+        Round points to millimetres.
     reader
         Reads the cells' points; None: they are files.
     """
@@ -213,6 +222,10 @@ class Sender:
         except Exception as error:  # noqa: BLE001  reported, the run ends
             self._send(NotSent(number, "", InternalError.code, repr(error), ""))
 
+    def refuse(self, why: NotSent) -> None:
+        """Report that a cell is not sent."""
+        self._send(why)
+
     def _sent(self, name: ObjectName, frame: bytes | None) -> int:
         if frame is None:
             return 0
@@ -240,15 +253,33 @@ def _work(channel: socket.socket, argument: str) -> None:
 
     sender = Sender(store, send, is_first=settings.is_first)
     channel.send(encode(Ready()))
+    packets = iter(lambda: channel.recv(MAX_PACKET_BYTES), b"")
+    make_and_send(map(decode_task, packets), maker, sender)
+
+
+def make_and_send(
+    tasks: Iterable[CellTask], maker: CellMaker, sender: Sender, *, ending: Collection[str] = ()
+) -> None:
+    """Make cells and send them in other threads, until there are no more tasks.
+
+    Parameters
+    ----------
+    ending
+        Codes of errors that end the run: every other cell would meet them, too.
+    """
     with ThreadPoolExecutor(TASKS_AHEAD, "send") as pool:
-        while data := channel.recv(MAX_PACKET_BYTES):
-            task = decode_task(data)
+
+        def work_on(task: CellTask) -> None:
             try:
                 cell = maker.make(task)
             except LayerRefused as error:
-                send(NotSent(task.number, error.layer, error.code, error.message[:2000], error.hint))
+                layer = "" if error.code in ending else error.layer
+                sender.refuse(NotSent(task.number, layer, error.code, error.message[:2000], error.hint))
             else:
                 pool.submit(sender.send, task.number, cell)
+
+        for task in tasks:
+            work_on(task)
 
 
 def run_worker(arguments: list[str], work: Callable[[socket.socket, str], None]) -> int:

@@ -29,7 +29,7 @@ SHIPPED_PROGRAM = "/usr/bin/shmmapd"
 SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
 PUBLISHED_MAP = "drop-ins/published-map.conf"
 ROOT_OF_TRUST = "ROOT.json"
-"""What a root of trust is called in the directory of the configuration, into which it is copied."""
+"""File name of the copy of a root of trust, in the directory of the configuration."""
 CREDENTIALS = ("shmmap.aws", "shmmap.google", "shmmap.azure")
 """Files in /etc/shmmap that are passed to the service, whose account need not be able to read them."""
 _GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
@@ -135,7 +135,7 @@ def _network(path: Path, file_system: FileSystem, *, is_remote: bool) -> list[Pl
 
 
 def _root_of_trust(given: str, path: Path) -> list[PlannedFile]:
-    """A copy of a root of trust: the service sees it, wherever the original lies; it is no secret."""
+    """Plan a copy of a root of trust: the service may not see the original; it is not a secret."""
     if not given:
         return []
     from shmmap.origin.remote.verify_apart import read_trusted_root
@@ -168,7 +168,7 @@ def plan_system(
     BadRequest
         ``root`` is no directory, or a URL cannot be served.
     ConfigError
-        The image has no program, or the service's account could not read it; or ``trust`` is no root of
+        The image has no program, or the service's account could not read it; or ``trust`` is not a root of
         trust.
     """
     file_system = FileSystem(root)

@@ -59,15 +59,15 @@ TURN_KINDS: Final = {
 """What a turn of the serving loop is named after: what took most of it."""
 
 REFUSALS: Final = ("", "unsigned", "older", "expired", "altered", "foreign_root", "other")
-"""Why a version of a published map that is offered is not taken, by the value of ``published_refusal``."""
+"""Why the offered version of a published map is not taken, by the value of ``published_refusal``."""
 
 OBJECTS_READ: Final = {
-    "objects_from_disk": ("", "Objects read out of the disk cache instead of the store"),
-    "bytes_from_disk": ("bytes", "Bytes of objects read out of the disk cache"),
+    "objects_from_disk": ("", "Objects read from the disk cache instead of the store"),
+    "bytes_from_disk": ("bytes", "Bytes of objects read from the disk cache"),
     "objects_fetched": ("", "Objects fetched from the store, index pages included"),
     "bytes_fetched": ("bytes", "Bytes of objects fetched from the store"),
     "objects_damaged_on_disk": ("", "Objects found damaged in the disk cache, and removed"),
-    "objects_damaged_in_store": ("", "Times that the store's object was not what its name says"),
+    "objects_damaged_in_store": ("", "Objects from the store that did not match their name's hash"),
     "fetches_failed": ("", "Times that an object could not be fetched from the store"),
 }
 """Counters of what a daemon of a published map and its loaders read: unit and help."""
@@ -77,7 +77,7 @@ _PUBLISHED: Final = (
     Counter("published_version", "gauge", "", "Number of the published version that is served; 0: files"),
     Counter("published_refused", "gauge", "", "Number of a version that is offered and refused; 0: none"),
     Counter("published_taken_unix_ns", "gauge", "ns", "When the version served was taken, wall clock"),
-    Counter("published_expires_unix_ns", "gauge", "ns", "When what signs it runs out; 0: it is not signed"),
+    Counter("published_expires_unix_ns", "gauge", "ns", "When its signature expires; 0: it is not signed"),
     Counter("published_signed_unix_ns", "gauge", "ns", "When that was signed, wall clock; 0: it is not"),
     Counter(
         "published_refusal",
@@ -91,7 +91,7 @@ _PUBLISHED: Final = (
 )
 
 PUBLISHED: Final = frozenset(counter.name for counter in _PUBLISHED)
-"""Counters that mean nothing where the map is files."""
+"""Counters that mean nothing if the map is files."""
 
 COUNTERS: Final = (
     Counter("requests", "counter", "", "Requests received, well-formed or not"),

@@ -31,7 +31,7 @@ _LIVE = {
 }
 
 _NO_TIME_IF_0 = {"origin_out_since_unix_ns", "published_expires_unix_ns", "published_signed_unix_ns"}
-"""Of what has not happened, or never will, there is no time: 1970 would be an alarm."""
+"""Times that are 0 are left out: 1970 would raise alarms."""
 
 _TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
 

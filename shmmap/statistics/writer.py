@@ -159,7 +159,7 @@ class StatisticsWriter:
         self.values[name] += n
 
     def add_objects_read(self, more: Sequence[int]) -> None:
-        """Add to the counters `OBJECTS_READ`, in their order; nothing, if that is what was read."""
+        """Add to the counters `OBJECTS_READ`, in their order; an empty ``more`` adds nothing."""
         for name, n in zip(OBJECTS_READ, more, strict=False):
             self.values[name] += n
 

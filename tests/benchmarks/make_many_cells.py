@@ -34,7 +34,7 @@ DATA binary
 
 
 def make_many_cells(out: Path, side: int, points: int = 1, *, distinct: bool = False) -> None:
-    """Write ``side`` x ``side`` cells of so many points and their metadata into the new directory ``out``.
+    """Write ``side`` x ``side`` cells of ``points`` points and their metadata into the new directory ``out``.
 
     With ``distinct`` each file has bytes of its own: its points lie in its middle.
     """

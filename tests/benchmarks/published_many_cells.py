@@ -49,14 +49,14 @@ LIMITS: Final = {"ready": 0.6, "known": 0.6, "memory": 100.0}
 
 
 def start_local(one: DaemonProcess, *, lifted: bool) -> float:
-    """Seconds until a daemon is ready that knows its map's list."""
+    """Seconds until a daemon with its map's list in the cache is ready."""
     took_s = seconds_to_start(one, lifted=lifted)
     one.stop()
     return took_s
 
 
 def start_published(served: ServedMadeMap, link: SlowLink, *, later: bool, lifted: bool) -> dict[str, float]:
-    """Start a daemon that knows nothing, and a client that knows nothing; what it took."""
+    """Start a daemon and a client without any cache; returns what each took."""
     corner_m = served.side * CELL_M // SHARD_M // 4 * SHARD_M
     area = shmmap.Circle(corner_m, corner_m, RADIUS_M)
     before = link.received_bytes()

@@ -181,7 +181,7 @@ def processors(url: str, root: Root, shards: list[Shard], repeats: int) -> int:
 
 
 def map_to_publish(given: Path | None, folder: Path) -> Path:
-    """Return the map given, else the street's, else one that is made; a cloud is divided first."""
+    """Return the given map, else the street's, else a made one; a cloud is divided first."""
     data = os.environ.get("SHMMAP_TEST_DATA", "")
     source = given or (Path(data, "kitti0005_map/map_static_v005.pcd") if data else None)
     if source is None:

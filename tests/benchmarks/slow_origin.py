@@ -118,7 +118,7 @@ def bucket(server: BucketServer, link: SlowLink, args: argparse.Namespace) -> Or
 
 @contextmanager
 def origins(root: Path, args: argparse.Namespace) -> Iterator[Callable[[str], Origin]]:
-    """Make the map; what is returned makes the origin of each drive."""
+    """Make the map; returns a function that makes the origin of each drive."""
     make_many_cells(root, SIDE, distinct=args.bucket)
     if not args.bucket:
         yield lambda kind: files(root, kind, args)
@@ -131,7 +131,7 @@ def origins(root: Path, args: argparse.Namespace) -> Iterator[Callable[[str], Or
 
 
 def vehicle(client: shmmap.Client, kind: str, origin: Origin, args: argparse.Namespace, run: Run) -> None:
-    """Drive, and ask for what is around every 20 m."""
+    """Drive, and ask for the cells around every 20 m."""
     client.area(shmmap.Circle(*CORNERS[0], RADIUS_M), wait=300.0)
     client.release()
     begin_s = time.monotonic()

@@ -108,7 +108,7 @@ def square_drive(side_m: float = 2400.0, speed_mps: float = 12.0, length_s: floa
 
 
 def city_path(seed: int, length_m: float, blocks: int = 20) -> Floats:
-    """Where such a drive goes: (N, 2) about a metre apart; the city has so many blocks along each side."""
+    """Where such a drive goes: (N, 2) about a metre apart; the city has ``blocks`` blocks on each side."""
     random = np.random.Generator(np.random.PCG64([seed, 18]))
     crossings = _walk(random, blocks, math.ceil(length_m / 160.0) + 2)
     # streets lie across the cells as it happens

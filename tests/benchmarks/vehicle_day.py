@@ -3,11 +3,11 @@
 
     python -m tests.benchmarks.vehicle_day [--minutes 20] [--at-once] [--picture DAY.png]
 
-The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects are made when they are asked
-for (`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, 15 m/s at
-most) and asks for a circle of 200 m every 20 m.  Two daemons: one is told the vehicle's places alone, one its
-route, too (the next kilometres of it).  Each has 2 GiB of memory for cells and 8 GiB of disk, empty at the
-start, and bridges outages of 20 s (`--ride-out`).  The link: an answer takes a log-normal time (mean 0.2 s,
+The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects are generated on request
+(`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, at most 15 m/s)
+and asks for a circle of 200 m every 20 m.  Two daemons: one gets only the vehicle's positions, one also its
+route (the next kilometres of it).  Each has 2 GiB of memory for cells and 8 GiB of disk, empty at the start,
+and bridges outages of 20 s (`--ride-out`).  The link: an answer takes a log-normal time (mean 0.2 s,
 sigma 0.8), all share 100 Mbit/s, and by chance, every four minutes on average, nothing passes for 2 to 20 s.
 
 The hour is driven in ``--minutes``: the vehicle is 60 / minutes times as fast, the link as much wider, and
@@ -54,8 +54,8 @@ RIDE_OUT_S: Final = 20.0
 HOUR_S: Final = 3600.0
 BLOCKS: Final = 120
 STRETCH_M: Final = 1000.0
-TOLD_M: Final = 5000.0
-"""So much of the route, and more, is told; another stretch of it every kilometre."""
+AHEAD_M: Final = 5000.0
+"""At least this much of the route ahead is sent; a new stretch of it every kilometre."""
 VERTEX_M: Final = 15.0
 KINDS: Final = ("places", "route")
 
@@ -70,7 +70,7 @@ class Sample(NamedTuple):
 
 @dataclass
 class Query:
-    """One time that the vehicle asks: where, what lacked, and how long until it was there."""
+    """One query of the vehicle: where, how much was missing, and how long until it was there."""
 
     asked_s: float
     x: float
@@ -81,7 +81,7 @@ class Query:
 
 @dataclass
 class Day:
-    """What came of one drive.
+    """Results of one drive.
 
     Attributes
     ----------
@@ -110,12 +110,12 @@ class Day:
 
     @property
     def misses(self) -> int:
-        """Queries that lacked something."""
+        """Number of queries with something missing."""
         return sum(query.late > 0 for query in self.counted)
 
     @property
     def longest_wait_s(self) -> float:
-        """The longest that a cell was waited for."""
+        """Longest wait for a cell, seconds."""
         return max((query.wait_s for query in self.counted), default=0.0)
 
     @property
@@ -126,7 +126,7 @@ class Day:
 
     @property
     def over_fetch(self) -> float:
-        """Bytes loaded for each one that was asked for."""
+        """Bytes loaded for each requested byte."""
         return self.counters["bytes_loaded"] / max(1, self.counters["bytes_used"])
 
     @property
@@ -148,30 +148,30 @@ def outages(seed: int, factor: float, length_s: float) -> list[tuple[float, floa
     return found
 
 
-class Told:
-    """What the vehicle tells of its route: a stretch of it, another one every kilometre."""
+class SentRoute:
+    """The part of its route that the vehicle sends: a stretch of it, a new one every kilometre."""
 
     def __init__(self, drive: Drive) -> None:
         self._route, self._along = drive.route, travelled_m(drive.route)
 
     def at(self, along_m: float) -> tuple[tuple[float, float], ...]:
-        """Return the stretch that is told so far along the way."""
+        """Return the stretch that is sent after ``along_m`` metres of the way."""
         begin_m = max(0.0, along_m // STRETCH_M * STRETCH_M - STEP_M)
-        marks = np.arange(begin_m, min(begin_m + STRETCH_M + TOLD_M, self._along[-1]), VERTEX_M)
+        marks = np.arange(begin_m, min(begin_m + STRETCH_M + AHEAD_M, self._along[-1]), VERTEX_M)
         x, y = (np.interp(marks, self._along, column).tolist() for column in self._route.T)
         return tuple(zip(x, y, strict=True))
 
 
 class Vehicle:
-    """Drives, asks, and waits for what it lacks until it asks again."""
+    """Drives, asks, and waits for missing cells until it asks again."""
 
-    def __init__(self, client: shmmap.Client, day: Day, told: Told | None) -> None:
-        self._client, self._day, self._told = client, day, told
+    def __init__(self, client: shmmap.Client, day: Day, sent: SentRoute | None) -> None:
+        self._client, self._day, self._sent = client, day, sent
         self._lacking: dict[str, tuple[float, Query]] = {}
 
     def ask(self, x: float, y: float, along_m: float, begin_s: float, until_s: float) -> None:
-        """Ask for what is around; where something lacks, wait for it until a time."""
-        route = self._told.at(along_m) if self._told is not None else ()
+        """Ask for the cells around; if some are missing, wait for them until ``until_s``."""
+        route = self._sent.at(along_m) if self._sent is not None else ()
         intent = shmmap.Intent(x, y, route=route)
         area = shmmap.Circle(x, y, RADIUS_M)
         asked_s = time.monotonic()
@@ -192,7 +192,7 @@ class Vehicle:
         return len(answer.pending) + len(answer.failed) + (not answer.covered)
 
     def _note(self, answer: shmmap.CellSet, query: Query, asked_s: float) -> None:
-        """Keep who lacks what since when; what has come, or is needed no more, has waited till now."""
+        """Note since when cells are missing, and the wait for those that came or are no longer needed."""
         now_s = time.monotonic()
         missing = {each.id for each in answer.pending} | {each.cell_id for each in answer.failed}
         if not answer.covered:
@@ -207,7 +207,7 @@ class Vehicle:
 
 
 def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> Day:
-    """One daemon, its link and its vehicle."""
+    """Run one daemon, its link and its vehicle."""
     factor, end_s = 60.0 / args.minutes, HOUR_S * args.hours
     day = Day(kind, outages(args.seed, factor, end_s / factor))
     with ExitStack() as stack:
@@ -219,7 +219,7 @@ def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> 
         one = DaemonProcess(link.endpoint, *options, "--workers", "2", "--cache-dir", str(cache))
         stack.enter_context(one)
         client = stack.enter_context(shmmap.connect(one.endpoint))
-        vehicle = Vehicle(client, day, Told(way) if kind == "route" else None)
+        vehicle = Vehicle(client, day, SentRoute(way) if kind == "route" else None)
         times = way.times_each(STEP_M)
         times = times[times < end_s]
         day.way_km = len(times) * STEP_M / 1e3
@@ -259,7 +259,7 @@ def row(day: Day) -> str:
 
 
 def main() -> None:
-    """Drive with and without a route, and print what came of it."""
+    """Drive with and without a route, and print the results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -277,7 +277,9 @@ def main() -> None:
         "--scratch", type=Path, help="directory for the disk tiers (default: a temporary one)"
     )
     parser.add_argument(
-        "--lift", action="store_true", help="let all of this go before unrelated work (needs root)"
+        "--lift",
+        action="store_true",
+        help="run all of this at a higher priority than other work (needs root)",
     )
     args = parser.parse_args()
     if args.lift:

@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 __all__ = ["day_picture"]
 
 _SCALE: Final = 2
-"""Everything is drawn so much larger, and made smaller in the end: lines are smooth."""
+"""Factor by which all is drawn larger and finally reduced, for smooth lines."""
 _COLUMN, _GAP, _LEFT, _TOP = 640, 70, 76, 146
 _MAP_HEIGHT, _CHART_HEIGHT, _CHART_GAP = 400, 104, 62
 _WARM, _LATE, _LINK, _MEMORY, _BAND = "#2b8a3e", "#c92a2a", "#1f6fb4", "#5f3dc4", "#ffe8cc"
 _INK, _SOFT, _AXIS = "#1f2933", "#52606d", "#ced4da"
-_TITLES: Final = {"places": "told where the vehicle is", "route": "told the route, too"}
+_TITLES: Final = {"places": "with positions only", "route": "with the route, too"}
 _RATE_S: Final = 20.0
-"""What comes over the link is averaged over so long."""
+"""Traffic of the link is averaged over this time, seconds."""
 _Place = tuple[float, float]
 
 
 class _Sheet:
-    """A picture in the making, in pixels of what it becomes."""
+    """A picture that is being drawn, in pixels of the result."""
 
     def __init__(self, width: int, height: int) -> None:
         self.image = Image.new("RGB", (width * _SCALE, height * _SCALE), "white")
@@ -163,7 +163,7 @@ def _heading(sheet: _Sheet, day: Day, left: float) -> None:
 
 
 def _way(sheet: _Sheet, day: Day, left: float) -> None:
-    """The way from above: where queries were complete at once, and, wider the longer it took, where not."""
+    """The way from above: where queries were complete at once and where not, wider for longer waits."""
     at = np.array([(query.x, query.y) for query in day.queries])
     low, high = at.min(axis=0), at.max(axis=0)
     scale = min((_COLUMN - 16) / max(high[0] - low[0], 1.0), (_MAP_HEIGHT - 40) / max(high[1] - low[1], 1.0))
@@ -183,7 +183,7 @@ def _way(sheet: _Sheet, day: Day, left: float) -> None:
 
 
 def _rates(day: Day) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Seconds since the start, and the megabytes a second that came over the link about then."""
+    """Seconds since the start, and the link's megabytes per second around then."""
     at_s = np.array([sample.asked_s for sample in day.samples])
     mb = np.array([sample.received_bytes for sample in day.samples]) / 1e6
     marks = np.arange(0.0, at_s[-1], _RATE_S / 4)

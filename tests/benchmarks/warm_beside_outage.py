@@ -30,7 +30,7 @@ FAULTS = ("corrupt", "503", "stall", "refuse")
 
 
 def serve(folder: Path, pipe: Connection) -> None:
-    """Serve a directory, and fail as the other side of the pipe says."""
+    """Serve a directory, with the faults that the pipe's other side names."""
     with faulty_web(folder) as web:
         pipe.send(web.url)
         while (fault := pipe.recv()) is not None:
@@ -45,7 +45,7 @@ def serve(folder: Path, pipe: Connection) -> None:
 
 
 def of_objects(fault: str) -> Fault:
-    """Objects alone fail."""
+    """Return a fault of objects only."""
     return lambda path: fault if path.startswith("blobs/") else ""
 
 

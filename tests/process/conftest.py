@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from shmmap.errors import ShmmapError
 from shmmap.testing.fixtures import judged_daemons
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
@@ -26,6 +27,33 @@ if TYPE_CHECKING:
     from tests.support.ros_peer import RosPeer
 
 DaemonFactory = Callable[..., DaemonProcess]
+Meanwhile = Callable[[str, Callable[[], object]], list[object]]
+
+
+@pytest.fixture
+def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
+    """Do something when a publisher reaches a step for the first time; returns its result or error."""
+    from shmmap.origin.remote import map_versions
+    from shmmap.publishing import joining, prune, publish, restore, sending
+
+    def arrange(label: str, act: Callable[[], object]) -> list[object]:
+        outcome: list[object] = []
+        acting: list[bool] = []
+
+        def step(at: str) -> None:
+            if at == label and not acting:
+                acting.append(True)
+                try:
+                    outcome.append(act())
+                except ShmmapError as error:
+                    outcome.append(error)
+
+        for module in (map_versions, publish, sending, restore, joining, prune):
+            if hasattr(module, "step"):
+                monkeypatch.setattr(module, "step", step)
+        return outcome
+
+    return arrange
 
 
 @pytest.fixture

@@ -58,7 +58,7 @@ def of_files(daemon: DaemonFactory, town: DividedMap) -> dict[str, dict[str, byt
 def test_daemons_of_the_store_are_killed_while_cells_are_fetched(
     ceph: CephServer, daemon: DaemonFactory, town: DividedMap, killed: list[str]
 ) -> None:
-    """One disk of three is not missed; without two, or the gateway, only what is here is served meanwhile."""
+    """One disk of three is not missed; without two, or the gateway, only cells that are here are served."""
     url = ceph.url(f"killed-{'-'.join(killed)}/town")
     publish(town.root, url)
     right = of_files(daemon, town)

@@ -112,7 +112,7 @@ def test_an_older_offer(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
     assert "--accept-version 1" in found["advice"]
     with shmmap.connect(one.endpoint) as client, suppress(shmmap.ShmmapError):
         client.reload()
-    found = until_row(one, "versions", "version 1 is offered and refused")
+    found = until_row(one, "versions", "version 1, which is offered, is refused, older")
     assert found["versions"]["state"] == "warn"
 
 
@@ -207,7 +207,7 @@ def test_credentials_that_cannot_be_used(bucket: DaemonProcess, web: FaultyWeb, 
 def test_no_other_address_is_asked(
     buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor the cloud's metadata address, also where there are no credentials."""
+    """Nor the cloud's metadata address, even if there are no credentials."""
     made = make_map(tmp_path / "files", columns=2, rows=2, points=300)
     publish(made.root, buckets.url("examined"))
     shim, seen = built_preload("connects", tmp_path), tmp_path / "connects"

@@ -38,7 +38,7 @@ def test_every_block_is_tested() -> None:
 
 @pytest.fixture
 def origin(tmp_path: Path) -> Iterator[FaultyWeb]:
-    """The server behind the gateway, which writes down what it is asked."""
+    """The server behind the gateway, which records requests."""
     needed_nginx()
     made = make_map(tmp_path / "files", columns=3, rows=3, points=300)
     publish(made.root, tmp_path / "www/town")

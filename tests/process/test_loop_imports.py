@@ -58,7 +58,7 @@ def test_nothing_is_imported_while_it_serves(daemon: DaemonFactory, tmp_path: Pa
 
 
 def test_python_tuf_is_never_imported_by_a_daemon(daemon: DaemonFactory, tmp_path: Path) -> None:
-    """Nor anything else, while a process apart verifies what it then takes."""
+    """Nor anything else, while a separate process verifies the version that it then takes."""
     for package in ("tuf", "obstore", "zstandard"):
         pytest.importorskip(package, reason=f"{package} is not installed")
     (tmp_path / "watch").mkdir()
@@ -84,4 +84,4 @@ def test_python_tuf_is_never_imported_by_a_daemon(daemon: DaemonFactory, tmp_pat
     assert [name for pid, name in imported[before:] if int(pid) == one.pid] == []
     importing_tuf = {int(pid) for pid, name in imported if name.partition(".")[0] == "tuf"}
     assert one.pid not in importing_tuf
-    assert len(importing_tuf) >= 3, "each time another process"
+    assert len(importing_tuf) >= 3, "each time in another process"

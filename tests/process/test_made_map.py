@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What benchmarks of published maps use: a map that is what ORIGIN.md says, and a slow link."""
+"""Tools of the benchmarks of published maps: a map as ORIGIN.md describes it, and a slow link."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ AWAY = [(0.0, 1e12)]
 
 
 def test_every_object_is_what_the_pages_say(tmp_path: Path) -> None:
-    """Judged by the reader that is written from the pages alone: names, content digests, checksums."""
+    """Checked by the reader that is written from the pages alone: names, content digests, checksums."""
     made = MadeMap(40 * 40, 50)
     folder = tmp_path / "made"
     (folder / "blobs/sha256").mkdir(parents=True)

@@ -337,7 +337,7 @@ def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: Divi
     town.change("0_0.pcd", seed=1)
     with locked(store):
         slow = before_its_switch(shmmap, town, store)
-        # what another publisher would have made current meanwhile
+        # the version that another publisher made current meanwhile
         faster = json.loads((store / "CURRENT").read_bytes()) | {"version": 3}
         entry = json.loads((store / "versions/1.json").read_bytes())
         (store / "versions/3.json").write_text(json.dumps({**entry, "version": 3, "before": 1}))

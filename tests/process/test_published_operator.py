@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What operators see of a published map: counters, screens, metrics; what they do not see of files."""
+"""What operators see of a published map: counters, screens, metrics; none of it for a map of files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import shmmap
-from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import DaemonProcess
@@ -21,6 +20,7 @@ from tests.support.divided_map import make_map
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
 from tests.support.publishing import publish
+from tests.support.waiting import counters
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -38,14 +38,10 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
         yield one
 
 
-def counters(one: DaemonProcess) -> Mapping[str, int]:
-    return read_statistics(one.instance, one.shm_dir).counters
-
-
-def until(one: DaemonProcess, told: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
-    """Wait for a beat that tells this."""
+def until(one: DaemonProcess, is_so: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
+    """Wait for counters of which ``is_so`` is true; returns them."""
     waiting = Patience()
-    while waiting(not told(counters(one))):
+    while waiting(not is_so(counters(one))):
         time.sleep(0.02)
     return counters(one)
 
@@ -56,9 +52,9 @@ def load_all(one: DaemonProcess) -> shmmap.CellSet:
 
 
 def evict_all(one: DaemonProcess, client: shmmap.Client) -> None:
-    """Drop all cells, and wait until none is left that could be taken back."""
+    """Evict all cells, and wait until none could be reused."""
     client.evict()
-    until(one, lambda told: not told["cells_resident"] and not told["zombies"])
+    until(one, lambda counts: not counts["cells_resident"] and not counts["zombies"])
 
 
 def objects(web: FaultyWeb) -> list[Path]:
@@ -71,17 +67,18 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
     assert load_all(one).complete
     sizes = [path.stat().st_size for path in objects(web)]
     assert len(sizes) == CELLS + PAGES + 1
-    told = until(one, lambda told: told["objects_fetched"] == len(sizes))
-    assert told["bytes_fetched"] == sum(sizes)
-    assert (told["objects_from_disk"], told["fetches_failed"]) == (0, 0)
-    assert (told["published_version"], told["published_refused"], told["published_expires_unix_ns"]) == (
-        1,
-        0,
-        0,
+    counts = until(one, lambda counts: counts["objects_fetched"] == len(sizes))
+    assert counts["bytes_fetched"] == sum(sizes)
+    assert (counts["objects_from_disk"], counts["fetches_failed"]) == (0, 0)
+    assert counts["published_version"] == 1
+    assert (counts["published_refused"], counts["published_expires_unix_ns"]) == (0, 0)
+    assert began_ns < counts["published_taken_unix_ns"] < time.time_ns()
+    assert (counts["map_pages"], counts["map_pages_known"], counts["map_cells_known"]) == (
+        PAGES,
+        PAGES,
+        CELLS,
     )
-    assert began_ns < told["published_taken_unix_ns"] < time.time_ns()
-    assert (told["map_pages"], told["map_pages_known"], told["map_cells_known"]) == (PAGES, PAGES, CELLS)
-    taken_ns = told["published_taken_unix_ns"]
+    taken_ns = counts["published_taken_unix_ns"]
     waiting = Patience()
     while waiting(not list(one.state_dir.rglob("*.taken"))):
         time.sleep(0.02)
@@ -89,8 +86,8 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
     one.stop()
     one.start()
     assert load_all(one).complete
-    told = until(one, lambda told: told["objects_from_disk"] == CELLS + PAGES)  # the root is state
-    assert (told["objects_fetched"], told["published_taken_unix_ns"]) == (0, taken_ns)
+    counts = until(one, lambda counts: counts["objects_from_disk"] == CELLS + PAGES)  # the root is state
+    assert (counts["objects_fetched"], counts["published_taken_unix_ns"]) == (0, taken_ns)
 
 
 def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) -> None:
@@ -106,8 +103,8 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
     one.start()
     cells = load_all(one)
     assert len(cells.failed) == 1
-    told = until(one, lambda told: told["objects_damaged_in_store"] == 2)  # it is asked twice
-    assert (told["objects_damaged_on_disk"], told["fetches_failed"]) == (1, 2)
+    counts = until(one, lambda counts: counts["objects_damaged_in_store"] == 2)  # it is asked twice
+    assert (counts["objects_damaged_on_disk"], counts["fetches_failed"]) == (1, 2)
 
     before_ns = time.time_ns()
     web.refuse()
@@ -115,11 +112,11 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
         waiting = Patience()
         while waiting([failure.code for failure in client.area(ALL, wait=5.0).failed] != ["offline"]):
             time.sleep(0.05)
-    told = until(one, lambda told: told["origin_out"] == 1 and told["fetches_failed"] > 2)
-    assert before_ns < told["origin_out_since_unix_ns"] < time.time_ns()
+    counts = until(one, lambda counts: counts["origin_out"] == 1 and counts["fetches_failed"] > 2)
+    assert before_ns < counts["origin_out_since_unix_ns"] < time.time_ns()
     web.listen()
-    told = until(one, lambda told: told["origin_out"] == 0)
-    assert told["origin_out_since_unix_ns"] == 0
+    counts = until(one, lambda counts: counts["origin_out"] == 0)
+    assert counts["origin_out_since_unix_ns"] == 0
 
 
 def test_a_refused_offer_is_shown_until_another_one_comes(
@@ -130,24 +127,24 @@ def test_a_refused_offer_is_shown_until_another_one_comes(
     publish(other.root, web.folder)
     second = (web.folder / "CURRENT").read_bytes()
     one = daemon(web.url, "--poll", "1")
-    until(one, lambda told: told["published_version"] == 2)
+    until(one, lambda counts: counts["published_version"] == 2)
     (web.folder / "CURRENT").write_bytes(first)
-    until(one, lambda told: told["published_refused"] == 1)
+    until(one, lambda counts: counts["published_refused"] == 1)
     assert "version 1, which is offered, is refused, older" in Shmmap(one, tmp_path)("status")
     (web.folder / "CURRENT").write_bytes(second)
-    until(one, lambda told: told["published_refused"] == 0)
+    until(one, lambda counts: counts["published_refused"] == 0)
 
 
 def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -> None:
     one = daemon(web.url, "--poll", "0")
     assert load_all(one).complete
-    until(one, lambda told: told["objects_fetched"] == CELLS + PAGES + 1)
+    until(one, lambda counts: counts["objects_fetched"] == CELLS + PAGES + 1)
     shmmap_ = Shmmap(one, tmp_path)
-    told: dict[str, Any] = shmmap_.json("status")["published"]
-    assert shmmap_.json("top")["published"].keys() == told.keys()
-    assert (told["version"], told["objects_fetched"], told["cells_known"]) == (1, CELLS + PAGES + 1, CELLS)
-    assert told["expires_unix_s"] is told["offline_since_unix_s"] is told["refused"] is None
-    assert abs(told["taken_unix_s"] - time.time()) < 240
+    shown: dict[str, Any] = shmmap_.json("status")["published"]
+    assert shmmap_.json("top")["published"].keys() == shown.keys()
+    assert (shown["version"], shown["objects_fetched"], shown["cells_known"]) == (1, CELLS + PAGES + 1, CELLS)
+    assert shown["expires_unix_s"] is shown["offline_since_unix_s"] is shown["refused"] is None
+    assert abs(shown["taken_unix_s"] - time.time()) < 240
     status, top = shmmap_("status"), " ".join(shmmap_("top", "--once").split())
     assert re.search(r"^version +1, taken on \d{4}-\d\d-\d\d \d\d:\d\d UTC, .* ago$", status, re.MULTILINE)
     assert re.search(r"^known +all 4 cells$", status, re.MULTILINE)
@@ -174,7 +171,7 @@ def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
         waiting = Patience()
         while waiting(len(client.area(ALL, wait=5.0).failed) != CELLS):
             time.sleep(0.05)
-    until(one, lambda told: told["origin_out"] == 1)
+    until(one, lambda counts: counts["origin_out"] == 1)
     assert re.search(
         r"^origin +out of reach for .* \(since .* UTC\): what is in memory and on", shmmap_("status"), re.M
     )

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ import pytest
 from shmmap.dividing.progress import NoProgress
 from shmmap.errors import BadRequest, InstanceBusy, MapMissing, ShmmapError
 from shmmap.origin.map_directory import open_map
+from tests.process.conftest import Meanwhile
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.published_map_reader import PublishedMapReader
 
@@ -21,7 +21,7 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.origin.remote import map_versions
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.publishing import prune, publish, restore, sending
+from shmmap.publishing import prune, publish, restore
 from shmmap.publishing.messages import PublishSettings
 from shmmap.publishing.prune import Pruned
 from shmmap.publishing.publish import Published
@@ -76,33 +76,6 @@ def program(tmp_path: Path, town: DividedMap) -> Program:
     for blob in (made.folder / "blobs/sha256").iterdir():
         os.utime(blob, (1, 1))
     return made
-
-
-@pytest.fixture
-def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Callable[[], object]], list[object]]:
-    """Have something done when a step is come to for the first time; returns what came of it."""
-
-    def arrange(label: str, act: Callable[[], object]) -> list[object]:
-        outcome: list[object] = []
-        acting: list[bool] = []
-
-        def step(at: str) -> None:
-            if at == label and not acting:
-                acting.append(True)
-                try:
-                    outcome.append(act())
-                except ShmmapError as error:
-                    outcome.append(error)
-
-        for module in (map_versions, publish, sending, restore, prune):
-            if hasattr(module, "step"):
-                monkeypatch.setattr(module, "step", step)
-        return outcome
-
-    return arrange
-
-
-Meanwhile = Callable[[str, Callable[[], object]], list[object]]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from tests.support.divided_map import DividedMap, random_points
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
 from tests.support.publishing import publish
+from tests.support.waiting import counters
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -45,12 +46,8 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
         yield one
 
 
-def counters(one: DaemonProcess) -> Mapping[str, int]:
-    return read_statistics(one.instance, one.shm_dir).counters
-
-
 def until_ahead(one: DaemonProcess, seconds: float) -> None:
-    """Wait until all that is needed for so long is in memory."""
+    """Wait until all that is needed for ``seconds`` is in memory."""
     waiting = Patience()
     while waiting(counters(one)["ahead_ns"] < seconds * 1e9):
         time.sleep(0.02)
@@ -63,14 +60,14 @@ def until_in_memory(one: DaemonProcess, *names: str) -> None:
 
 
 def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
-    """Drive as far as is to be ridden out; no step is made before a vehicle could have come so far."""
+    """Drive through the outage, no faster than a vehicle could."""
     for x in range(STEP, DRIVEN_M, STEP):
         until_in_memory(one, f"{x - STEP}_0.pcd", f"{x}_0.pcd")
         update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S)
         assert update.complete, (x, update.failed)
-    told = counters(one)
-    assert told["cells_late"] == 0
-    assert told["origin_out"] == 1, "and it was away all the time"
+    counts = counters(one)
+    assert counts["cells_late"] == 0
+    assert counts["origin_out"] == 1, "it was away all the time"
 
 
 def until_out(one: DaemonProcess) -> None:
@@ -80,7 +77,7 @@ def until_out(one: DaemonProcess) -> None:
 
 
 def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, web: FaultyWeb) -> None:
-    """Of the list of cells there is room for a part only; what lies along the route stays."""
+    """Only a part of the list of cells fits; the pages along the route stay."""
     words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--catalogue-budget", "64K")
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
@@ -106,9 +103,9 @@ def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: 
             window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE)
             time.sleep(0.02)
         assert verdict.state == "enough"
-        told = counters(one)
-        assert told["ahead_ns"] < 0.5 * RIDE_OUT_S * 1e9, "memory has no room for all of it"
-        assert told["objects_fetched"] >= wanted
+        counts = counters(one)
+        assert counts["ahead_ns"] < 0.5 * RIDE_OUT_S * 1e9, "memory has no room for all of it"
+        assert counts["objects_fetched"] >= wanted
         web.refuse()
         until_out(one)
         drive(one, window)

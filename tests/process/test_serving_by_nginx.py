@@ -24,7 +24,7 @@ pytest.importorskip("obstore", reason="obstore is not installed")
 
 ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 SLOWLY = "limit_rate 1k;"
-"""A cell takes half a minute: whoever is cut off was in the middle of one."""
+"""A cell takes half a minute: a connection that is cut off was in the middle of one."""
 
 Cells = dict[str, bytes]
 
@@ -93,7 +93,7 @@ def ask_all(one: DaemonProcess, answers: list[Cells]) -> None:
 
 
 def test_transfers_that_are_cut_off_are_begun_again(daemon: DaemonFactory, town: Town) -> None:
-    """Killed in the middle of all of them, and back: the same bytes, and nothing half of it."""
+    """Killed in the middle of all transfers, and back: the same bytes, and nothing in halves."""
     one = daemon(town.url, "--poll", "0")
     town.restart(SLOWLY)
     answers: list[Cells] = []
@@ -108,7 +108,7 @@ def test_transfers_that_are_cut_off_are_begun_again(daemon: DaemonFactory, town:
             while waiting(not client.area(ALL, wait=5.0).failed):
                 time.sleep(0.02)
             kept = [path for path in Path(one.cache_dir).rglob("objects/cells/*/*") if path.is_file()]
-            assert kept == [], "nothing of what was cut off"
+            assert kept == [], "nothing of an interrupted transfer is kept"
             town.restart()
             while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
                 time.sleep(0.02)

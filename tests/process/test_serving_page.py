@@ -83,7 +83,7 @@ def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFact
 
 
 def verb(one: DaemonProcess, line: str) -> tuple[int, str]:
-    """Run a command of the page for this daemon; returns exit code and what is printed."""
+    """Run a command of the page for this daemon; returns its exit code and output."""
     words = shlex.split(line)[1:]
     place = ["--instance", one.instance, "--runtime-dir", one.runtime_dir]
     place += ["--shm-dir", one.shm_dir] if words[0] != "tail" else []
@@ -95,14 +95,14 @@ def verb(one: DaemonProcess, line: str) -> tuple[int, str]:
 
 
 def is_shown(line: str, text: str) -> bool:
-    """Whether a line of the page is printed, whatever its numbers, times and blanks are."""
+    """Whether a line of the page is printed, apart from its numbers, times and blanks."""
     fixed = re.split(r"\d+(?:\.\d+)? [smhd]\b|\d+", " ".join(line.split()))
     pattern = r"[\w. ]+?".join(re.escape(part) for part in fixed)
     return re.search(pattern, " ".join(text.split())) is not None
 
 
 def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
-    """Commands, what they print, and what is served meanwhile."""
+    """The page's commands, their output, and which cells are served meanwhile."""
     pytest.importorskip("obstore", reason="obstore is not installed")
     pytest.importorskip("zstandard", reason="zstandard is not installed")
     made = make_map(tmp_path / "files", columns=2, rows=2, points=300)
@@ -122,13 +122,13 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             cells = client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=60.0)
             assert {failure.code for failure in cells.failed} == {"offline"}
             assert {cell.id for cell in cells} == {cell.id for cell in near}
-            told = dict(zip(("health", "status", "doctor", "tail"), PAGE.commands("down"), strict=True))
+            commands = dict(zip(("health", "status", "doctor", "tail"), PAGE.commands("down"), strict=True))
             for name in ("health", "status", "doctor"):
-                code, text = verb(one, told[name])
+                code, text = verb(one, commands[name])
                 assert code == (1 if name == "health" else 0), text
                 for line in PAGE.blocks[name]:
                     assert is_shown(line, text), f"{line}\n\n{text}"
-            assert "offline" in verb(one, told["tail"])[1]
+            assert "offline" in verb(one, commands["tail"])[1]
             with pytest.raises(shmmap.Offline):
                 client.reload()
             del cells

@@ -31,6 +31,7 @@ from tests.support.preloaded import built_preload
 from tests.support.publishing import make_older, publish
 from tests.support.raw_client import DaemonError, RawClient, circle
 from tests.support.served_cells import names
+from tests.support.statistics_verbs import health, verb
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -232,21 +233,6 @@ def test_one_loader_fetches_many_objects_at_once(daemon: DaemonFactory, web: Fau
 
 
 # --- out of reach -------------------------------------------------------------------------------------
-
-
-def verb(one: DaemonProcess, *words: str) -> tuple[int, str]:
-    """Exit code of a verb that reads a daemon's statistics, and what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *words, "--instance", one.instance,
-         "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir],
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
-    )  # fmt: skip
-    return done.returncode, done.stdout
-
-
-def health(one: DaemonProcess) -> tuple[int, str]:
-    """Exit code of ``shmmap health --strict``, and what it says."""
-    return verb(one, "health", "--strict")
 
 
 def offline_codes(cells: Any) -> set[str]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole daemons that serve a published map under a root of trust: what is taken, refused, and served on."""
+"""Whole daemons that serve a published map under a root of trust: what they take, refuse, and still serve."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -18,7 +17,6 @@ import pytest
 import shmmap
 from shmmap.doctor.signed_map import trust_problems
 from shmmap.errors import Offline, ShmmapError
-from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess, stop
 from tests.support.divided_map import make_map
@@ -27,6 +25,8 @@ from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
 from tests.support.preloaded import built_preload
 from tests.support.publishing_verbs import Shmmap as Verbs
+from tests.support.statistics_verbs import health, verb
+from tests.support.waiting import counters
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -99,7 +99,7 @@ def flip(path: Path) -> None:
 
 
 def sign_timestamp(web: FaultyWeb, keys: Path, **fields: object) -> Signed:
-    """Sign the timestamp that is offered again, as the next one, with other fields."""
+    """Sign the offered timestamp again, as the next one, with other fields."""
     signed = Signed(web.folder, keys)
     sign_timestamp_of(signed, **fields)
     return signed
@@ -120,26 +120,9 @@ def versions_of(one: DaemonProcess) -> dict[str, int]:
         return {cell.id: cell.version for cell in cells}
 
 
-def counters(one: DaemonProcess) -> dict[str, int]:
-    return dict(read_statistics(one.instance, one.shm_dir).counters)
-
-
 def problems(one: DaemonProcess) -> str:
-    """What the statistics say is wrong with the signature and the offer."""
+    """Problems with the signature and the offer, by the statistics."""
     return "; ".join(trust_problems(counters(one), time.time()))
-
-
-def verb(one: DaemonProcess, *words: str, env: dict[str, str] | None = None) -> tuple[int, str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *words, "--instance", one.instance,
-         "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir],
-        env={**os.environ, "PYTHONPATH": str(ROOT), **(env or {})}, capture_output=True, text=True,
-    )  # fmt: skip
-    return done.returncode, done.stdout
-
-
-def health(one: DaemonProcess, env: dict[str, str] | None = None) -> tuple[int, str]:
-    return verb(one, "health", "--strict", env=env)
 
 
 def until_remembered(one: DaemonProcess) -> None:
@@ -149,7 +132,7 @@ def until_remembered(one: DaemonProcess) -> None:
 
 
 def until_polled(web: FaultyWeb, times: int) -> list[tuple[str, int]]:
-    """Wait until the origin was asked for its timestamp so often; returns all that was asked."""
+    """Wait for ``times`` requests of the timestamp; returns all requests."""
     asked, waiting = web.requests(), Patience()
     while waiting(sum(path == "timestamp.json" for path, _ in asked) < times):
         time.sleep(0.02)
@@ -189,7 +172,7 @@ def test_a_first_start_refuses_what_is_older_or_altered_in_its_root(
     assert one.run_to_end() == 65
     assert "its SHA-256 is not its name" in one.log
     assert not list(one.state_dir.rglob("*.taken"))
-    offer("one")  # what was signed later was seen, although it was not taken
+    offer("one")  # newer metadata was seen, although it was not taken
     assert one.run_to_end() == 65
     assert "refused, older" in one.log
 
@@ -327,9 +310,10 @@ def test_a_refusal_is_seen_by_every_verb_also_after_a_restart(
         time.sleep(0.02)
     assert verb(one, "health")[0] == 0, "clients lack nothing"
     assert says in verb(one, "status")[1]
-    found = doctor(one)[1]["signature"]
-    assert says in found["fact"]
-    assert (found["state"], found["advice"] != "") == ("warn", True)
+    found = doctor(one)[1]
+    assert says in found["versions"]["fact"]
+    assert (found["versions"]["state"], found["versions"]["advice"] != "") == ("warn", True)
+    assert found["signature"]["state"] == "ok"
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError, match="refused, altered"):
         client.reload()
     (web.folder / "timestamp.json").write_bytes(whole)
@@ -413,7 +397,7 @@ def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
     one.start()
     assert versions_of(one) == served
     one.stop()
-    # neither under another root of trust, nor what was taken without one
+    # no version taken under another root of trust, or without one
     one.arguments = list(trusting(made_once / "others"))
     assert one.run_to_end() == 71
     assert "no answer" in one.log
@@ -460,7 +444,7 @@ def _shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def clock(_shim: Path) -> Callable[[float], dict[str, str]]:
-    """Environment of a process whose clock is so many days ahead."""
+    """Environment of a process whose clock is ``days`` days ahead."""
 
     def off(days: float) -> dict[str, str]:
         return {"LD_PRELOAD": str(_shim), "CLOCK_AHEAD_S": str(int(days * DAY_S))}
@@ -522,7 +506,7 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
 
 
 def test_a_clock_a_day_behind(daemon: DaemonFactory, web: FaultyWeb, keys: Path, clock: Clock) -> None:
-    """It is named; and what had expired when the timestamp was signed is found to have."""
+    """It is named; metadata that had expired when the timestamp was signed counts as expired."""
     sign_timestamp(web, keys, expires=in_days(1))
     one = daemon(web.url, *trusting(keys), "--poll", "1", environment=clock(-1))
     assert len(versions_of(one)) == 2
@@ -621,7 +605,7 @@ def test_a_daemon_ends_while_it_verifies(daemon: DaemonFactory, web: FaultyWeb, 
 
 
 def test_where_a_store_hides_what_it_does_not_have(daemon: DaemonFactory, web: FaultyWeb, keys: Path) -> None:
-    """A bucket whose user may read objects and not list them answers 403 for one that is not there."""
+    """A bucket whose user may read but not list objects answers 403 for an absent one."""
     web.fault = lambda path: "" if (web.folder / path).exists() else "403"
     one = daemon(web.url, *trusting(keys))
     assert len(versions_of(one)) == 2

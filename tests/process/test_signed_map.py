@@ -417,7 +417,7 @@ def test_a_rotation_killed_anywhere_leaves_a_valid_map(
     shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
     assert read_signed(store, keys).version == 1
     assert shmmap.json("versions", store, "--trust", keys / "ROOT.json")["current"] == 1
-    # what is published in between is signed by keys that are named then
+    # a version published in between is signed by the keys named then
     town.change("0_0.pcd", seed=1)
     assert shmmap.json("publish", town.root, store, "--sign", keys)["version"] == 2
     assert read_signed(store, keys).version == 2

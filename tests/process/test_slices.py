@@ -17,6 +17,7 @@ import pytest
 
 from shmmap.dividing.progress import NoProgress
 from shmmap.errors import InstanceBusy, MapDataError, ShmmapError
+from tests.process.conftest import Meanwhile
 from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
@@ -32,7 +33,7 @@ import zstandard
 from shmmap.origin.remote import map_versions
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.slice_part import Part, pack_part, read_run, unpack_part
-from shmmap.publishing import joining, prune, publish, sending
+from shmmap.publishing import joining, prune
 from tests.support.message_pack import pack, unpack
 
 LAYERS = ("sample(every=2)", "around(radius=3.0)")
@@ -41,7 +42,7 @@ DAY_S = 86_400
 
 
 class Town:
-    """A published town of four shards, and what makes slices of it."""
+    """A published town of four shards, and the commands that make slices of it."""
 
     def __init__(self, folder: Path, made: DividedMap, shmmap: Shmmap, kept: Path) -> None:
         self.folder = folder
@@ -68,7 +69,7 @@ class Town:
         )  # fmt: skip
 
     def slices(self, count: int) -> str:
-        """Make all, the last first, or take them as they were made before; returns the run."""
+        """Make all slices, the last first, or copy those made before; returns the run."""
         kept = self.kept / f"in {count}"
         if not kept.exists():
             for number in range(count, 0, -1):
@@ -86,7 +87,7 @@ class Town:
         return joining.join_slices(open_store(str(self.url)), run, progress=NoProgress())
 
     def refused(self, run: str, code: int) -> str:
-        """What a join says that has changed nothing."""
+        """Error of a join, which has to change nothing."""
         before = self.files()
         with pytest.raises(ShmmapError) as refused:
             self.join_here(run)
@@ -150,7 +151,7 @@ def root(_made: tuple[Path, str, str]) -> str:
 
 @pytest.fixture
 def map_version(_made: tuple[Path, str, str]) -> str:
-    """The map version of that."""
+    """The map version of the town, published with its layers in one go."""
     return _made[2]
 
 
@@ -199,7 +200,7 @@ def test_in_a_bucket_nothing_is_sent_twice(town: Town, root: str, buckets: Bucke
 
 
 def test_layers_of_all_kinds_of_points_in_millimetres_too(town: Town) -> None:
-    """Halos whose order counts, cells without points, points outside their box, some that stay exact."""
+    """Halos whose order matters, cells without points, points outside their box, some that stay exact."""
     open3d_or_skip()
     empty = {name: values[:0] for name, values in town.made.points("0_0.pcd").items()}
     town.made.write_cell("20_0.pcd", (20, 0), empty)
@@ -397,32 +398,6 @@ def test_a_join_that_is_killed_is_finished_by_the_same_command(label: str, town:
 # --- two at a time ------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Callable[[], object]], list[object]]:
-    """Have something done when a step is come to for the first time; returns what came of it."""
-
-    def arrange(label: str, act: Callable[[], object]) -> list[object]:
-        outcome: list[object] = []
-        acting: list[bool] = []
-
-        def step(at: str) -> None:
-            if at == label and not acting:
-                acting.append(True)
-                try:
-                    outcome.append(act())
-                except ShmmapError as error:
-                    outcome.append(error)
-
-        for module in (map_versions, publish, sending, joining, prune):
-            monkeypatch.setattr(module, "step", step)
-        return outcome
-
-    return arrange
-
-
-Meanwhile = Callable[[str, Callable[[], object]], list[object]]
-
-
 @pytest.mark.parametrize("label", [*JOIN_STEPS, "publish.send"])
 def test_of_two_joins_one_wins_and_the_other_learns_it(
     label: str, town: Town, root: str, meanwhile: Meanwhile
@@ -477,7 +452,7 @@ def test_of_a_join_and_a_publisher_one_wins(label: str, town: Town, root: str, m
 def test_pruning_meanwhile_takes_nothing_that_is_served(
     label: str, town: Town, root: str, meanwhile: Meanwhile
 ) -> None:
-    """All that slices have sent is as old as what pruning removes."""
+    """All objects that slices have sent are old enough to be pruned."""
     before = set((town.store / "blobs/sha256").iterdir())
     run = town.slices(2)
     for path in {*(town.store / "blobs/sha256").iterdir()} - before:

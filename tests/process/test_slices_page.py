@@ -213,7 +213,7 @@ def test_a_dask_worker_that_is_killed_changes_nothing(
             time.sleep(0.001)
         victim.send_signal(signal.SIGKILL)
         printed, errors = example.communicate()
-        for pid in making:  # it goes on without its parent, which harms nothing
+        for pid in making:  # it continues without its parent, which is harmless
             wait_ended(pid)
     finally:
         example.kill()

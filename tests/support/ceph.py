@@ -78,7 +78,7 @@ class CephServer(BucketServer):
         self._marks = 0
 
     def requests(self) -> list[tuple[str, str, int, int]]:
-        """What was asked since the last call: method, path, status, and 0: its log has no sizes."""
+        """Requests since the last call: method, path, status, and 0: its log has no sizes."""
         mark = f"/mark-{self._marks}"
         self._marks += 1
         with suppress(urllib.error.HTTPError):
@@ -120,7 +120,7 @@ class CephServer(BucketServer):
         process.wait()
 
     def repair(self) -> None:
-        """Start what was killed, and wait until all of it serves."""
+        """Start the daemons that were killed, and wait until all serve."""
         for name in ("client.rgw", *(f"osd.{number}" for number in _DISKS)):
             if name not in self._daemons:
                 self.start(name)

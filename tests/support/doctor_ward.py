@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Machines for doctor, made of files in a directory, and daemons that tell what a test wants."""
+"""Machines for doctor, made of files in a directory, and daemons with given statistics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shmmap.doctor.patient import Machine, Patient
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["IDENTITY", "USER", "Told", "Ward", "told"]
+__all__ = ["IDENTITY", "USER", "Ward", "snapshot"]
 
 USER = 61005
 IDENTITY = DaemonIdentity(
@@ -23,17 +23,17 @@ IDENTITY = DaemonIdentity(
 )  # fmt: skip
 
 
-class Told(Snapshot):
+class _Made(Snapshot):
     """Statistics with these counters."""
 
-    def __init__(self, state: str, version: str, told: dict[str, int]) -> None:
+    def __init__(self, state: str, version: str, counters: dict[str, int]) -> None:
         identity = None if state == "absent" else dataclasses.replace(IDENTITY, library_version=version)
         super().__init__(cast("Any", state), identity)
-        self.__dict__["counters"] = told
+        self.__dict__["counters"] = counters
 
 
-def told(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
-    return Told(state, version, counters)
+def snapshot(state: str = "healthy", *, version: str = shmmap.__version__, **counters: int) -> Snapshot:
+    return _Made(state, version, counters)
 
 
 class Ward:
@@ -52,4 +52,4 @@ class Ward:
     ) -> Patient:
         (self.root / "dev/shm").mkdir(parents=True, exist_ok=True)
         config = DaemonConfig(**settings)  # type: ignore[arg-type]
-        return Patient(Machine(self.root), config, file, config.endpoint, seen or told("absent"), uid=uid)
+        return Patient(Machine(self.root), config, file, config.endpoint, seen or snapshot("absent"), uid=uid)

@@ -21,7 +21,7 @@ from pathlib import Path
 __all__ = ["Fault", "FaultyWeb", "Read", "faulty_web"]
 
 Read = Callable[[str], bytes]
-"""Returns what lies at a path; OSError: nothing."""
+"""Returns the content of a path; OSError: there is none."""
 Fault = Callable[[str], str]
 """What becomes of a request for a path: ``stall`` (no answer), ``stall body`` (but not the rest of one),
 ``truncate``, ``corrupt``, a status such as ``503``, or one with Amazon's code such as ``403 ExpiredToken``;
@@ -55,7 +55,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Say nothing."""
 
     def date_time_string(self, timestamp: float | None = None) -> str:
-        """Say what the server's clock shows."""
+        """Set the time that the server's clock shows."""
         return super().date_time_string((timestamp or time.time()) + self.server.web.clock_ahead_s)
 
     def do_GET(self) -> None:
@@ -179,7 +179,7 @@ class FaultyWeb:
 
 @contextmanager
 def faulty_web(source: Path | Read) -> Iterator[FaultyWeb]:
-    """Run a server of a directory, or of what is read otherwise, until the end of the block."""
+    """Run a server of a directory, or of a reading function, until the end of the block."""
     web = FaultyWeb(source)
     try:
         yield web

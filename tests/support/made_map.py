@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map of any number of cells, each of whose objects is made when it is asked for.
+"""A published map of any number of cells, whose objects are generated on request.
 
 ``python -m tests.support.made_map CELLS POINTS`` serves one until stdin is closed.  It prints its port and
-what else `ServedMadeMap` has to know, and answers each line of stdin with how many cells' objects it has sent
-whole.
+other attributes of `ServedMadeMap`, and answers each line of stdin with the number of cells' objects that it
+has sent whole.
 
 An object is a pure function of its cell's number.  The points are those of one of a few patterns, in the box
 of the first cell wherever the cell lies; the last bytes of the object, which only fill it up to a multiple of
@@ -17,7 +17,6 @@ import json
 import math
 import os
 import struct
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -47,8 +46,8 @@ from shmmap.origin.remote.published_index import (
 )
 from shmmap.origin.remote.published_object import bare_object, blob_path
 from shmmap.origin.remote.zstd_frame import LEVEL, pack_frame
-from tests.support.daemon_process import ROOT
 from tests.support.faulty_web import faulty_web
+from tests.support.line_process import LineProcess, line_process
 
 if TYPE_CHECKING:
     from hashlib import _Hash
@@ -60,8 +59,8 @@ SHARD_CELLS: Final = 32
 SHARD_M: Final = SHARD_CELLS * CELL_M
 PATTERNS: Final = 16
 NAME_BYTES: Final = 12
-"""Of the hash in a cell's name: so the index has as many bytes a cell as a recorded map's (89), although here
-sizes and heights of cells repeat."""
+"""Bytes of the hash in a cell's name: so the index has as many bytes per cell as a recorded map's (89),
+although here sizes and heights of cells repeat."""
 _NUMBER: Final = struct.Struct("<Q")
 _RAW_BLOCK: Final = (1 | _NUMBER.size << 3).to_bytes(3, "little")
 """Header of the last block of a zstd frame, which is not compressed (RFC 8878, 3.1.1.2)."""
@@ -71,7 +70,7 @@ _SPREAD: Final = 2654435761
 
 @dataclass(frozen=True, eq=False)
 class _Pattern:
-    """What the objects of some cells begin with, packed and unpacked, and the hashes of that."""
+    """The common beginning of some cells' objects, packed and unpacked, and its hashes."""
 
     begin: bytes
     begin_sha256: _Hash
@@ -86,7 +85,7 @@ class _Pattern:
         return self.begin + _RAW_BLOCK + _NUMBER.pack(number)
 
     def digests(self, number: int) -> tuple[bytes, bytes]:
-        """Return the SHA-256 of an object and of what is in it."""
+        """Return the SHA-256 of an object and of its unpacked content."""
         end = _NUMBER.pack(number)
         name, content = self.begin_sha256.copy(), self.content_sha256.copy()
         name.update(_RAW_BLOCK + end)
@@ -116,7 +115,7 @@ def _make_pattern(seed: int, points: int) -> _Pattern:
         os.close(fd)
     unpacked = bytes(bare_object(memoryview(segment)))
     begin = unpacked[: -_NUMBER.size]
-    assert not any(unpacked[len(begin) :]), "they fill up, and mean nothing"
+    assert not any(unpacked[len(begin) :]), "they are padding"
     packer = zstandard.ZstdCompressor(level=LEVEL, write_content_size=True).compressobj(size=len(unpacked))
     packed = packer.compress(begin) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
     z = header.z_min, header.z_max
@@ -190,7 +189,7 @@ class MadeMap:
 
     @cached_property
     def root(self) -> Root:
-        """What the map is; all shards are made for it once."""
+        """The map's root; all shards are made for it once."""
         numbers = range(self._shards_along**2)
         rows = [self._shard_row(number) for number in numbers]
         extent = self.side * CELL_M
@@ -266,23 +265,18 @@ class ServedMadeMap:
     side
         Cells along each side.
     mean_object_bytes, index_bytes_per_cell
-        Mean size of a cell's object, and what the shards have for each cell.
+        Mean size of a cell's object, and bytes of the shards per cell.
     """
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: LineProcess) -> None:
         self._process = process
-        self.port, self.side, self.mean_object_bytes, self.index_bytes_per_cell = self._answer()
-
-    def _answer(self) -> Any:
-        assert self._process.stdout is not None
-        return json.loads(self._process.stdout.readline())
+        first = json.loads(process.read())
+        self.port, self.side, self.mean_object_bytes, self.index_bytes_per_cell = first
 
     def cells_sent(self) -> int:
-        """How many cells' objects were sent whole so far."""
-        assert self._process.stdin is not None
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
-        return int(self._answer())
+        """Number of cells' objects sent whole so far."""
+        self._process.write("")
+        return int(self._process.read())
 
     @property
     def url(self) -> str:
@@ -293,15 +287,8 @@ class ServedMadeMap:
 @contextmanager
 def serve_made_map(cells: int, points: int) -> Iterator[ServedMadeMap]:
     """Serve a map by a process of its own until the end of the block."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.support.made_map", str(cells), str(points)],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
+    with line_process("tests.support.made_map", str(cells), str(points)) as process:
         yield ServedMadeMap(process)
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def main() -> None:

@@ -73,11 +73,11 @@ class Nginx:
 
     @property
     def command(self) -> list[str]:
-        """How it is started: as root its workers stay root, who owns the directories of tests."""
+        """Its command: as root its workers stay root, the owner of the tests' directories."""
         user = " user root;" if os.geteuid() == 0 else ""
         log = str(self.folder / "error.log")
-        told = ["-p", str(self.folder), "-c", str(self._file), "-e", log, "-g", f"daemon off;{user}"]
-        return [needed_nginx(), *told]
+        options = ["-p", str(self.folder), "-c", str(self._file), "-e", log, "-g", f"daemon off;{user}"]
+        return [needed_nginx(), *options]
 
     def configure(self, configuration: str) -> None:
         """Take another configuration, from the next start on."""

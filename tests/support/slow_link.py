@@ -3,8 +3,8 @@
 
 ``python -m tests.support.slow_link PLAN`` takes a `Plan` as JSON and prints its port.  All connections share
 the bandwidth, each direction for itself; TCP's slow start and the bytes of its headers are not imitated.
-While the link is out nothing passes in either direction, and nobody is told: what a client sends, or should
-get, waits until the link is back or the client has gone.
+While the link is out nothing passes in either direction, without an error: bytes from and to a client wait
+until the link is back or the client has gone.
 
 A line of stdin that is a JSON list of pairs says from when to when the link is out, in seconds of
 `time.monotonic`; any other line is answered with how many bytes the server's side has sent so far.
@@ -18,29 +18,28 @@ import json
 import math
 import os
 import random
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final, NamedTuple, TypeAlias
 
-from tests.support.daemon_process import ROOT
+from tests.support.line_process import LineProcess, line_process
 
 __all__ = ["Plan", "SlowLink", "slow_link"]
 
 SIGMA: Final = 0.8
-"""Standard deviation of the logarithm of what an answer takes."""
+"""Standard deviation of the logarithm of an answer's time."""
 CHUNK_BYTES: Final = 16 << 10
 AHEAD_S: Final = 0.01
-"""So much is read before the link is free for it: else it would idle while the proxy wakes up."""
+"""Bytes are read this long before the link is free for them: it would idle while the proxy wakes up."""
 
 _Queue: TypeAlias = "asyncio.Queue[tuple[float, bytes]]"
-"""When chunks arrive, and they."""
+"""Chunks, each with the time at which it arrives."""
 
 
 class Plan(NamedTuple):
-    """What a link is like.
+    """Properties of a link.
 
     Attributes
     ----------
@@ -51,9 +50,9 @@ class Plan(NamedTuple):
     delay_s
         How long a byte is on its way; a new connection takes two of these more.
     mean_s
-        Mean of a log-normal time that each answer takes more, seconds; 0: none.
+        Mean of a log-normal delay of each answer, seconds; 0: none.
     seed
-        Of these times.
+        Seed of these delays.
     """
 
     port: int
@@ -66,42 +65,26 @@ class Plan(NamedTuple):
 class SlowLink:
     """A running link."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: LineProcess) -> None:
         self._process = process
-        self.port = int(self._ask())
+        self.port = int(process.read())
         self.endpoint = f"http://127.0.0.1:{self.port}"
-
-    def _ask(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline()
-
-    def _say(self, line: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(line + "\n")
-        self._process.stdin.flush()
 
     def go_out(self, periods: Sequence[tuple[float, float]]) -> None:
         """Let nothing pass in these periods, ascending, in seconds of `time.monotonic`."""
-        self._say(json.dumps(list(periods)))
+        self._process.write(json.dumps(list(periods)))
 
     def received_bytes(self) -> int:
-        """How much has come from the server so far."""
-        self._say("count")
-        return int(self._ask())
+        """Bytes that the server has sent so far."""
+        self._process.write("count")
+        return int(self._process.read())
 
 
 @contextmanager
 def slow_link(plan: Plan) -> Iterator[SlowLink]:
     """Run a link until the end of the block."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.support.slow_link", json.dumps(plan)],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
+    with line_process("tests.support.slow_link", json.dumps(plan)) as process:
         yield SlowLink(process)
-    finally:
-        process.kill()
-        process.communicate()
 
 
 class _Outages:
@@ -114,7 +97,7 @@ class _Outages:
         self._periods = sorted(periods)
 
     def end_of(self, now_s: float) -> float:
-        """When what would pass now does."""
+        """When bytes that would pass now do pass."""
         for from_s, to_s in self._periods:
             if from_s <= now_s < to_s:
                 now_s = to_s
@@ -168,7 +151,7 @@ class _Connection:
             server[1].close()
 
     async def _take_up(self, client: asyncio.StreamReader, queue: _Queue) -> None:
-        """Read requests, until the client wants nothing more: then what is on its way is lost."""
+        """Read requests until the client closes; answers still on their way are then lost."""
         while data := await client.read(CHUNK_BYTES):
             entered_s = self._up.pass_through(len(data), time.monotonic())
             if not self._is_asked:  # the first bytes of a request: no client here sends the next one before
@@ -187,7 +170,7 @@ class _Connection:
         queue.put_nowait((0.0, b""))
 
     def _longer_s(self) -> float:
-        """What an answer takes more."""
+        """Delay of an answer, seconds."""
         mean_s = self._plan.mean_s
         # the mean of a log-normal distribution is exp(mu + sigma^2 / 2)
         return self._took.lognormvariate(math.log(mean_s) - SIGMA**2 / 2, SIGMA) if mean_s else 0.0
@@ -212,7 +195,7 @@ async def _serve(plan: Plan) -> None:
             await _Connection(plan, up, down, took).run((reader, writer))
 
     def commands() -> None:
-        data = os.read(sys.stdin.fileno(), 1 << 20)  # what a text file buffers would not be seen again
+        data = os.read(sys.stdin.fileno(), 1 << 20)  # bytes that a text file buffers would be lost
         if not data:
             loop.remove_reader(sys.stdin)
         for line in data.decode().splitlines():

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import datetime
 import time
 from collections.abc import Mapping
 
 from shmmap.doctor.signed_map import signature_lines, trust_problems
-from shmmap.quantities import counted, format_bytes, format_duration
+from shmmap.quantities import counted, format_bytes, format_duration, format_utc
 from shmmap.statistics.counters import OBJECTS_READ
 
 __all__ = ["published_as_json", "published_lines", "published_words", "since"]
@@ -47,7 +46,7 @@ def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
 
 
 def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
-    """Return the same in short pieces, and whether each is trouble."""
+    """Return the same as short texts, each with whether it is a problem."""
     if not counters.get("published_version"):
         return []
     problems = trust_problems(counters, time.time())
@@ -58,15 +57,15 @@ def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
 
 
 def since(counters: Mapping[str, int]) -> str:
-    """Return since when the origin is out of reach, in brackets with a blank before; or nothing."""
+    """Return `` (since TIME)`` while the origin is out of reach, else an empty string."""
     began_ns = counters.get("origin_out_since_unix_ns", 0)
-    return f" (since {_date(began_ns, seconds=True)})" if began_ns else ""
+    return f" (since {format_utc(began_ns // 10**9, seconds=True)})" if began_ns else ""
 
 
 def _version(counters: Mapping[str, int]) -> str:
     taken_ns = counters["published_taken_unix_ns"]
     ago = format_duration(max(time.time() - taken_ns * 1e-9, 0.0))
-    return f"{counters['published_version']}, taken on {_date(taken_ns)}, {ago} ago"
+    return f"{counters['published_version']}, taken on {format_utc(taken_ns // 10**9)}, {ago} ago"
 
 
 def _signature(counters: Mapping[str, int]) -> list[str]:
@@ -98,8 +97,3 @@ def _troubles(counters: Mapping[str, int]) -> str:
         ("objects_damaged_in_store", "came damaged from the store"),
     )
     return ", ".join(f"{counters[name]:,} {text}" for name, text in found if counters[name])
-
-
-def _date(unix_ns: int, *, seconds: bool = False) -> str:
-    when = datetime.datetime.fromtimestamp(unix_ns // 10**9, datetime.timezone.utc)
-    return f"{when:%Y-%m-%d %H:%M}{f':{when:%S}' if seconds else ''} UTC"

@@ -30,7 +30,7 @@ _CHOSEN = {
     "group": "only the daemon's own user may connect",
     "admin_group": "only root and the daemon's own user",
     "budget_bytes": "at start: a quarter of the memory available, at most 4 GiB",
-    "trust": "nothing is verified: what the map's origin says is taken",
+    "trust": "nothing is verified: the version that the map's origin names is taken",
     "workers": "at start: one less than there are processors, from 1 to 4",
     "cache_dir": "the service's or the user's cache directory",
     "cache_bytes": "no layers are kept",

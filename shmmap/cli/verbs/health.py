@@ -24,8 +24,8 @@ _JSON = """\
    "troubles": [text], what --strict counts}
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
 also 1 while clients lack something: cells were refused in the last minute, the map's files are out of
-reach, the map could not be read again or has problems, what signs it has expired, what its origin offers is
-refused, or a live map has one."""
+reach, the map could not be read again or has problems, its signature has expired, the version that its origin
+offers is refused, or a live map has a problem."""
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``shmmap publish MAP URL``: a map into a bucket or a directory, for vehicles to fetch.
 
-``shmmap publish URL --join RUN`` makes a version of what the slices of a run have made.
+``shmmap publish URL --join RUN`` joins the slices of a run into a version.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ JSON (fields may be added, none is removed):
    "sent_objects", "sent_bytes", "seconds", "failed": [{"id", "layer", "message"}],
    "notes": [text], oddities of the map}
   --join: {"url", "run", "slices", "changed", "version": the current one, "map_version": hex, "root", "cells",
-   "layers": [spec], "objects": that were looked for, "seconds"}
+   "layers": [spec], "objects": that were checked, "seconds"}
 Exit code: 0, 1 if a layer of some cell cannot be made (nothing is published then), 2 wrong usage, 65 bad map
 or damaged version, 66 no map or bucket, or slices are missing, 69 a package is missing, 73 cannot write,
 75 the store does not answer or refuses, or another publisher was quicker, 78 unusable credentials or
@@ -109,7 +109,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 class _Join(argparse.Action):
-    """Takes the name of a run; the URL is then the one argument, which argparse takes for MAP."""
+    """Takes the name of a run; the only argument is then the URL, and argparse calls it MAP."""
 
     def __init__(self, *, url: argparse.Action, **settings: Any) -> None:
         super().__init__(**settings)

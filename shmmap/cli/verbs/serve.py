@@ -20,8 +20,8 @@ it.  A LAS or float64 cloud far from the origin is shifted close to it, and the 
 by how much.  To keep its frame: `shmmap divide --translate none`, and serve that map.
 MAP may also be where `shmmap publish` has put a map: an s3://, gs://, az://, https:// or file:// URL, or a
 directory.  Its cells are fetched as they are needed; a new version is taken by itself (--poll), and on
-`shmmap reload`.  With --trust what is unsigned, older, expired, altered or signed by others is not taken;
-what was taken is served on.
+`shmmap reload`.  With --trust a version that is unsigned, older, expired, altered or signed by others is
+refused; the version taken before is still served.
 `shmmapd` is `shmmap serve`: the same options.
 Clients find the daemon by --instance, or by --endpoint; with that alone, the instance is named as the socket.
 Signals: SIGTERM and SIGINT stop it and free all memory; SIGUSR1 stops it and keeps the cells in memory for

@@ -55,7 +55,7 @@ class Adoption:
     loads: Loads
     misplaced: MisplacedCells
     _aside: dict[str, tuple[Box, int]] = field(default_factory=dict)  # where to look, and the bytes, by name
-    _by_page: dict[int, list[str]] = field(default_factory=dict)  # names by one page that each waits for
+    _by_page: dict[int, list[str]] = field(default_factory=dict)  # names, by a page that they wait for
 
     def take_over(self, now_s: float) -> None:
         """Look at every name once."""
@@ -74,7 +74,7 @@ class Adoption:
             self._judge(self._by_page.pop(page, ()), now_s)
 
     def map_changed(self, now_s: float) -> None:
-        """Another state of the map is served, with other pages: judge what these know."""
+        """Another state of the map is served, with other pages: judge by the pages that are here."""
         self._by_page.clear()
         self._judge(list(self._aside), now_s)
 
@@ -100,7 +100,7 @@ class Adoption:
         return next((page for page in pages.of_area(area) if not pages.is_here(page)), None)
 
     def _wait_for_page(self, name: str, area: Box) -> bool:
-        """Let a segment wait for one page of its area that is not here; whether there is one."""
+        """Let a segment wait for one absent page of its area; False if none is absent."""
         page = self._absent_page(area)
         if page is not None:
             self._by_page.setdefault(page, []).append(name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches an origin elsewhere: asks it when loads fail, and what failed is fetched once it answers again."""
+"""Watches a remote origin: asks it when loads fail; once it answers again, failed loads are repeated."""
 
 from __future__ import annotations
 

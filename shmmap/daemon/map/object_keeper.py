@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Has objects of a published map kept on the disk before any loader needs them, in a few threads.
+"""Fetches objects of a published map onto the disk before any loader needs them, in a few threads.
 
-They are fetched and compared with their hash as loaders do it, and nothing in them is looked at.
+They are fetched and checked against their hash as loaders do it; they are not unpacked.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ __all__ = ["Kept", "KeptCell", "ObjectKeeper"]
 
 THREADS: Final = 8
 END_S: Final = 0.5
-"""How long the end of the daemon waits for a thread that waits for the store."""
+"""How long a daemon that ends waits for a thread that waits for the store, seconds."""
 
 
 class KeptCell(NamedTuple):
-    """What objects are for: a layer of a cell, by its index in a version of the map."""
+    """The layer of a cell that objects belong to; the cell by its index in a version of the map."""
 
     map_version: int
     cell: int
@@ -43,7 +43,7 @@ class Kept(NamedTuple):
     is_here
         They are on the disk.
     has_no_room
-        They were fetched, and the disk does not take them.
+        They were fetched, but the disk has no room for them.
     """
 
     key: KeptCell
@@ -62,7 +62,7 @@ class ObjectKeeper:
     Attributes
     ----------
     fd
-        Readable when `take` has something to say.
+        Readable when `take` has results.
     """
 
     def __init__(self, objects: KeptObjects, tier: ObjectTier, failed: Callable[[], None]) -> None:
@@ -89,7 +89,7 @@ class ObjectKeeper:
         self._wanted.put((key, names))
         if len(self._threads) < min(self._under_way, THREADS):
             thread = threading.Thread(target=self._run, name="keep", daemon=True)
-            with contextlib.suppress(RuntimeError):  # there are as many threads as there may be
+            with contextlib.suppress(RuntimeError):  # the system allows no more threads
                 thread.start()
                 self._threads.append(thread)
 
@@ -118,9 +118,9 @@ class ObjectKeeper:
         except Offline:
             self._failed()
             return Kept(key, False)
-        except ShmmapError:  # a loader that needs it says so, by the cell's name
+        except ShmmapError:  # a loader that needs it reports it, with the cell's name
             return Kept(key, False)
-        except Exception:  # noqa: BLE001  else it would count as under way for ever
+        except Exception:  # noqa: BLE001  else it would stay under way
             log.exception("an object cannot be kept on disk ahead", cause="a defect in shmmap")
             return Kept(key, False)
         return Kept(key, True)

@@ -51,11 +51,11 @@ __all__ = ["PublishedOrigin"]
 
 NOTHING: Final = CurrentState(None, None)
 VERIFY_S: Final = 30.0
-"""Most time for verifying what is signed: a server that says nothing is given up long before."""
+"""Time limit for verifying, seconds: requests to a silent server end long before."""
 
 
 class _Offer(NamedTuple):
-    """The version that the origin says is current, and of a signed one when it was signed and runs out."""
+    """The version that the origin names as current; if signed, when it was signed and when that expires."""
 
     current: Current
     signed_s: float = 0.0
@@ -76,9 +76,9 @@ class _Problem(NamedTuple):
 class PublishedOrigin:
     """What views of a published map come from; see `shmmap.daemon.map.catalogue_view.ViewOrigin`.
 
-    The first view is of the version that was taken last, whatever the origin says then, if anything.  An
-    offer that cannot be taken is a problem that a reload says once, not with each poll; another reload
-    follows when it is another problem, or none.
+    The first view is of the version that was taken last, whatever the origin offers then.  A reload reports
+    an offer that cannot be taken once, not with each poll; the next reload follows when the problem changes
+    or ends.
 
     Parameters
     ----------
@@ -93,13 +93,13 @@ class PublishedOrigin:
     accept_version
         A version that is taken although a later one was taken before; 0: none.
     trust
-        Path of the root of trust: what is current is then what is signed under it, which a process apart
-        verifies, and only what was taken under it is served at the start.  Empty: what ``CURRENT`` says.
+        Path of the root of trust: the current version is then the one signed under it, as a separate process
+        verifies, and only a version taken under it is served at the start.  Empty: the one in ``CURRENT``.
 
     Raises
     ------
     ConfigError
-        The root of trust cannot be read or is none, or there is no state directory for what was verified.
+        The root of trust cannot be read or is not one, or there is no state directory for what was verified.
 
     Attributes
     ----------
@@ -169,12 +169,12 @@ class PublishedOrigin:
         MapMissing
             Nothing is published there.
         MapDataError
-            Its index is damaged, or the version is lower than one that was taken before; or it is refused
-            under the root of trust, see `verify_apart`, whose other errors come, too.
+            Its index is damaged, the version is lower than one taken before, or the root of trust refuses it:
+            see `verify_apart`, whose other errors are raised, too.
         Offline
             It is out of reach.
         CannotStart
-            So it is at the start, and nothing was taken before.
+            The same at the start, when nothing was taken before.
         """
         view = before if isinstance(before, PublishedView) else None
         self._is_loading = True
@@ -184,13 +184,13 @@ class PublishedOrigin:
                     try:
                         return self._offered(None)
                     except ShmmapError:
-                        self._problem = None  # the next poll says it
+                        self._problem = None  # the next poll reports it
                 return self._restored(*taken)
             return self._offered(view)
         except Offline as error:
             if fresh:
                 raise
-            # of this the service manager knows that it may get better
+            # its exit code says to the service manager that a later start may succeed
             raise CannotStart(error.message, hint=error.hint) from None
         finally:
             self._is_loading = False
@@ -225,7 +225,7 @@ class PublishedOrigin:
         return self._take(taken, root, known)
 
     def _read_offer(self) -> _Offer:
-        """Ask which version is current: the one that is signed, or without a root of trust what is said."""
+        """Ask which version is current: the signed one, or without a root of trust the one in ``CURRENT``."""
         self._refused = 0
         if self._trust:
             return self._verify()
@@ -237,9 +237,9 @@ class PublishedOrigin:
         return _Offer(self._seen.current)
 
     def _verify(self) -> _Offer:
-        """Have it verified which version is signed."""
+        """Have a separate process verify which version is signed."""
         tag = None
-        with contextlib.suppress(MapMissing, MapDataError):  # verifying says by name what is wrong
+        with contextlib.suppress(MapMissing, MapDataError):  # verifying names what is wrong
             _, tag = self._store.get_tagged(TIMESTAMP, MAX_METADATA_BYTES)
         settings = VerifySettings(
             self.path,
@@ -328,9 +328,9 @@ class PublishedOrigin:
             known.update((number, shard) for number, shard in fetched if shard is not None)
 
     def _has_another(self) -> bool:
-        """Whether a reload would find other than what is known; asked in a thread.
+        """Whether a reload would find something else than is known; asked in a thread.
 
-        That is another version than the one that was taken, a problem with the offer, or its end.
+        That is another version than the one taken, a new problem with the offer, or the end of one.
         """
         if self._taken is None:
             return False
@@ -349,9 +349,9 @@ class PublishedOrigin:
         return before is not None
 
     def _is_same(self, store: Store) -> bool:
-        """Whether the origin says what it said when it was last read."""
+        """Whether the origin still offers what it offered when it was last read."""
         path, tag = TIMESTAMP if self._trust else CURRENT, self._seen.tag
-        with contextlib.suppress(MapMissing, MapDataError):  # reading it says what is wrong
+        with contextlib.suppress(MapMissing, MapDataError):  # reading it names what is wrong
             if tag is not None:
                 return store.get_if_changed(path, MAX_METADATA_BYTES, tag) is None
             store.get_tagged(path, MAX_METADATA_BYTES)
@@ -374,7 +374,7 @@ class PublishedOrigin:
     def _save(self, state: TakenVersionFile, taken: TakenVersion) -> None:
         with self._saving:
             if taken is not self._saved:
-                return  # a later one was quicker, or comes
+                return  # a later version is saved, or will be
             try:
                 state.save(taken)
             except CannotWrite as error:
@@ -382,19 +382,19 @@ class PublishedOrigin:
 
     @property
     def expires_s(self) -> float | None:
-        """When what signs the version that was taken runs out, Unix time; None where nothing signs it."""
+        """When the signature of the version taken expires, Unix time; None if it is not signed."""
         taken = self._taken
         return taken.expires_s or None if taken is not None else None
 
     @property
     def signed_s(self) -> float:
-        """When that was signed, Unix time; 0: it is not."""
+        """When that version was signed, Unix time; 0: it is not."""
         taken = self._taken
         return taken.signed_s if taken is not None else 0.0
 
     @property
     def refusal(self) -> str:
-        """Why what is offered is not taken, one of `REFUSALS`; empty where it is, or is out of reach."""
+        """Why the offer is not taken, one of `REFUSALS`; empty if it is, or is out of reach."""
         problem = self._problem
         if problem is None or problem.code == Offline.code:
             return ""

@@ -217,7 +217,7 @@ class PublishedView:
     def changes_from(self, before: object) -> CatalogueChange:
         """Find what differs from another version, as far as both know it.
 
-        A shard is compared once, as soon as it is here: asked at each page that comes, this has little to do.
+        Each shard is compared once, as soon as it is here: calls with each page that comes are cheap.
         """
         if not isinstance(before, PublishedView):
             raise TypeError(f"{type(before).__name__} is no version of a published map")

@@ -30,8 +30,8 @@ NAME_BYTES: Final = 150
 NAME_TABLES: Final = 64
 """Names are shared out among many dicts: one of all would stop the loop whenever it grows."""
 BACKGROUND_AT_ONCE: Final = 2
-"""Pages that nothing needs yet are fetched few at a time: what an area needs then has the link nearly alone.
-Measured over 20 Mbit/s and 50 ms, with 8 at a time: it came after twice as long."""
+"""Pages that nothing needs yet are fetched few at a time, so that pages an area needs have most of the link.
+With 8 at a time over 20 Mbit/s and 50 ms, those took twice as long."""
 BACKGROUND: Final = 1e15
 """Priority of pages that nothing needs yet: behind all that something does."""
 NAMED: Final = 3
@@ -330,7 +330,7 @@ class ShardPages:
                     self._by_base[base] = (*self._by_base.get(base, ()), index)
 
     def _fill(self) -> None:
-        """Have some more pages fetched that nothing needs yet, the nearest first, while there is room.
+        """Fetch some more pages that nothing needs yet, the nearest first, while there is room.
 
         None while others are needed.
         """

@@ -23,7 +23,7 @@ from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 __all__ = ["Paging"]
 
 KEPT_S: Final = 0.02
-"""Pause after a page that has to stay: to find that out takes about a millisecond."""
+"""Pause after a page that has to stay: each check takes about a millisecond."""
 MOST_RETIRED: Final = 20_000
 """Retired segments that are looked through; of more, no page is given up."""
 

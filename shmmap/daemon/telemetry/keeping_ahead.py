@@ -120,7 +120,7 @@ class KeepingAhead:
         statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
-        # some are kept for what clients wait for; those that fetch do so for many cells at once
+        # some loaders are reserved for cells that clients wait for; each one fetches many cells at once
         loaders = max(limit * self._scheduler.pool.places - prefetcher.kept_places, 1)
         statistics.set("loadable_per_1000s", int(1e3 * loaders / health.mean_s) if health.mean_s else 0)
         statistics.set("origin_out", int(health.is_out))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the statistics show of a published map: its version, and what the daemon itself has read of it.
 
-Loaders say what they have read with the messages that end their loads.
+Loaders report what they read in the messages that end their loads.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ class VersionInService(Protocol):
 
     @property
     def expires_s(self) -> float | None:
-        """When what signs the version runs out, Unix time; None where nothing signs it."""
+        """When the version's signature expires, Unix time; None if it is not signed."""
 
     @property
     def signed_s(self) -> float:
-        """When that was signed, Unix time; 0: it is not."""
+        """When the version was signed, Unix time; 0: it is not."""
 
     @property
     def refusal(self) -> str:
-        """Why what is offered is not taken, one of `REFUSALS`; empty where it is."""
+        """Why the offer is not taken, one of `REFUSALS`; empty if it is."""
 
     @property
     def counts(self) -> ObjectCounts:

@@ -45,7 +45,7 @@ class WatchedDescriptors:
 
     def unwatch(self, fd: int) -> None:
         """Stop watching; before the descriptor is closed."""
-        callback = self.callbacks.pop(fd, None)  # it may be the last that has what closes the descriptor
+        callback = self.callbacks.pop(fd, None)  # it may hold the last reference to the descriptor's owner
         if callback is not None:
             del self.kinds[fd]
             self._epoll.unregister(fd)

@@ -57,7 +57,7 @@ _REASONS: Final = {
     "RequestTimeTooSkewed": "this machine's clock differs from the store's",
     "AccessDenied": "no permission",
 }
-"""What Amazon's codes of refusals mean, which others use, too."""
+"""Meaning of Amazon's error codes, which other stores use, too."""
 _LISTED_AT_ONCE: Final = 1000
 
 
@@ -234,16 +234,13 @@ def _out_of_reach(name: str, text: str) -> Offline:
 
 
 def _reason(text: str) -> str:
-    """Return why a store refuses, where it says so by one of the known codes."""
+    """Return why a store refuses, if it gives one of the known codes; else an empty string."""
     found = _CODE.search(text)
     return _REASONS.get(found[1], "") if found is not None else ""
 
 
 def server_url(where: StoreUrl) -> str:
-    """Return the URL of the server that a store is asked at, which no credentials are needed for; or nothing.
-
-    For other questions than for objects: what it answers to anyone.
-    """
+    """Return the URL of a store's server, for requests without credentials; empty if it is not known."""
     if where.scheme in WEB_SCHEMES:
         return where.text
     if endpoint := _endpoint(where.scheme):

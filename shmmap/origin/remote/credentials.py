@@ -2,7 +2,7 @@
 """Credentials for buckets: from the environment, the service manager or a profile, never from the network.
 
 obstore reads the environment itself.  Without any it would ask the cloud's metadata address, where on a
-vehicle nothing answers, or a stranger does: so that is done only where it was configured.
+vehicle nothing answers, or an unknown machine does: so that is done only if it is configured.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ Provider = Callable[[], dict[str, Any]]
 
 
 def credentials_source(scheme: str, environment: Mapping[str, str], *, instance: bool = False) -> str:
-    """Return in words where the credentials of a store come from, never what they are; empty: it needs none.
+    """Describe where the credentials of a store come from, never what they are; empty: it needs none.
 
     Raises
     ------
     ConfigError
-        As `s3_settings` and `azure_settings`; or they say themselves that they have expired.
+        As `s3_settings` and `azure_settings`; or the credentials' own expiry has passed.
     """
     if scheme == "s3":
         return _s3_source(environment, instance=instance)

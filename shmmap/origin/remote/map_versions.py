@@ -289,7 +289,7 @@ def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:
 
 
 def changed_meanwhile(store: Store) -> InstanceBusy:
-    """Return the error of a publisher whose version is not served: another one has made its own current."""
+    """Return the error of a publisher whose version is not served: another publisher was quicker."""
     return InstanceBusy(
         f"another publisher has changed {store.url} meanwhile: its version stays, this one is not served",
         hint="run the same command again: what was sent is not sent again",

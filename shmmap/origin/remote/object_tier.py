@@ -109,7 +109,7 @@ class ObjectTier:
         return None
 
     def has(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bool:
-        """Whether there is a file of an object, of its size; what is in it is looked at when it is read."""
+        """Whether an object's file is there and has its size; its content is checked when it is read."""
         try:
             with self._opened() as place:
                 status = os.stat(_path(digest, is_index), dir_fd=place, follow_symlinks=False)
@@ -153,7 +153,7 @@ class ObjectTier:
                     self._trimmer = trimmer
 
     def _trim(self) -> None:
-        """Trim until nothing was added that needs it: what comes meanwhile may not have been looked at."""
+        """Trim until nothing was added meanwhile: a pass may miss what comes while it runs."""
         while True:
             with self._lock:
                 if not self._trim_again:
@@ -266,9 +266,9 @@ def _write(place: int, path: str, data: memoryview, *, durable: bool) -> None:
 
 
 class ObjectCounts(NamedTuple):
-    """What was read, out of the tier and out of the store, in the order of `counters.OBJECTS_READ`.
+    """What was read from the tier and from the store, in the order of `counters.OBJECTS_READ`.
 
-    Bytes are those of objects; ``failed`` are fetches that brought nothing, for whatever reason.
+    Bytes are those of objects; ``failed`` are fetches that failed for any reason.
     """
 
     disk_objects: int = 0

@@ -305,7 +305,7 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
 
 
 def check_layers(layers: Mapping[str, int], wrong: Damage) -> None:
-    """Refuse what are no specs with their builder versions."""
+    """Refuse layers that are not specs with their builder versions."""
     if len(layers) > MAX_LAYERS:
         raise wrong("its layers are too many")
     if any(len(spec) > _MAX_SPEC_CHARACTERS or not 0 <= built < 1 << 32 for spec, built in layers.items()):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What one slice of a run has made: shards of a published map to which layers were added.
 
-A *run* adds layers to one version of a map.  Its slices are made each by itself, anywhere and in any order;
-what a slice has made is its *part*.  The name of a run follows from the version's content, the layers and the
-number of slices: so programs that make slices of the same run need not know of each other.  ``ORIGIN.md`` is
+A *run* adds layers to one version of a map.  Each of its slices is made by itself, anywhere and in any order;
+its result is its *part*.  The name of a run follows from the version's content, the layers and the number of
+slices: so programs that make slices of the same run need not know of each other.  ``ORIGIN.md`` is
 the byte-exact document.
 """
 
@@ -43,6 +43,7 @@ __all__ = [
     "part_number",
     "read_run",
     "run_of",
+    "shards_of",
     "slice_of_shards",
     "unpack_part",
     "with_parts",
@@ -95,7 +96,7 @@ def run_of(content: bytes, layers: Iterable[str], slices: int) -> RunName:
 
 
 def read_run(text: str) -> RunName:
-    """Read the name of a run; `BadRequest` if it is none."""
+    """Read the name of a run; `BadRequest` if it is not one."""
     found = _RUN.fullmatch(text)
     if found is None or int(found[2]) > MAX_SLICES:
         raise BadRequest(
@@ -105,14 +106,14 @@ def read_run(text: str) -> RunName:
 
 
 def part_number(run: RunName, path: str) -> int | None:
-    """Return the slice whose part lies there; None: something else does."""
+    """Return the slice whose part lies at a path; None: it is not a part of this run."""
     name = path.removeprefix(run.path)
     is_one = path.startswith(run.path) and re.fullmatch(r"[1-9]\d{0,5}", name) is not None
     return int(name) if is_one and int(name) <= run.slices else None
 
 
 def slice_of_shards(root: Root, slices: int) -> NDArray[np.int64]:
-    """(S,) int64, ascending: which slice each shard of a root is in; the first slice is 1.
+    """Return the slice of each shard of a root, (S,) int64, ascending; the first slice is 1.
 
     Each slice has about as many cells as the others; one may have no shard.
     """
@@ -159,7 +160,7 @@ class Part:
     root_content
         Content digest of that version's root, 32 bytes.
     slice, slices
-        Which one of how many; the first is 1.
+        Number of the slice, from 1, and how many there are.
     layers
         Builder version of each layer of the run, by spec.
     keys
@@ -213,14 +214,14 @@ def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: s
     Parameters
     ----------
     run, number
-        Where it lies: the run and the slice that it has to be of.
+        The run and the slice that it has to belong to, as its path says.
     name
         Of the object, for messages.
 
     Raises
     ------
     MapDataError
-        It is no sound part of that slice (cause ``damaged``), or one that needs a later reader (``newer``).
+        It is not a sound part of that slice (cause ``damaged``), or it needs a later reader (``newer``).
     """
     name = name or run.part_path(number)
     wrong = Damage(name)
@@ -263,6 +264,13 @@ def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: s
     return part
 
 
+def shards_of(root: Root, part: Part) -> NDArray[np.intp] | None:
+    """Return the numbers of a part's shards in a root, ascending; None if its slice has others there."""
+    numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
+    same = np.array_equal(root.keys[numbers], part.keys) and np.array_equal(root.counts[numbers], part.counts)
+    return numbers if same else None
+
+
 def with_parts(root: Root, parts: Sequence[Part]) -> Root:
     """Return the root that has the shards of these parts, and the layers of their run.
 
@@ -274,11 +282,8 @@ def with_parts(root: Root, parts: Sequence[Part]) -> Root:
     sizes, hashes = root.sizes.copy(), root.hashes.copy()
     layers = dict(root.layers)
     for part in parts:
-        numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
-        same = np.array_equal(root.keys[numbers], part.keys) and np.array_equal(
-            root.counts[numbers], part.counts
-        )
-        if not same:
+        numbers = shards_of(root, part)
+        if numbers is None:
             wrong = Damage(part.run.part_path(part.slice))
             raise wrong(f"its shards are not those of slice {part.slice} of {part.slices}")
         sizes[numbers], hashes[numbers] = part.sizes, part.hashes

@@ -46,8 +46,8 @@ Tag: TypeAlias = Mapping[str, Any]
 class StoreRefused(Offline):
     """The store answers, and refuses.
 
-    ``of_credentials``: because of who asks, or how that is shown.  A store whose list may not be read also
-    says so of what is not there.
+    ``of_credentials``: because of the account or its credentials.  A store that does not let an account list
+    objects also answers so for an object that is absent.
     """
 
     def __init__(self, message: str, *, hint: str = "", of_credentials: bool = False) -> None:
@@ -132,13 +132,13 @@ class Store(ObjectReader, Protocol):
 
 
 def put_over(store: Store, path: str, data: bytes, seen: Tag | None) -> bool:
-    """Replace the state of an object that was seen, None: there was none; False if it has another one now."""
+    """Replace an object if its tag still is ``seen`` (None: there was no object); False if it has changed."""
     return store.put_new(path, data) if seen is None else store.put_if(path, data, seen)
 
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """How long to wait for a server, in seconds: to connect, for more bytes, and with all retries."""
+    """Time limits of requests, seconds: to connect, for the next bytes, and for all retries together."""
 
     connect_s: float
     read_s: float
@@ -147,7 +147,7 @@ class Timeouts:
 
 
 SERVING: Final = Timeouts(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
-"""For requests that wait: a server that says nothing is asked once more, as is one that falls silent."""
+"""For requests that clients wait for: a server that is silent, or falls silent, is asked once more."""
 PROBE: Final = Timeouts(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
 """To find out whether a server is back."""
 LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
@@ -214,8 +214,8 @@ def read_url(text: str) -> StoreUrl:
 def may_be_plain(url: str, *, insecure_http: bool, trust: str | None) -> bool:
     """Whether a map may be read over plain ``http://`` from other machines.
 
-    That is so where its user says so, and from a web server where a root of trust is named: then all that is
-    read is verified.  A bucket's requests have credentials, which the signature of a map does not protect.
+    It may if the user allows it, and from a web server if a root of trust is named: then all that is read is
+    verified.  Requests to a bucket carry credentials, which the signature of a map does not protect.
     """
     return insecure_http or bool(trust and is_url(url) and url.partition("://")[0].lower() in WEB_SCHEMES)
 

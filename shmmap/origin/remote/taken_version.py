@@ -51,9 +51,9 @@ class TakenVersion(msgspec.Struct, frozen=True):
     taken_s
         When it was taken, Unix time.
     signed_s
-        When the metadata was signed that was verified last, Unix time; 0: none was.
+        When the metadata that was last verified was signed, Unix time; 0: none was.
     expires_s
-        When that runs out, Unix time; 0: nothing signs it.
+        When its signature expires, Unix time; 0: it is not signed.
     """
 
     instance: str
@@ -186,7 +186,7 @@ class Judgement(NamedTuple):
     problem, hint
         What is wrong with the offer, for ``health``, and what to do about it; empty if nothing is.
     cause
-        The same by a name: ``older`` or ``altered``.
+        Short name of the problem: ``older`` or ``altered``.
     """
 
     is_taken: bool

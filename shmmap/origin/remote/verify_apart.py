@@ -43,9 +43,9 @@ class VerifySettings(msgspec.Struct, frozen=True):
     trust
         Path of the trusted root.
     state_dir
-        Where what was seen is kept: what is older is refused from then on.
+        Where the newest metadata seen is kept: older metadata is refused from then on.
     is_serving
-        Ask as a daemon does, which must not wait long.
+        Use the short time limits of a daemon.
     """
 
     url: str
@@ -101,7 +101,7 @@ def read_trusted_root(path: str) -> bytes:
     Raises
     ------
     ConfigError
-        It cannot be read, or is no root of trust.
+        It cannot be read, or is not a root of trust.
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
@@ -120,14 +120,14 @@ def read_trusted_root(path: str) -> bytes:
 
 
 def no_root_of_trust(path: str, why: str = "") -> ConfigError:
-    """Return the error for a file that is no root of trust."""
+    """Return the error for a file that is not a root of trust."""
     return ConfigError(
         f"{path}: this is no root of trust{f': {why}' if why else ''}", key="trust", hint=_NO_ROOT
     )
 
 
 def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
-    """Return the directory of what was seen signed at a URL under a root of trust."""
+    """Return the directory of the metadata seen at a URL under a root of trust."""
     of = msgspec.msgpack.encode([url, sha256(trusted).hexdigest()])
     return os.path.join(state_dir, "trust", sha256(of).hexdigest()[:32])
 
@@ -146,7 +146,7 @@ def verify_apart(settings: VerifySettings, *, timeout_s: float = _LONGEST_S) -> 
         What is offered is refused; ``cause`` is ``unsigned``, ``older``, ``expired``, ``altered`` or
         ``foreign_root``.
     ConfigError
-        The trusted root cannot be read, or is no root of trust.
+        The trusted root cannot be read, or is not a root of trust.
     PackageMissing
         Without python-tuf.
     Offline
@@ -173,7 +173,7 @@ def verify_apart(settings: VerifySettings, *, timeout_s: float = _LONGEST_S) -> 
     except TimeoutError:
         raise ShmmapError(
             f"{settings.url}: the process that verifies it has not ended within {timeout_s:.0f} s",
-            hint="has this machine too little memory or too much to do, or does the state directory hang?",
+            hint="is this machine short of memory or overloaded, or does the state directory hang?",
         ) from None
     finally:
         with contextlib.suppress(ProcessLookupError):

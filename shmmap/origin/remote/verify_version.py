@@ -36,6 +36,7 @@ from shmmap.origin.remote.verify_apart import (
     read_trusted_root,
 )
 from shmmap.processes.end_with_parent import die_with
+from shmmap.quantities import format_utc
 
 if TYPE_CHECKING:
     from tuf.ngclient import Updater
@@ -50,7 +51,7 @@ _NICE: Final = 5
 
 
 class _Asked(NamedTuple):
-    """What the store failed with, and the newest metadata that it gave, by role."""
+    """Errors of the store, and the newest metadata that it returned, by role."""
 
     failed: list[ShmmapError]
     found: dict[str, bytes]
@@ -59,7 +60,7 @@ class _Asked(NamedTuple):
 def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = "") -> Verified:
     """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`.
 
-    Where this machine's clock is behind, what has run out is judged by when the timestamp was signed.
+    Expiry is judged by the later of this machine's clock and the time at which the timestamp was signed.
     """
     from tuf.api.exceptions import DownloadError, RepositoryError
 
@@ -83,7 +84,9 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
             signed_s, expires = _times(memory)
     role = min(expires, key=lambda role: expires[role])
     if expires[role].timestamp() <= signed_s:  # by this machine's clock it is still valid
-        raise _expired(store, role, expires[role], f"the timestamp was signed on {_text_of(signed_s)}, and ")
+        raise _expired(
+            store, role, expires[role], f"the timestamp was signed on {format_utc(signed_s)}, and "
+        )
     return Verified(
         current.version,
         current.root,
@@ -95,7 +98,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
 
 
 def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Updater, _Asked]:
-    """Return TUF's client over a store, and what the store gives it."""
+    """Return TUF's client for a store, and a record of what the store returns to it."""
     from tuf.api.exceptions import DownloadHTTPError, RepositoryError
     from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
@@ -112,7 +115,7 @@ def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Upd
             except ShmmapError as error:
                 is_refused = isinstance(error, StoreRefused) and error.of_credentials
                 if is_refused and path.endswith(f".{_ROLES[-1]}.json"):
-                    raise DownloadHTTPError(path, 403) from None  # so a store says that there is none
+                    raise DownloadHTTPError(path, 403) from None  # the store may say so of an absent object
                 asked.failed.append(error)
                 raise
             asked.found[path.removesuffix(".json").rpartition(".")[2]] = data
@@ -190,10 +193,6 @@ def _expired(store: Store, role: str, expires: datetime, after: str = "") -> Map
     )
 
 
-def _text_of(unix_s: float) -> str:
-    return f"{datetime.fromtimestamp(unix_s, timezone.utc):%Y-%m-%d %H:%M} UTC"
-
-
 def _expires(data: bytes) -> datetime:
     from tuf.api.metadata import Metadata
 
@@ -203,7 +202,7 @@ def _expires(data: bytes) -> datetime:
 
 
 def _times(memory: str) -> tuple[float, dict[str, datetime]]:
-    """When the timestamp was signed, and when the metadata of each role runs out."""
+    """When the timestamp was signed, and when the metadata of each role expires."""
     from tuf.api.metadata import Metadata
 
     found: dict[str, Any] = {
@@ -218,7 +217,7 @@ def _times(memory: str) -> tuple[float, dict[str, datetime]]:
 
 
 def _remove_interim(memory: str) -> None:
-    """Remove what TUF's client had half written when it was killed."""
+    """Remove files that TUF's client had half written when it was killed."""
     for name in os.listdir(memory):
         if name.startswith(tempfile.gettempprefix()):
             os.unlink(os.path.join(memory, name))

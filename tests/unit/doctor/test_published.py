@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What doctor says of a published map, by what its store has answered and the daemon tells."""
+"""Doctor's rows of a published map, from answers of its store and statistics of the daemon."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 
 from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
 from shmmap.doctor.store_probe import StoreAnswer
-from tests.support.doctor_ward import Ward, told
+from shmmap.statistics.counters import REFUSALS
+from tests.support.doctor_ward import Ward, snapshot
 
 URL = "s3://maps/town"
-DAY_S = 86_400.0
 ANSWERS: dict[str, Any] = {
     "answers": True,
     "first_s": 0.012,
@@ -30,10 +30,10 @@ def ward(tmp_path: Path) -> Ward:
 
 
 def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) -> dict[str, tuple[str, str]]:
-    """Each row: its state, and what it says."""
+    """State and text of each row."""
     counts = {"published_version": 7, "published_refused": 0, "published_expires_unix_ns": 0}
     counts |= {"published_taken_unix_ns": time.time_ns(), **counters}
-    patient = ward.patient(told(**counts), map_path=url)  # type: ignore[arg-type]
+    patient = ward.patient(snapshot(**counts), map_path=url)  # type: ignore[arg-type]
     assert patient.seen is not None
     patient.seen.identity = None  # the map is that of the settings
     patient.__dict__["store"] = answer
@@ -91,9 +91,11 @@ def test_the_daemon_may_be_worse_off(ward: Ward) -> None:
     assert "the daemon has not reached it for 90.0 s" in found["link"][1]
 
 
-def test_refused_and_expired(ward: Ward) -> None:
-    found = look(ward, StoreAnswer(**ANSWERS), published_refused=9)["versions"]
-    assert (found[0], "version 9 is offered and refused" in found[1]) == ("warn", True)
-    expired = int((time.time() - 3 * DAY_S) * 1e9)
-    found = look(ward, StoreAnswer(**ANSWERS), published_expires_unix_ns=expired)["versions"]
-    assert (found[0], "what signs it has expired 3 d ago" in found[1]) == ("warn", True)
+@pytest.mark.parametrize("refusal", [*range(1, len(REFUSALS)), 77])
+def test_a_refused_offer_is_in_the_row_of_versions(ward: Ward, refusal: int) -> None:
+    found = look(ward, StoreAnswer(**ANSWERS), published_refused=9, published_refusal=refusal)
+    state, text = found["versions"]
+    cause = REFUSALS[min(refusal, len(REFUSALS) - 1)].replace("_", " ")
+    why = "cannot be taken" if cause == "other" else f"is refused, {cause}"
+    assert (state, f"version 9, which is offered, {why}: what was taken is served" in text) == ("warn", True)
+    assert not text.endswith("-> "), "there is advice for each cause"

@@ -47,7 +47,7 @@ def store(tmp_path: Path, town: DividedMap) -> Store:
 
 
 class CountedObjects(KeptObjects):
-    """Counts what is read, as soon as it may go on."""
+    """Counts reads, which wait until they may go on."""
 
     def __init__(self, store: Store) -> None:
         super().__init__(store, None)

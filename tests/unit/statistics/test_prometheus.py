@@ -86,9 +86,9 @@ def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:
 
 
 def test_a_published_map(found: Snapshot) -> None:
-    told = found.counters | {"published_version": 7, "published_taken_unix_ns": 1_500_000_000_500_000_000}
-    told |= {"origin_out_since_unix_ns": 1_600_000_000_000_000_000, "objects_fetched": 5}
-    found.__dict__["counters"] = told
+    counts = found.counters | {"published_version": 7, "published_taken_unix_ns": 1_500_000_000_500_000_000}
+    counts |= {"origin_out_since_unix_ns": 1_600_000_000_000_000_000, "objects_fetched": 5}
+    found.__dict__["counters"] = counts
     types, samples = parse(exposition(found, "unit"))
     assert {f"shmmap_{name}_total" for name in OBJECTS_READ} <= types.keys()
     assert samples["shmmap_published_version", ""] == 7

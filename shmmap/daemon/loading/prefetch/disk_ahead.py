@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fetches ahead onto the disk what does not fit in memory: nor is it noticed then that a store is away.
+"""Fetches ahead onto the disk what does not fit in memory, to bridge outages of the store.
 
-It looks along the same paths as `Prefetcher`, as far ahead, and begins where that one has no room: objects of
-cells that are neither in memory nor on the disk, needed first first, while no load waits for a loader.
+It looks along the same paths as `Prefetcher`, as far ahead, and begins where `Prefetcher` has no room.  It
+fetches objects of cells that are neither in memory nor on the disk, those needed first first, and only while
+no load waits for a loader.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from shmmap.origin.remote.published_source import unpack_source
 __all__ = ["DiskAhead"]
 
 LOOK_S: Final = 0.25
-"""How often it is looked whether memory has room, or loads wait."""
+"""Interval of looking whether memory has room and whether loads wait, seconds."""
 KEPT_S: Final = 60.0
-"""For so long what was on the disk is taken to be there: the disk cache drops what was not used."""
+"""How long an object is assumed to stay on the disk, seconds: the disk cache drops unused ones."""
 AGAIN_S: Final = 2.0
-"""So long after an object could not be had it is tried again."""
+"""Pause before an object that could not be fetched is tried again, seconds."""
 MOST_KNOWN: Final = 1 << 16
 
 
@@ -57,7 +58,7 @@ class DiskAhead:
         self._now_s = now_s
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)
         if not is_asked or len(self._scheduler.loads):
-            self._prefetch.restart()  # it holds no state of the map meanwhile
+            self._prefetch.restart()  # so that it does not keep a catalogue alive meanwhile
             if not is_asked:
                 self._forget()
             self._next_s = now_s + LOOK_S
@@ -97,7 +98,7 @@ class DiskAhead:
         self._cache.statistics.set("disk_ahead", 0)
 
     def _follow(self) -> None:
-        """Look along the paths that are looked along for memory."""
+        """Take over the paths of the `Prefetcher`."""
         mine, theirs = self._prefetch.ways, self._scheduler.prefetcher.prefetch.ways
         for session in mine.keys() - theirs.keys():
             del mine[session]

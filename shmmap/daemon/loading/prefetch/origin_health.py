@@ -27,7 +27,7 @@ class OriginHealth:
     failed_in_a_row
         Loads that failed since the last one that succeeded.
     waited_s
-        The longest time that one of these took: for so long, about, nothing has answered.
+        The longest that one of these took, seconds: about how long nothing has answered.
     unreachable
         It is known otherwise that it does not answer.
     slow_s, mean_s
@@ -48,9 +48,9 @@ class OriginHealth:
         return self.unreachable or self.failed_in_a_row >= IN_A_ROW
 
     def next_try_s(self) -> float:
-        """Until when nothing is tried: minus infinity unless nothing can be loaded.
+        """Until when nothing is tried; minus infinity unless nothing can be loaded.
 
-        An origin may not answer, and loads succeed: what they need is on the disk.
+        Loads may succeed although the origin does not answer: from the disk.
         """
         return self._tried_s + PROBE_S if self.is_out and self.failed_in_a_row else -math.inf
 

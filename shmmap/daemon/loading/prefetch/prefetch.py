@@ -119,7 +119,7 @@ class Prefetch:
         return None
 
     def restart(self) -> None:
-        """Begin all paths from the start: what lies on them is known better now."""
+        """Begin all paths from the start: more of the map on them is known now."""
         self._catalogue = None
 
     def _compare_some(self, now_s: float) -> bool:
@@ -149,13 +149,13 @@ class Prefetch:
     def _is_back(self, now_s: float) -> bool:
         """Whether loads succeed again; and for how long they did not."""
         if self.health.is_out:
-            # a server that says nothing is found out late: it was away when the loads were begun that fail
+            # a silent server is noticed late: it was already away when the failed loads began
             self._out_since_s = min(self._out_since_s, now_s - self.health.waited_s)
             return False
         if self._out_since_s == math.inf:
             return False
         away_s, self._out_since_s = now_s - self._out_since_s, math.inf
-        if away_s > SLACK_S:  # one answer that was lost says nothing of how long outages are
+        if away_s > SLACK_S:  # a single lost answer does not show how long outages are
             self._away_s = max(away_s, 0.5 * self._away_s)
         return True
 

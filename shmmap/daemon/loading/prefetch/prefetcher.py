@@ -75,7 +75,7 @@ class Prefetcher:
         self._no_room = False
 
     def restart(self) -> None:
-        """More of the map is known, or less: look along all paths from the start."""
+        """Look along all paths from the start: more of the map is known, or less."""
         self.prefetch.restart()
         self._next_s = -math.inf
 
@@ -195,8 +195,8 @@ class Prefetcher:
     def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
         """A load has ended: what that tells of where it comes from.
 
-        A file that is broken was read all the same.  One that was begun before another load succeeded tells
-        of an outage that is over.
+        A broken file counts as an answer.  The failure of a load that began before another one succeeded
+        belongs to an outage that is over.
         """
         self._running.pop(load, None)
         if not ran or not load.sources or (out and self._now_s - took_s < self._answered_s):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objects are on the disk before a loader needs them: fetched once, or it is said why not."""
+"""Objects are on the disk before a loader needs them: fetched once, or with the reason why not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OBJECTS = [random.Random(number).randbytes(5_000 + number) for number in range(2
 
 
 class Store:
-    """Objects by path; away while it is told to be."""
+    """Objects by path; `Offline` while ``is_away``."""
 
     url = "memory"
 

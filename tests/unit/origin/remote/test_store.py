@@ -31,7 +31,7 @@ SOON = Timeouts(connect_s=0.5, read_s=0.3, retries=0, retry_s=0.5)
 ONCE = Timeouts(connect_s=30.0, read_s=30.0, retries=0, retry_s=30.0)
 """For servers that answer, however busy the machine is."""
 AGAIN = Timeouts(connect_s=30.0, read_s=30.0, retries=8, retry_s=30.0)
-"""Of writers at once, Ceph's gateway answers the losers with status 500, and with 412 when they ask again."""
+"""Of concurrent writers, Ceph's gateway answers the losers with status 500, and with 412 on a second try."""
 
 
 @pytest.fixture(params=["directory", "file", "s3"])

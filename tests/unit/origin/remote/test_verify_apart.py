@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A root of trust is read before a process is started, and that process is bounded in time."""
+"""A root of trust is read before the process is started, and that process has a time limit."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_which_maps_may_be_read_over_plain_http() -> None:
         assert may_be_plain(url, insecure_http=True, trust="")
         assert not may_be_plain(url, insecure_http=False, trust="")
         assert not may_be_plain(url, insecure_http=False, trust=None)
-    # what a bucket is asked with holds credentials
+    # requests to a bucket carry credentials
     for url in ("s3://maps/town", "az://maps/town", "/srv/map", "file:///srv/map"):
         assert not may_be_plain(url, insecure_http=False, trust="ROOT.json")
         assert may_be_plain(url, insecure_http=True, trust="ROOT.json")
@@ -78,7 +78,7 @@ def test_a_refusal_of_plain_http_says_what_to_do() -> None:
 
 
 def test_an_offer_is_judged_by_the_latest_time_seen(tmp_path: Path) -> None:
-    """Where this machine's clock is behind: what had run out when the timestamp was signed has run out."""
+    """If this machine's clock is behind: what had expired when the timestamp was signed has expired."""
     pytest.importorskip("tuf", reason="tuf is not installed")
     from datetime import datetime, timedelta, timezone
 

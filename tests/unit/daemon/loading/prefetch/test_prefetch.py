@@ -231,7 +231,7 @@ def test_without_a_route_outages_are_prepared_for_after_the_first() -> None:
 
 
 def test_an_outage_begins_with_the_loads_that_fail_not_when_they_have() -> None:
-    """A server that says nothing is found out after seconds: the next outage is as long for all that."""
+    """A silent server is noticed only after seconds; the next outage is prepared for in full length."""
     daemon = Daemon()
     daemon.client("a", route=False)
     before = daemon.prefetch.look_ahead

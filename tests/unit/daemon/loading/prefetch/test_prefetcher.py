@@ -93,7 +93,7 @@ def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[...
 def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     prefetching: Callable[..., InnerDaemon],
 ) -> None:
-    """They fail seconds after others have succeeded, where the origin says nothing."""
+    """They fail seconds after others have succeeded, if the origin is silent."""
     one = prefetching()
     Drive(one)
     one.run_until(lambda: idle(one))
