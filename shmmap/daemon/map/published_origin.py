@@ -336,7 +336,7 @@ class PublishedOrigin:
             return False
         is_same = self._is_same(self._probe if self.link.is_out else self._store)
         before = self._problem
-        if is_same and before is None:
+        if self._is_loading or (is_same and before is None):  # a reload that runs says what it finds
             return False
         try:
             offer = self._read_offer()
@@ -345,7 +345,7 @@ class PublishedOrigin:
                 self._read_root(offer.current)
                 return True
         except ShmmapError as error:  # out of reach, too: it has just answered
-            return _Problem.of(error) != before
+            return not self._is_loading and _Problem.of(error) != self._problem
         return before is not None
 
     def _is_same(self, store: Store) -> bool:
