@@ -70,6 +70,7 @@ from shmmap.logfmt import log
 from shmmap.optional_packages import needed_packages
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.no_map import NoMap
+from shmmap.origin.remote.store import is_published, is_url, read_url
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
@@ -108,9 +109,7 @@ def run(config: DaemonConfig) -> int:
             "no map is named", key="map_path",
             hint="give `shmmap serve MAP`, or set map_path; --live NAME for a live map alone",
         )  # fmt: skip
-    if "://" in config.map_path:
-        from shmmap.origin.remote.store import read_url
-
+    if is_url(config.map_path):
         read_url(config.map_path)  # may refuse: one that may hold a secret is not logged
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     early = fork_early()
@@ -185,12 +184,12 @@ def run(config: DaemonConfig) -> int:
 def _published(config: DaemonConfig) -> PublishedOrigin | None:
     """Open a published map: a URL, or a directory with a file CURRENT; None where the map is files."""
     path = config.map_path
-    if config.trust and "://" not in path and not os.path.isdir(path):
+    if config.trust and not is_url(path) and not os.path.isdir(path):
         raise ConfigError(
             "--trust is for a published map", key="trust",
             hint="name its URL or directory; `shmmap publish MAP URL --sign KEYDIR` makes one",
         )  # fmt: skip
-    if not config.trust and "://" not in path and not os.path.isfile(os.path.join(path, "CURRENT")):
+    if not config.trust and not is_published(path):
         return None
     for name in ("metadata", "unit", "vertical_unit", "watch"):
         if getattr(config, name):

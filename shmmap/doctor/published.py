@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import datetime
-import os
 import time
 from collections.abc import Mapping
 from typing import Final
@@ -15,7 +14,7 @@ from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.doctor.patient import Patient
 from shmmap.doctor.signed_map import refused_offer
 from shmmap.doctor.store_probe import ASKED_S
-from shmmap.origin.remote.store import is_url
+from shmmap.origin.remote.store import is_published, is_url
 from shmmap.quantities import format_duration
 
 __all__ = ["check_clock", "check_credentials", "check_link", "check_versions"]
@@ -27,7 +26,7 @@ FILES: Final = "the map is files"
 
 def _is_published(patient: Patient) -> bool:
     path = patient.map_path
-    return is_url(path) or (bool(path) and os.path.isfile(patient.machine.path(f"{path}/CURRENT")))
+    return bool(path) and is_published(path if is_url(path) else str(patient.machine.path(path)))
 
 
 def _counters(patient: Patient) -> Mapping[str, int]:

@@ -649,6 +649,7 @@ def test_wrong_usage_says_what_is_right(town: Town, tmp_path: Path) -> None:
         assert "expected I/N" in says("prepare", town.url, f"--shards={which}", *layer)
     assert "there is no slice" in says("prepare", town.url, "--shards", "1/999999", *layer)
     assert "--shards 1/1 is all of it" in says("prepare", f"file://{town.url}", *layer)
+    assert "--shards 1/1 is all of it" in says("prepare", str(town.store), *layer)
     assert "name at least one layer" in says("prepare", town.url, "--shards", "1/2")
     assert "name at least one layer" in says("prepare", town.url, "--shards", "1/2", "--layer", "points")
     assert "unknown layer" in says("prepare", town.url, "--shards", "1/2", "--layer", "ntd")

@@ -102,16 +102,17 @@ def _slice(text: str) -> tuple[int, int]:
 def run(args: argparse.Namespace) -> int:
     """Prepare, with progress on stderr."""
     from shmmap.errors import BadRequest
-    from shmmap.origin.remote.store import is_url
+    from shmmap.origin.remote.store import is_published
 
     if not args.layer:
         raise BadRequest("name at least one layer", hint="such as --layer 'ndt(leaf=2.0)' points")
     if args.shards is not None:
         refuse_map_options(args, "--shards: the map is published already")
         return _prepare_slice(args)
-    if is_url(args.map_path):
+    if is_published(args.map_path):
         raise BadRequest(
-            "a published map is prepared by slices", hint="--shards I/N; --shards 1/1 is all of it"
+            f"{args.map_path} is a published map: its layers are made by slices",
+            hint="--shards I/N; --shards 1/1 is all of it",
         )
     if args.trust is not None:
         raise BadRequest("--trust goes with --shards")

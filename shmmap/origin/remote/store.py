@@ -29,6 +29,7 @@ __all__ = [
     "Tag",
     "Timeouts",
     "is_loopback",
+    "is_published",
     "is_url",
     "may_be_plain",
     "put_over",
@@ -167,6 +168,11 @@ class StoreUrl:
 def is_url(text: str) -> bool:
     """Whether it is a URL, no path."""
     return "://" in text
+
+
+def is_published(path: str) -> bool:
+    """Whether a map's path is that of a published one: a URL, or a directory with a file ``CURRENT``."""
+    return is_url(path) or os.path.isfile(os.path.join(path, "CURRENT"))
 
 
 def read_url(text: str) -> StoreUrl:
