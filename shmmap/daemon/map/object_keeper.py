@@ -86,12 +86,15 @@ class ObjectKeeper:
     def keep(self, key: KeptCell, names: Sequence[ObjectName]) -> None:
         """Have these objects on the disk."""
         self._under_way += 1
-        self._wanted.put((key, names))
         if len(self._threads) < min(self._under_way, THREADS):
             thread = threading.Thread(target=self._run, name="keep", daemon=True)
             with contextlib.suppress(RuntimeError):  # the system allows no more threads
                 thread.start()
                 self._threads.append(thread)
+        if self._threads:
+            self._wanted.put((key, names))
+        else:
+            self._settle(Kept(key, False))
 
     def take(self) -> list[Kept]:
         """Return what was done since the last time."""
@@ -103,9 +106,11 @@ class ObjectKeeper:
 
     def _run(self) -> None:
         while (wanted := self._wanted.get()) is not None:
-            key, names = wanted
-            self._done.append(self._keep(key, names))
-            os.eventfd_write(self.fd, 1)
+            self._settle(self._keep(*wanted))
+
+    def _settle(self, kept: Kept) -> None:
+        self._done.append(kept)
+        os.eventfd_write(self.fd, 1)
 
     def _keep(self, key: KeptCell, names: Sequence[ObjectName]) -> Kept:
         try:

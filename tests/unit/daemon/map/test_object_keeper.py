@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import random
 import select
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -111,3 +112,17 @@ def test_a_disk_without_room_is_said(tmp_path: Path) -> None:
     small = Keeper(tmp_path / "cache", limit_bytes=100)
     assert small.keep(3) == Kept(KeptCell(1, 3, "points"), False, has_no_room=True)
     assert small.keeper.close()
+
+
+def test_without_a_thread_nothing_stays_under_way(one: Keeper, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system allows no more of them for a while."""
+
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refuse)
+        for number in range(2 * THREADS):
+            assert not one.keep(number).is_here
+    assert one.keeper.free_places == THREADS
+    assert one.keep(0).is_here
