@@ -18,7 +18,7 @@ from shmmap.formats.causes import refusal
 from shmmap.formats.coordinate_system import CoordinateSystem, geokey_system, wkt_system
 from shmmap.formats.source_file import open_regular
 
-__all__ = ["LASZIP", "VARIABLE_CHUNKS", "LasHeader", "read_las_header"]
+__all__ = ["LasHeader", "read_las_header"]
 
 _SIGNATURE: Final = b"LASF"
 _HEADER_BYTES: Final = 375  # of LAS 1.4; of 1.0 to 1.2 it has
@@ -37,10 +37,10 @@ _RECORD: Final = struct.Struct("<2x16sHH32x")
 _EXTENDED: Final = struct.Struct("<2x16sHQ32x")
 _PROJECTION: Final = b"LASF_Projection"
 _WKT, _GEOKEYS, _GEODOUBLES, _GEOTEXTS = 2112, 34735, 34736, 34737
-LASZIP: Final = (b"laszip encoded", 22204)
+_LASZIP: Final = (b"laszip encoded", 22204)
 _MAX_RECORDS: Final = 10_000
 _MAX_RECORD_BYTES: Final = 1 << 20
-VARIABLE_CHUNKS: Final = 0xFFFFFFFF
+_VARIABLE_CHUNKS: Final = 0xFFFFFFFF
 _LEGACY_FORMATS: Final = 6  # point formats below have the legacy count, too
 
 
@@ -54,6 +54,12 @@ class LasHeader:
         Points that count: those that the header announces.
     compressed
         Whether it is LAZ.
+    laszip
+        Content of the record that says how it is compressed; empty where there is none.
+    point_format, record_bytes
+        Of a point, uncompressed.
+    data_at
+        Where the points begin.
     crs
         The coordinate system; None where nothing is said.
     warnings
@@ -62,6 +68,10 @@ class LasHeader:
 
     points: int
     compressed: bool
+    laszip: bytes
+    point_format: int
+    record_bytes: int
+    data_at: int
     crs: CoordinateSystem | None
     warnings: list[str]
 
@@ -128,13 +138,17 @@ class _Header:
                 )
         found = dict(self._records(header_bytes, records, extended_at, extended))
         if compressed:
-            self._check_chunks(points, data_at, found.get(LASZIP, b""))
+            self._check_chunks(points, data_at, found.get(_LASZIP, b""))
         else:
             behind = [at for at in (waveforms, extended_at if extended else 0) if at >= needed]
             self._check_rest(points, needed, min(behind, default=self.size), record_bytes)
         return LasHeader(
             points=points,
             compressed=compressed,
+            laszip=found.get(_LASZIP, b""),
+            point_format=form & 0x3F,
+            record_bytes=record_bytes,
+            data_at=data_at,
             crs=self._system(found),
             warnings=self.warnings,
         )
@@ -179,7 +193,7 @@ class _Header:
     def _check_chunks(self, points: int, data_at: int, laszip: bytes) -> None:
         """Compare the points of LAZ with its table of chunks."""
         if len(laszip) < 16:
-            return  # laspy says what is wrong
+            return  # `check_laz` says what is wrong
         (chunk_points,) = struct.unpack_from("<I", laszip, 12)
         self.file.seek(data_at)
         start = self.file.read(8)
@@ -195,7 +209,7 @@ class _Header:
         chunks = int.from_bytes(self.file.read(4), "little")
         if chunks > table_at - data_at:
             raise self._error("bad_las", f"{chunks} chunks in {table_at - data_at} bytes", table_at + 4)
-        if chunk_points in (0, VARIABLE_CHUNKS):
+        if chunk_points in (0, _VARIABLE_CHUNKS):
             if chunks and not points:
                 raise self._error(
                     "bad_las", f"the header counts no points, but there are {chunks} chunks", 107
@@ -228,7 +242,7 @@ class _Header:
                     return
                 user, number, length = form.unpack(head)
                 key = user.rstrip(b"\0"), number
-                if key == LASZIP or (key[0] == _PROJECTION and length <= _MAX_RECORD_BYTES):
+                if key == _LASZIP or (key[0] == _PROJECTION and length <= _MAX_RECORD_BYTES):
                     yield key, self.file.read(min(length, _MAX_RECORD_BYTES))
                 at += form.size + length
                 if at > self.size:

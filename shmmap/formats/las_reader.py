@@ -10,8 +10,8 @@ scale applied.
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from types import TracebackType
 from typing import Any, Final
 
@@ -22,13 +22,14 @@ from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, PackageMissing
 from shmmap.formats.causes import refusal
 from shmmap.formats.degrees import unit_warnings
-from shmmap.formats.las_header import LASZIP, VARIABLE_CHUNKS, read_las_header
+from shmmap.formats.las_header import read_las_header
+from shmmap.formats.laz_chunks import check_laz
 
 __all__ = ["LAS_SUFFIXES", "LasReader"]
 
 LAS_SUFFIXES: Final = (".las", ".laz")  # COPC files end in .copc.laz
 
-_LAYERED: Final = 3  # compressor whose chunks count their points
+_PANICS: Final = "pyo3_runtime"  # module of exceptions that are panics of Rust
 
 Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -65,27 +66,44 @@ class LasReader:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = os.fspath(path)
         checked = read_las_header(self.path)
+        self.points = checked.points
         self.compressed = checked.compressed
+        self.crs = checked.crs
         laspy = _laspy(self.path)
-        try:
-            self._reader = laspy.open(self.path)
-        except Exception as error:
-            raise refusal("bad_las", f"laspy refuses it: {_first_line(error)}", path=self.path) from error
+        chunks = None
+        backends: dict[str, Any] = {}
+        with ExitStack() as undo, _refused(self.path, ""):
+            if self.compressed:
+                chunks = check_laz(
+                    self.path, checked.laszip,
+                    point_format=checked.point_format, record_bytes=checked.record_bytes,
+                    data_at=checked.data_at,
+                )  # fmt: skip
+            if chunks is not None and not chunks.small:
+                backends = {"laz_backend": laspy.LazBackend.Lazrs}  # point by point
+            counted = self.points
+            if chunks is not None and chunks.points is not None and not checked.warnings:
+                counted = chunks.points
+            if counted < self.points:
+                message = f"{self.points} points announced, {counted} are there"
+                raise refusal("truncated", message, path=self.path, offset=os.stat(self.path).st_size)
+            if counted > self.points:
+                checked.warnings.append(
+                    f"the header counts {self.points} points, the compressed data {counted}"
+                )
+            self._reader = laspy.open(undo.enter_context(open(self.path, "rb")), **backends)
+            self._read_header(laspy, checked.points)
+            undo.pop_all()
+        self.warnings: tuple[str, ...] = (*checked.warnings, *unit_warnings(checked.crs))
+
+    def _read_header(self, laspy: Any, points: int) -> None:
         header = self._reader.header
-        header.point_count = self.points = checked.points  # laspy believes a wide count of 0
+        header.point_count = points  # laspy believes a wide count of 0
         self.version = str(header.version)
         self.encoding = ""
         low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
         sound = np.isfinite([low, high]).all() and (low <= high).all() and np.any([low, high])
         self.bounds: Bound3 | None = (low, high) if sound else None
-        self.crs = checked.crs
-        counted = _counted(self.path, header) if self.compressed and not checked.warnings else self.points
-        if counted < self.points:
-            message = f"{self.points} points announced, {counted} are there"
-            raise refusal("truncated", message, path=self.path, offset=os.stat(self.path).st_size)
-        if counted > self.points:
-            checked.warnings.append(f"the header counts {self.points} points, the compressed data {counted}")
-        self.warnings: tuple[str, ...] = (*checked.warnings, *unit_warnings(checked.crs))
         self._names = [name for name in header.point_format.dimension_names if name not in ("X", "Y", "Z")]
         empty = laspy.ScaleAwarePointRecord.zeros(0, header=header)
         self._columns = column_names(self._names)
@@ -120,20 +138,16 @@ class LasReader:
         at = start
         if at >= self.points:
             return
-        try:
+        with _refused(self.path, f"from point {at} on "):
             self._reader.seek(start)
-            while at < self.points:
+        while at < self.points:
+            with _refused(self.path, f"after {at} points "):
                 record = self._reader.read_points(min(block_points, self.points - at))
-                if not len(record):
-                    break
-                at += len(record)
-                yield self._block(record)
-        except MapDataError:
-            raise
-        except Exception as error:
-            raise refusal(
-                "bad_las", f"after {at} points laspy refuses it: {_first_line(error)}", path=self.path
-            ) from error
+                block = self._block(record)
+            if not len(record):
+                break
+            at += len(record)
+            yield block
         if at < self.points:
             raise refusal("truncated", f"{self.points} points announced, {at} are there", path=self.path)
 
@@ -147,27 +161,17 @@ class LasReader:
         return block
 
 
-def _counted(path: str, header: Any) -> int:
-    """Return how many points a LAZ file's chunks hold; where they do not say, what its header does."""
-    import lazrs
-
-    points = int(header.point_count)
+@contextmanager
+def _refused(path: str, when: str) -> Iterator[None]:
+    """Turn whatever laspy raises into a refusal; a panic of its decompressor is no `Exception`."""
     try:
-        (laszip,) = (one for one in header.vlrs if (one.user_id.encode(), one.record_id) == LASZIP)
-        record = laszip.record_data_bytes()
-        compressor, chunk_points = struct.unpack_from("<H10xI", record)
-        with open(path, "rb") as file:
-            file.seek(header.offset_to_point_data)
-            chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
-            if chunk_points == VARIABLE_CHUNKS:
-                return sum(count for count, _ in chunks)
-            if compressor != _LAYERED or not chunks:
-                return points
-            last = sum(nbytes for _, nbytes in chunks[:-1])
-            file.seek(header.offset_to_point_data + 8 + last + header.point_format.size)
-            return (len(chunks) - 1) * int(chunk_points) + int.from_bytes(file.read(4), "little")
-    except Exception:  # noqa: BLE001  whatever it is, reading the points says it
-        return points
+        yield
+    except MapDataError:
+        raise
+    except BaseException as error:
+        if not isinstance(error, Exception) and type(error).__module__ != _PANICS:
+            raise
+        raise refusal("bad_las", f"{when}laspy refuses it: {_first_line(error)}", path=path) from error
 
 
 def _laspy(path: str) -> Any:

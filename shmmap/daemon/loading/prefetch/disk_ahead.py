@@ -2,8 +2,8 @@
 """Fetches ahead onto the disk what does not fit in memory, to bridge outages of the store.
 
 It looks along the same paths as `Prefetcher`, as far ahead, and begins where `Prefetcher` has no room.  It
-fetches objects of cells that are neither in memory nor on the disk, those needed first first, and only while
-no load waits for a loader.
+fetches objects of cells that are neither in memory nor on the disk, in the order in which they will be
+needed, and only while no load waits for a loader.
 """
 
 from __future__ import annotations

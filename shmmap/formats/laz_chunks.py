@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a LAZ file says of its compression, checked before a decompressor allocates for it.
+
+The LASzip record names the items that make a point; the table of chunks counts their bytes and, where chunks
+differ in size, their points; a chunk of LAS 1.4's formats counts its layers.  lazrs believes all of them: it
+would end the process for memory that is not there.  As LASzip 3 writes them (laszip_dll, `src/laszip.cpp`).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from dataclasses import dataclass
+from typing import IO, Final
+
+from shmmap.formats.causes import refusal
+
+__all__ = ["LazChunks", "check_laz"]
+
+_RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points a chunk, items
+_ITEM: Final = struct.Struct("<HHH")  # type, bytes, version
+_VARIABLE: Final = (0, 0xFFFFFFFF)  # points a chunk where the table counts them
+_LAYERED: Final = 3  # compressor whose chunks count their points and layers
+_CHUNKED: Final = (2, _LAYERED)
+_POINT10, _GPS, _RGB, _WAVE, _POINT14, _RGB14, _RGBNIR14, _WAVE14 = range(6, 14)
+_EXTRA, _EXTRA14 = 0, 14
+_ITEMS: Final = {  # of each point format
+    0: (_POINT10,),
+    1: (_POINT10, _GPS),
+    2: (_POINT10, _RGB),
+    3: (_POINT10, _GPS, _RGB),
+    4: (_POINT10, _GPS, _WAVE),
+    5: (_POINT10, _GPS, _RGB, _WAVE),
+    6: (_POINT14,),
+    7: (_POINT14, _RGB14),
+    8: (_POINT14, _RGBNIR14),
+    9: (_POINT14, _WAVE14),
+    10: (_POINT14, _RGBNIR14, _WAVE14),
+}
+_BYTES: Final = {
+    _POINT10: 20, _GPS: 8, _RGB: 6, _WAVE: 29, _POINT14: 30, _RGB14: 6, _RGBNIR14: 8, _WAVE14: 29
+}  # fmt: skip
+_LAYERS: Final = {_POINT14: 9, _RGB14: 1, _RGBNIR14: 2, _WAVE14: 1}
+_WHOLE_CHUNK_BYTES: Final = 256 << 20  # of the points of one chunk, held at once
+
+
+@dataclass(frozen=True, slots=True)
+class LazChunks:
+    """What the chunks of a file hold.
+
+    Attributes
+    ----------
+    points
+        Points in all chunks; None where neither the table nor a chunk says it.
+    small
+        Whether the points of each chunk fit in memory, so that several can be decompressed at once.
+    """
+
+    points: int | None
+    small: bool
+
+
+def check_laz(
+    path: str, laszip: bytes, *, point_format: int, record_bytes: int, data_at: int
+) -> LazChunks | None:
+    """Check a LAZ file's LASzip record against its header, and its chunks against the file's bytes.
+
+    Parameters
+    ----------
+    path
+        The file, whose table of chunks lies inside it.
+    laszip
+        Content of its LASzip record.
+    point_format, record_bytes, data_at
+        As the header says: format without the bits of compression, bytes of an uncompressed point, and where
+        the chunks begin.
+
+    Returns
+    -------
+    LazChunks or None
+        None for a file without chunks, which is decompressed point by point.
+
+    Raises
+    ------
+    MapDataError
+        ``bad_las``.
+    """
+    import lazrs
+
+    if len(laszip) < _RECORD.size or len(laszip) < _RECORD.size + _ITEM.size * _RECORD.unpack_from(laszip)[2]:
+        raise refusal("bad_las", "its LASzip record is missing or too short", path=path)
+    compressor, chunk_points, count = _RECORD.unpack_from(laszip)
+    items = [_ITEM.unpack_from(laszip, _RECORD.size + place * _ITEM.size) for place in range(count)]
+    _check_items(path, items, point_format, record_bytes)
+    if compressor not in _CHUNKED:
+        return None
+    size = os.stat(path).st_size
+    with open(path, "rb") as file:
+        file.seek(data_at)
+        try:
+            chunks: list[tuple[int, int]] = lazrs.read_chunk_table(file, lazrs.LazVlr(laszip))
+        except (lazrs.LazrsError, OSError, OverflowError, MemoryError) as error:
+            raise refusal("bad_las", f"its table of chunks: {error}", path=path, offset=data_at) from error
+        room = size - data_at - 8
+        if sum(nbytes for _, nbytes in chunks) > room:
+            raise refusal(
+                "bad_las", f"its table of chunks announces more than the {room} bytes after its header",
+                path=path, offset=data_at,
+            )  # fmt: skip
+        counts = [points for points, _ in chunks]
+        if compressor == _LAYERED:
+            layers = sum(nbytes if kind == _EXTRA14 else _LAYERS[kind] for kind, nbytes, _ in items)
+            counted = _check_layers(path, file, chunks, layers, record_bytes, data_at + 8)
+            counts[-1:] = counted[-1:]  # where all chunks are of one size, the table does not know the last
+        elif chunk_points not in _VARIABLE:
+            counts = []
+    most = max([points for points, _ in chunks], default=0)
+    return LazChunks(sum(counts) if counts else None, most * record_bytes <= _WHOLE_CHUNK_BYTES)
+
+
+def _check_items(path: str, items: list[tuple[int, int, int]], point_format: int, record_bytes: int) -> None:
+    """Compare what a compressed point is made of with what the header says of points."""
+    needed = _ITEMS.get(point_format, ())
+    extra = record_bytes - sum(_BYTES[kind] for kind in needed)
+    expected = [(kind, _BYTES[kind]) for kind in needed]
+    if extra:
+        expected.append((_EXTRA14 if needed[:1] == (_POINT14,) else _EXTRA, extra))
+    if [(kind, nbytes) for kind, nbytes, _ in items] != expected:
+        message = f"its LASzip record is not of point format {point_format} of {record_bytes} bytes"
+        raise refusal("bad_las", message, path=path)
+
+
+def _check_layers(
+    path: str, file: IO[bytes], chunks: list[tuple[int, int]], layers: int, record_bytes: int, at: int
+) -> list[int]:
+    """Compare the layers of each chunk, whose first point is not compressed, with its bytes; its points."""
+    form = struct.Struct(f"<{1 + layers}I")
+    counted = []
+    for _, nbytes in chunks:
+        file.seek(at + record_bytes)
+        head = file.read(form.size)
+        if len(head) < form.size:
+            raise refusal("bad_las", "a chunk ends within its first point", path=path, offset=at)
+        points, *sizes = form.unpack(head)
+        if record_bytes + form.size + sum(sizes) > nbytes:
+            message = f"a chunk of {nbytes} bytes announces {sum(sizes)} bytes of layers"
+            raise refusal("bad_las", message, path=path, offset=at)
+        counted.append(points)
+        at += nbytes
+    return counted
