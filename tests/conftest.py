@@ -28,9 +28,10 @@ from tests.support.survivors import no_survivors  # noqa: F401
 
 def pytest_configure(config: pytest.Config) -> None:
     """Compile kernels once for all tests and their processes, whatever their home is; heed Ctrl-C."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        # a shell's background job ignores SIGINT, and so would the programs it starts for the tests
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    # a shell's background job ignores SIGINT, and below nohup SIGHUP, and so would the tests' programs
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, handler)
     # how long an example takes, to make and to run, is for the machine to say
     hypothesis.settings.register_profile(
         "shmmap", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]

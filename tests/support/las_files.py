@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
 import laspy
 import numpy as np
 from numpy.typing import NDArray
+
+POINTS = 1000
 
 
 def write_las(
@@ -30,3 +33,21 @@ def write_las(
         las[name] = columns[name]
     las.write(str(path))
     return las
+
+
+def las_file(path: Path, *, version: str = "1.4", form: int = 6, points: int = POINTS) -> Path:
+    """Write points on a line, 0.1 m apart."""
+    header = laspy.LasHeader(point_format=form, version=version)
+    header.scales = np.full(3, 0.01)
+    las = laspy.LasData(header)
+    las.x = las.y = las.z = np.arange(points) * 0.1
+    las.write(str(path))
+    return path
+
+
+def patched(path: Path, at: int, code: str, *values: float) -> Path:
+    """Write values over a file's bytes."""
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<" + code, data, at, *values)
+    path.write_bytes(bytes(data))
+    return path

@@ -40,6 +40,8 @@ _LOOK_EVERY_S: Final = 0.01
 _KEPT: Final = 1024
 """Requests that a reader keeps until they are taken: of all clients together, so more than rclcpp's ten."""
 _CLIENT_ID: Final = re.compile(rb"(?:^|;)clientid=([^;]*);")
+_PARTICIPANT_HEX: Final = 24
+"""Digits of an endpoint's key, in hexadecimal, that are its participant's."""
 _VENDORS: Final = {0x0101: "RTI Connext", 0x010F: "Fast DDS", 0x0110: "CycloneDDS", 0x0112: "RustDDS"}
 """By the first two bytes of an endpoint's key: there most implementations put their number (DDSI-RTPS)."""
 
@@ -137,7 +139,9 @@ class ServiceServer:
         self.condition = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
         self._lock = threading.Lock()  # one thread takes requests, another one replies
         self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
-        self._readers: dict[int, str] = {}  # clientid by DDS's number of the reader of replies
+        self._readers: dict[
+            int, str
+        ] = {}  # clientid, else participant, by DDS's number of the reader of replies
 
     def __repr__(self) -> str:
         return f"<ServiceServer {self.name}>"
@@ -167,16 +171,24 @@ class ServiceServer:
         return [found for one in handles if (found := self._requester(one)) is not None]
 
     def present(self, request: Request) -> bool:
-        """Whether the client can hear the reply; waits a moment for its reader to be found."""
-        name = request.requester.name
+        """Whether the client can receive the reply; waits a moment for its reader to be found.
+
+        A client without ``clientid=`` counts as present after its first second: its reader may belong to
+        another participant.
+        """
+        requester = request.requester
+        owner = requester.name[:_PARTICIPANT_HEX] if requester.stranger else requester.name
         with self._lock:
-            if request.requester.stranger or name in self._readers.values():
+            if owner in self._readers.values():
                 return True
-        found_s = request.requester.found_s  # many that nobody can answer share this second
-        until_s = max(time.monotonic() + _KNOWN_WITHIN_S, found_s + _KNOWN_AT_FIRST_S)
-        while not self._hears(name):
-            if self.gone(request) or time.monotonic() >= until_s:
+        until_s = requester.found_s + _KNOWN_AT_FIRST_S  # many that nobody can answer share this second
+        if not requester.stranger:
+            until_s = max(time.monotonic() + _KNOWN_WITHIN_S, until_s)
+        while not self._has_reader(owner):
+            if self.gone(request):
                 return False
+            if time.monotonic() >= until_s:
+                return requester.stranger
             time.sleep(_LOOK_EVERY_S)
         return True
 
@@ -218,15 +230,15 @@ class ServiceServer:
             self._requesters[handle] = one
             return one
 
-    def _hears(self, client_id: str) -> bool:
+    def _has_reader(self, owner: str) -> bool:
         """Look for a client's reader among those that are known now."""
         handles = _unsigned(self._writer.get_matched_subscriptions())
         with self._lock:
             for handle in handles - self._readers.keys():
                 found = self._writer.get_matched_subscription_data(handle)
                 if found is not None:
-                    self._readers[handle] = _client_id(found)
-            return client_id in self._readers.values()
+                    self._readers[handle] = _client_id(found) or found.key.hex[:_PARTICIPANT_HEX]
+            return owner in self._readers.values()
 
 
 def _client_id(endpoint: Any) -> str:

@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import laspy
 import numpy as np
 import pytest
 
@@ -15,24 +13,7 @@ from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError
 from shmmap.formats.cloud import describe, read_cloud
-
-POINTS = 1000
-
-
-def las_file(path: Path, *, version: str = "1.4", form: int = 6, points: int = POINTS) -> Path:
-    header = laspy.LasHeader(point_format=form, version=version)
-    header.scales = np.full(3, 0.01)
-    las = laspy.LasData(header)
-    las.x = las.y = las.z = np.arange(points) * 0.1
-    las.write(str(path))
-    return path
-
-
-def patched(path: Path, at: int, code: str, *values: float) -> Path:
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<" + code, data, at, *values)
-    path.write_bytes(bytes(data))
-    return path
+from tests.support.las_files import POINTS, las_file, patched
 
 
 def said(path: Path) -> str:
