@@ -6,11 +6,11 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.forked_verbs import run_verb
 
 
 class Shmmap:
@@ -32,14 +32,7 @@ class Shmmap:
         return done.stdout
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "shmmap.cli", *words],
-            env=self.environment,
-            cwd=self.cwd,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        return run_verb(list(words), self.environment, self.cwd)
 
     def json(self, *words: str, code: int = 0) -> Any:
         return json.loads(self(*words, "--json", code=code))

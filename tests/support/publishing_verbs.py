@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.daemon_process import ROOT
+from tests.support.forked_verbs import run_verb
 
 __all__ = ["Shmmap", "files_of", "locked"]
 
@@ -30,11 +31,9 @@ class Shmmap:
         }
 
     def start(self, *words: str | Path, env: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
-        """Start a verb; one worker is enough for these maps."""
-        if words[0] in ("publish", "prepare"):
-            words = (*words, "--workers", "1")
+        """Start a verb as a process of its own."""
         return subprocess.Popen(
-            [sys.executable, "-m", "shmmap.cli", *map(str, words)],
+            [sys.executable, "-m", "shmmap.cli", *_words(words)],
             env={**self.environment, **(env or {})},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -42,15 +41,20 @@ class Shmmap:
         )
 
     def __call__(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> str:
-        process = self.start(*words, env=env)
-        out, errors = process.communicate()
-        assert process.returncode == code, errors + out
-        return out if code in (0, 1) else errors
+        done = run_verb(_words(words), {**self.environment, **(env or {})}, os.getcwd())
+        assert done.returncode == code, done.stderr + done.stdout
+        return done.stdout if code in (0, 1) else done.stderr
 
     def json(self, *words: str | Path, code: int = 0, env: Mapping[str, str] | None = None) -> dict[str, Any]:
         found = json.loads(self(*words, "--json", code=code, env=env))
         assert isinstance(found, dict)
         return found
+
+
+def _words(words: tuple[str | Path, ...]) -> list[str]:
+    """One worker is enough for these maps."""
+    workers = ["--workers", "1"] if words[0] in ("publish", "prepare") else []
+    return [*map(str, words), *workers]
 
 
 def files_of(folder: Path) -> dict[str, bytes]:

@@ -20,6 +20,7 @@ from typing import Final
 import pytest
 
 from tests.support.daemon_process import ROOT, processes_marked, wait_ended
+from tests.support.forked_verbs import forking
 
 __all__ = ["no_survivors"]
 
@@ -36,7 +37,7 @@ def no_survivors() -> Iterator[None]:
         stdin=subprocess.PIPE,
         start_new_session=True,  # Ctrl-C is not for it
     )
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, forking():
         patch.setenv(_VARIABLE, mark)
         yield
     watcher.kill()

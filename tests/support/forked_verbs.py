@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs verbs of ``shmmap`` in forks of a process that has imported them: half a second less for each.
+
+Whatever a process does after its imports is done: arguments, environment, directory, exit code, a crash at a
+step.  Command lines of the pages, programs that are sent signals, and what depends on the interpreter's
+start (``PYTHONPATH``, ``LD_PRELOAD``, the locale) are processes of their own elsewhere.
+
+As a program: ``python -m tests.support.forked_verbs FD`` serves requests on a socket until its end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import pkgutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any, Final
+
+from tests.support.daemon_process import ROOT
+
+__all__ = ["forking", "run_verb"]
+
+_AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
+_PACKAGES: Final = ("shmmap.cli.verbs", "shmmap.publishing", "shmmap.origin.remote")
+_MODULES: Final = (
+    "shmmap.cli.entry",
+    "shmmap.client.client",
+    "cryptography.hazmat.primitives.serialization",
+    "obstore",
+    "securesystemslib.signer",
+    "tuf.api.metadata",
+    "tuf.ngclient",
+    "zstandard",
+)
+_REQUEST_BYTES: Final = 1 << 18
+_FDS: Final = 2
+
+
+def run_verb(
+    words: list[str], environment: Mapping[str, str], cwd: str | os.PathLike[str]
+) -> subprocess.CompletedProcess[str]:
+    """Run ``shmmap`` with these words, as `subprocess.run` does, and return its output and exit code."""
+    server = _server()
+    if not server.may_run(environment) or not server.lock.acquire(blocking=False):
+        return subprocess.run(
+            [sys.executable, "-m", "shmmap.cli", *words],
+            env=dict(environment), cwd=cwd, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    try:
+        return server.run(words, environment, cwd)
+    finally:
+        server.lock.release()
+
+
+class _Server:
+    """Its socket is open from the start, so that no test seems to leak it; the process runs when it is needed."""
+
+    def __init__(self) -> None:
+        self._socket, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._start = _at_start(os.environ)
+        self.lock = threading.Lock()
+
+    def _begin(self) -> None:
+        with self._theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.support.forked_verbs", str(self._theirs.fileno())],
+                cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
+                pass_fds=[self._theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
+
+    def may_run(self, environment: Mapping[str, str]) -> bool:
+        return _at_start(environment) == self._start
+
+    def run(
+        self, words: list[str], environment: Mapping[str, str], cwd: str | os.PathLike[str]
+    ) -> subprocess.CompletedProcess[str]:
+        if self._process is None:
+            self._begin()
+        request = {"words": words, "environment": dict(environment), "cwd": os.fspath(cwd)}
+        with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
+            fds = [out.fileno(), errors.fileno()]
+            socket.send_fds(self._socket, [json.dumps(request).encode()], fds)
+            code = int(self._socket.recv(64))
+            texts = []
+            for file in (out, errors):
+                file.seek(0)
+                texts.append(file.read())
+        return subprocess.CompletedProcess(words, code, *texts)
+
+    def close(self) -> None:
+        self._socket.close()
+        self._theirs.close()
+        if self._process is not None:
+            self._process.wait()
+
+
+@cache
+def _server() -> _Server:
+    return _Server()
+
+
+@contextlib.contextmanager
+def forking() -> Iterator[None]:
+    """Fork verbs until this ends."""
+    server = _server()
+    try:
+        yield
+    finally:
+        server.close()
+        _server.cache_clear()
+
+
+def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """What an interpreter reads once, less the path of this project."""
+    found = {name: value for name, value in environment.items() if name.startswith(_AT_START)}
+    if found.get("PYTHONPATH") in ("", str(ROOT)):
+        del found["PYTHONPATH"]
+    return found
+
+
+def _import_all() -> None:
+    names = list(_MODULES)
+    for package in _PACKAGES:
+        path = importlib.import_module(package).__path__
+        names += [one.name for one in pkgutil.iter_modules(path, f"{package}.")]
+    for name in names:
+        with contextlib.suppress(ImportError):  # an extra that is not installed
+            importlib.import_module(name)
+
+
+def _become(request: dict[str, Any], fds: list[int]) -> None:
+    """Make of this fork the process that was asked for."""
+    for place, fd in enumerate(fds, 1):
+        os.dup2(fd, place)
+        os.close(fd)
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    os.chdir(request["cwd"])
+    sys.argv[1:] = request["words"]
+    from shmmap import failpoints
+
+    old = failpoints.step
+    new = importlib.reload(failpoints).step
+    if new is not old:
+        for module in list(sys.modules.values()):
+            if getattr(module, "step", None) is old:
+                module.step = new  # type: ignore[attr-defined]
+
+
+def main() -> int:
+    """Fork for each request; in a fork, return the verb's exit code."""
+    requests = socket.socket(fileno=int(sys.argv[1]))
+    _import_all()
+    while True:
+        data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _FDS)
+        if not data:
+            return 0
+        pid = os.fork()
+        if pid == 0:
+            requests.close()
+            _become(json.loads(data), fds)
+            from shmmap.cli.entry import main as verb
+
+            return verb()
+        for fd in fds:
+            os.close(fd)
+        _, status = os.waitpid(pid, 0)
+        requests.send(str(os.waitstatus_to_exitcode(status)).encode())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
