@@ -61,7 +61,7 @@ def run_verb(
 
 
 class _Server:
-    """Its socket is open from the start, so that no test seems to leak it; the process runs when it is needed."""
+    """Its socket is open from the start, so that no test seems to leak it; it runs from the first verb on."""
 
     def __init__(self) -> None:
         self._socket, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
