@@ -8,24 +8,21 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
+from tests.support.forked_verbs import run_verb
 
 VERBS = (("health",), ("status",), ("top", "--once"), ("metrics",), ("doctor", "--json"))
 
 
 def shmmap(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
     environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
-    return subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *words],
-        env={**environment, "PYTHONPATH": str(ROOT), **variables}, capture_output=True, text=True, cwd="/",
-    )  # fmt: skip
+    return run_verb(words, {**environment, **variables}, "/")
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from shmmap.origin.map_directory import open_map
 from tests.benchmarks.divide_large import FIELDS, generate
 from tests.support.clouds import expected_rows, map_rows, rows_of, xyzircaedt
 from tests.support.daemon_process import ROOT
+from tests.support.forked_verbs import run_verb
 from tests.support.pcd_files import read_pcd
 
 KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "4"))
@@ -32,7 +33,7 @@ def command(*words: str | Path) -> list[str]:
 
 
 def shmmap(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*words), capture_output=True, text=True, cwd=ROOT)
+    return run_verb([*map(str, words)], cwd=ROOT)
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.forked_verbs import run_verb
 from tests.support.patience import Patience
 from tests.support.pcd_files import read_pcd
 
@@ -289,14 +290,7 @@ def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path
         "SHMMAP_SHM_DIR": "/dev/shm",
         "SHMMAP_INSTANCE": f"test-{os.getpid()}-unused",
     }
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *words],
-        env=environment,
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_verb(words, environment, tmp_path)
     assert done.returncode == code, done.stderr
     assert done.stdout == ""
     assert "Traceback" not in done.stderr

@@ -23,6 +23,7 @@ from shmmap_clients.scans.trajectory import matrix_of, tum_line
 import shmmap
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.forked_verbs import run_verb
 from tests.support.pcd_files import read_pcd
 
 Factory = Callable[..., DaemonProcess]
@@ -58,7 +59,7 @@ def kept_by_brute_force(scan: Scan, made: DividedMap, distance: float) -> NDArra
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PROGRAM, *words], capture_output=True, text=True, timeout=LONG_S)
+    return run_verb(words, module=PROGRAM[-1])
 
 
 def test_a_window_gives_what_brute_force_gives(daemon: Factory, divided_map: DividedMap) -> None:

@@ -24,6 +24,7 @@ from shmmap.origin.map_writer import MapWriter
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.forked_verbs import run_verb
 from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
@@ -188,13 +189,13 @@ def test_the_program(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -
     one = daemon(divided_map.root)
     (divided_map.pcd_dir / sorted(divided_map.corners)[5]).write_bytes(b"no cloud")
     command = [
-        sys.executable, "-m", "shmmap_clients.elevation_map", "build", "--resolution", "1.0",
+        "build", "--resolution", "1.0",
         "--tolerance", "4", "--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint,
     ]  # fmt: skip
     words = ["--out", f"{tmp_path}/e.npz", "--hillshade", f"{tmp_path}/h.png", "--json"]
     with shmmap.connect(one.endpoint) as client:
         client.reload()
-    done = subprocess.run([*command, *words], capture_output=True, text=True, timeout=LONG_S)
+    done = run_verb([*command, *words], module="shmmap_clients.elevation_map")
     assert done.returncode == 1, done.stderr
     document = json.loads(done.stdout)
     assert [Path(failure["id"]).name for failure in document["failed"]] == [sorted(divided_map.corners)[5]]
@@ -203,13 +204,12 @@ def test_the_program(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -
         assert read["height"].shape == (document["rows"], document["columns"])
         assert int((read["kind"] == 1).sum()) == document["measured"] > 0
     assert (tmp_path / "h.png").read_bytes()[1:4] == b"PNG"
-    wrong = subprocess.run([*command, "--out", "e.xyz"], capture_output=True, text=True, timeout=LONG_S)
+    wrong = run_verb([*command, "--out", "e.xyz"], module="shmmap_clients.elevation_map")
     assert wrong.returncode == 2
 
 
 def elevation(*words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "shmmap_clients.elevation_map", "build", "--quiet", "--json", *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=LONG_S)
+    return run_verb(["build", "--quiet", "--json", *words], module="shmmap_clients.elevation_map")
 
 
 def test_a_sparse_map_is_warned_about(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -> None:

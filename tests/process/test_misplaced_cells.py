@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,9 @@ import pytest
 import shmmap
 from shmmap import ShmmapWarning
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.forked_verbs import run_verb
 
 MOVED = "0_0.pcd"
 
@@ -27,13 +26,8 @@ def cli(one: DaemonProcess | None, *words: str | Path) -> tuple[int, str]:
     place: tuple[str, ...] = ()
     if one is not None:
         place = ("--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir)
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *map(str, words), *place],
-        env={**{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
+    done = run_verb([*map(str, words), *place], environment)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -28,6 +28,7 @@ from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import stop
 from tests.support.drive_sender import PERIOD_S, to_and_fro
+from tests.support.forked_verbs import run_verb
 from tests.support.patience import Patience
 from tests.support.town_drive import TownDrive, make_town_drive
 
@@ -80,7 +81,7 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
         text=True,
     )
     try:
-        done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+        done = run_verb(words, module=PROGRAM[-1])
         assert done.returncode == 0, done.stderr + done.stdout
         heard = json.loads(listener.communicate(timeout=60.0)[0])
     finally:
@@ -126,7 +127,7 @@ def test_scans_and_odometry_come_from_another_process(
         ]
     )
     try:
-        done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+        done = run_verb(words, module=PROGRAM[-1])
         assert done.returncode == 0, done.stderr + done.stdout
         assert sender.wait(60.0) == 0
     finally:
@@ -249,7 +250,7 @@ def test_a_route_that_cannot_be_read(drive: TownDrive, tmp_path: Path, name: str
         "--route",
         str(tmp_path / name),
     ]
-    done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+    done = run_verb(words, module=PROGRAM[-1])
     assert done.returncode == code, done.stderr
     assert name in done.stderr
 
@@ -261,10 +262,10 @@ def test_rules_that_make_no_sense_are_refused() -> None:
 
 def test_without_a_daemon_the_program_says_so(drive: TownDrive, tmp_path: Path) -> None:
     words = ["follow", "--endpoint", str(tmp_path / "none.sock"), "--scans", str(drive.scans)]
-    done = subprocess.run([*PROGRAM, *words, "--truth", str(drive.truth)], capture_output=True, text=True)
+    done = run_verb([*words, "--truth", str(drive.truth)], module=PROGRAM[-1])
     assert done.returncode == 69
     assert "shmmap-ndt:" in done.stderr
-    nowhere = subprocess.run([*PROGRAM, *words], capture_output=True, text=True)
+    nowhere = run_verb(words, module=PROGRAM[-1])
     assert nowhere.returncode == 2
     assert nowhere.stderr.startswith("shmmap-ndt: no start pose: give --init, --rough or --truth")
 
@@ -313,7 +314,7 @@ def test_many_clients_share_one_map(daemon: DaemonFactory, tmp_path: Path) -> No
     assert loads == 256  # one per cell and layer, not per client
     words, scan, _ = clients[0]
     align = ["align", "--map", str(tmp_path / "whole.npz"), "--scan", scan, "--guess", words, "--json"]
-    alone = json.loads(subprocess.run([*PROGRAM, *align], capture_output=True, text=True, check=True).stdout)
+    alone = json.loads(run_verb(align, module=PROGRAM[-1]).stdout)
     np.testing.assert_allclose(found[0]["T_map_base"], alone["T_map_base"], atol=1e-6)
     assert found[0]["iterations"] == alone["iterations"]
     assert found[0]["voxels"] == alone["voxels"]

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,9 @@ from shmmap_clients.scans.trajectory import tum_line
 
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
+from tests.support.forked_verbs import run_verb
 from tests.support.town_drive import TownDrive, make_town_drive
 
-PROGRAM = [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher", "follow"]
 BEFORE, GONE, FRAMES = 7, 6, 20
 KEPT = [*range(BEFORE), *range(BEFORE + GONE, FRAMES)]
 
@@ -50,7 +48,7 @@ def follow(one: DaemonProcess, drive: TownDrive, *words: str) -> tuple[int, str,
     """Run the program; returns exit code, stderr, and its JSON lines, the summary last."""
     base = ["--endpoint", one.endpoint, "--scans", str(drive.scans), "--truth", str(drive.truth)]
     base += ["--thin", "0.5", "--map-radius", "200", "--steady", "--json-lines", "-", "--json"]
-    done = subprocess.run([*PROGRAM, *base, *words], capture_output=True, text=True)
+    done = run_verb(["follow", *base, *words], module="shmmap_clients.ndt_scan_matcher")
     return done.returncode, done.stderr, [json.loads(line) for line in done.stdout.splitlines()]
 
 

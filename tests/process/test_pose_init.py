@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from shmmap_clients.scans.scan_file import read_scan
 
 import shmmap
 from tests.process.conftest import DaemonFactory
+from tests.support.forked_verbs import run_verb
 from tests.support.town_drive import TownDrive, make_town_drive
 
 
@@ -119,11 +119,15 @@ def test_a_place_without_map_is_no_answer(town: TownDrive, daemon: DaemonFactory
                 initializer.initialize(scan, RoughPose(x, 0.0))
 
 
+def pose_init(*words: str) -> subprocess.CompletedProcess[str]:
+    return run_verb(words, module="shmmap_clients.pose_initializer")
+
+
 def test_the_program_away_from_the_map_says_where_it_is(town: TownDrive, daemon: DaemonFactory) -> None:
     one = daemon(town.map_dir)
-    program = [sys.executable, "-m", "shmmap_clients.pose_initializer", "--endpoint", one.endpoint]
+    program = ["--endpoint", one.endpoint]
     words = ["--scan", str(town.scans / "scan_0002.npz"), "--pose", "5000,0,0,0,0,0", "--json"]
-    done = subprocess.run([*program, *words], capture_output=True, text=True)
+    done = pose_init(*program, *words)
     assert done.returncode == 1
     assert re.fullmatch(
         r"shmmap-pose-init: no map within 150 m of the rough pose: the map spans x \S+ .. \S+ m,"
@@ -134,15 +138,14 @@ def test_the_program_away_from_the_map_says_where_it_is(town: TownDrive, daemon:
     assert document["no_map"]
     assert document["T_map_base"] is None
     assert not document["reliable"]
-    allowed = subprocess.run([*program, *words, "--allow-empty"], capture_output=True, text=True)
+    allowed = pose_init(*program, *words, "--allow-empty")
     assert (allowed.returncode, allowed.stderr) == (0, done.stderr)
 
 
 def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> None:
     one = daemon(town.map_dir)
     x, y, z, _, _, yaw = town.poses[2]
-    program = [sys.executable, "-m", "shmmap_clients.pose_initializer"]
-    program += ["--endpoint", one.endpoint, "--shm-dir", one.shm_dir]
+    program = ["--endpoint", one.endpoint, "--shm-dir", one.shm_dir]
     words = [
         "--scan",
         str(town.scans / "scan_0002.npz"),
@@ -151,28 +154,28 @@ def test_the_program(town: TownDrive, daemon: DaemonFactory, tmp_path: Path) -> 
         "--height",
         "1.8",
     ]
-    done = subprocess.run([*program, *words, "--json"], capture_output=True, text=True)
+    done = pose_init(*program, *words, "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     np.testing.assert_allclose(np.array(document["T_map_base"])[:3, 3], [x, y, z], atol=0.3)
     assert document["reliable"] is True
-    done = subprocess.run([*program, *words], capture_output=True, text=True)
+    done = pose_init(*program, *words)
     assert ": reliable" in done.stdout
     flat = [*words[:3], f"{x + 1},{y - 1},{yaw}", *words[4:], "--pose-format", "xyyaw"]
-    again = subprocess.run([*program, *flat], capture_output=True, text=True)
+    again = pose_init(*program, *flat)
     # the first is the pose as --pose-format says, the last has times
     assert again.stdout.splitlines()[1:-1] == done.stdout.splitlines()[1:-1]
     assert again.stdout.splitlines()[0].count(",") == 2
     points = read_scan(town.scans / "scan_0002.npz")
     np.savez(tmp_path / "near.npz", xyz=points[np.linalg.norm(points, axis=1) < 6.0])
     near = [*program, "--scan", str(tmp_path / "near.npz"), *words[2:]]
-    done = subprocess.run([*near, "--json"], capture_output=True, text=True)
+    done = pose_init(*near, "--json")
     assert done.returncode == 1, done.stderr
     document = json.loads(done.stdout)
     assert not document["reliable"]
     assert "distance" in document["failed_limits"]
-    done = subprocess.run(near, capture_output=True, text=True)
+    done = pose_init(*near)
     assert re.search(r"NOT reliable \(.*fewer than 20 points beyond 10 m", done.stdout)
     missing = [*program, "--scan", str(tmp_path / "none.npz"), "--pose", "0,0,0,0,0,0"]
-    assert subprocess.run(missing, capture_output=True).returncode == 66
-    assert subprocess.run([*program, "--scan", "x"], capture_output=True).returncode == 2
+    assert pose_init(*missing).returncode == 66
+    assert pose_init(*program, "--scan", "x").returncode == 2

@@ -20,6 +20,7 @@ from shmmap.layers.build import build_layer
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, wait_ended
 from tests.support.divided_map import DividedMap, make_map
+from tests.support.forked_verbs import run_verb
 from tests.support.offered_kinds import install
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
@@ -43,12 +44,7 @@ def command(made: DividedMap, cache: Path, *layers: str) -> list[str]:
 
 
 def prepare(made: DividedMap, cache: Path, *layers: str, code: int = 0, **environment: str) -> dict[str, Any]:
-    done = subprocess.run(
-        command(made, cache, *layers),
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-    )
+    done = run_verb(command(made, cache, *layers)[3:], {**os.environ, **environment})
     assert done.returncode == code, done.stderr + done.stdout
     answer = json.loads(done.stdout)
     assert isinstance(answer, dict)
@@ -152,12 +148,7 @@ def test_a_killed_run_leaves_no_worker_and_goes_on_where_it_was(tmp_path: Path) 
 
 def test_a_cache_that_cannot_be_written_is_said_at_once(small_map: DividedMap, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    done = subprocess.run(
-        command(small_map, tmp_path / "file", NDT),
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
+    done = run_verb(command(small_map, tmp_path / "file", NDT)[3:])
     assert done.returncode == 73
     assert f"{tmp_path}/file/layers: Not a directory" in done.stderr
 
@@ -169,11 +160,7 @@ def test_usage(small_map: DividedMap, tmp_path: Path) -> None:
         (["--layer", "ndt"], "leaf"),
         (["--layer", "points", "--cache-size", "much"], "no size"),
     ):
-        done = subprocess.run(
-            [sys.executable, "-m", "shmmap.cli", "prepare", str(small_map.root), *words],
-            capture_output=True,
-            text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)},
-        )
+        environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+        done = run_verb(["prepare", str(small_map.root), *words], environment)
         assert done.returncode == 2, done.stderr
         assert message in done.stderr

@@ -23,6 +23,7 @@ from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
 import shmmap
 from tests.support.daemon_process import DaemonProcess
+from tests.support.forked_verbs import run_verb
 from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, reference
@@ -37,7 +38,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PROGRAM, *words], capture_output=True, text=True, timeout=LONG_S)
+    return run_verb(words, module=PROGRAM[-1])
 
 
 def write_drive(directory: Path, scans: int) -> list[str]:

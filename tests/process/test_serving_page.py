@@ -6,8 +6,6 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from tests.support.bucket_server import KEYS, BucketServer
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import make_map
 from tests.support.faulty_web import faulty_web
+from tests.support.forked_verbs import run_verb
 from tests.support.pages import read_page
 from tests.support.patience import Patience
 from tests.support.publishing import publish
@@ -68,10 +67,7 @@ def test_a_map_is_served_from_a_bucket(buckets: BucketServer, daemon: DaemonFact
     def run(line: str) -> str:
         words = [*shlex.split(line)[1:], "--instance", one.instance, "--runtime-dir", one.runtime_dir]
         words += ["--shm-dir", one.shm_dir] if words[0] == "health" else []
-        done = subprocess.run(
-            [sys.executable, "-m", "shmmap.cli", *words],
-            env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
-        )  # fmt: skip
+        done = run_verb(words)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -87,10 +83,7 @@ def verb(one: DaemonProcess, line: str) -> tuple[int, str]:
     words = shlex.split(line)[1:]
     place = ["--instance", one.instance, "--runtime-dir", one.runtime_dir]
     place += ["--shm-dir", one.shm_dir] if words[0] != "tail" else []
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", *words, *place],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "400"}, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run_verb([*words, *place], {**os.environ, "COLUMNS": "400"})
     return done.returncode, done.stdout
 
 

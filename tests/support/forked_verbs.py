@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs verbs of ``shmmap`` in forks of a process that has imported them: half a second less for each.
+"""Runs ``shmmap`` and its programs in forks of a process that has imported them: a second less for each.
 
 Whatever a process does after its imports is done: arguments, environment, directory, exit code, a crash at a
 step.  Command lines of the pages, programs that are sent signals, and what depends on the interpreter's
@@ -15,12 +15,13 @@ import importlib
 import json
 import os
 import pkgutil
+import runpy
 import socket
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, Final
 
@@ -29,11 +30,21 @@ from tests.support.daemon_process import ROOT
 __all__ = ["forking", "run_verb"]
 
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
-_PACKAGES: Final = ("shmmap.cli.verbs", "shmmap.publishing", "shmmap.origin.remote")
+_PACKAGES: Final = (
+    "shmmap.cli.verbs",
+    "shmmap.publishing",
+    "shmmap.origin.remote",
+    "shmmap_clients.compare_map_filter",
+    "shmmap_clients.elevation_map",
+    "shmmap_clients.ndt_scan_matcher",
+    "shmmap_clients.pose_initializer",
+    "shmmap_clients.rolling_map",
+)
 _MODULES: Final = (
     "shmmap.cli.entry",
     "shmmap.client.client",
     "cryptography.hazmat.primitives.serialization",
+    "numba",
     "obstore",
     "securesystemslib.signer",
     "tuf.api.metadata",
@@ -45,17 +56,25 @@ _FDS: Final = 2
 
 
 def run_verb(
-    words: list[str], environment: Mapping[str, str], cwd: str | os.PathLike[str]
+    words: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    cwd: str | os.PathLike[str] = ".",
+    *,
+    module: str = "shmmap.cli",
 ) -> subprocess.CompletedProcess[str]:
-    """Run ``shmmap`` with these words, as `subprocess.run` does, and return its output and exit code."""
+    """Run ``python -m MODULE WORDS``, as `subprocess.run` does, and return its output and exit code."""
+    environment = dict(os.environ if environment is None else environment)
     server = _server()
     if not server.may_run(environment) or not server.lock.acquire(blocking=False):
         return subprocess.run(
-            [sys.executable, "-m", "shmmap.cli", *words],
-            env=dict(environment), cwd=cwd, capture_output=True, text=True, check=False,
+            [sys.executable, "-m", module, *words],
+            env=environment, cwd=cwd, capture_output=True, text=True, check=False,
         )  # fmt: skip
     try:
-        return server.run(words, environment, cwd)
+        directory = os.path.abspath(cwd)
+        return server.run(
+            {"words": list(words), "environment": environment, "cwd": directory, "module": module}
+        )
     finally:
         server.lock.release()
 
@@ -80,12 +99,9 @@ class _Server:
     def may_run(self, environment: Mapping[str, str]) -> bool:
         return _at_start(environment) == self._start
 
-    def run(
-        self, words: list[str], environment: Mapping[str, str], cwd: str | os.PathLike[str]
-    ) -> subprocess.CompletedProcess[str]:
+    def run(self, request: dict[str, Any]) -> subprocess.CompletedProcess[str]:
         if self._process is None:
             self._begin()
-        request = {"words": words, "environment": dict(environment), "cwd": os.fspath(cwd)}
         with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
             fds = [out.fileno(), errors.fileno()]
             socket.send_fds(self._socket, [json.dumps(request).encode()], fds)
@@ -94,7 +110,7 @@ class _Server:
             for file in (out, errors):
                 file.seek(0)
                 texts.append(file.read())
-        return subprocess.CompletedProcess(words, code, *texts)
+        return subprocess.CompletedProcess(request["words"], code, *texts)
 
     def close(self) -> None:
         self._socket.close()
@@ -131,7 +147,7 @@ def _import_all() -> None:
     names = list(_MODULES)
     for package in _PACKAGES:
         path = importlib.import_module(package).__path__
-        names += [one.name for one in pkgutil.iter_modules(path, f"{package}.")]
+        names += [one.name for one in pkgutil.iter_modules(path, f"{package}.") if "__main__" not in one.name]
     for name in names:
         with contextlib.suppress(ImportError):  # an extra that is not installed
             importlib.import_module(name)
@@ -157,7 +173,7 @@ def _become(request: dict[str, Any], fds: list[int]) -> None:
 
 
 def main() -> int:
-    """Fork for each request; in a fork, return the verb's exit code."""
+    """Fork for each request; a fork ends as its program does."""
     requests = socket.socket(fileno=int(sys.argv[1]))
     _import_all()
     while True:
@@ -167,10 +183,10 @@ def main() -> int:
         pid = os.fork()
         if pid == 0:
             requests.close()
-            _become(json.loads(data), fds)
-            from shmmap.cli.entry import main as verb
-
-            return verb()
+            request = json.loads(data)
+            _become(request, fds)
+            runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
+            return 0
         for fd in fds:
             os.close(fd)
         _, status = os.waitpid(pid, 0)
