@@ -32,6 +32,7 @@ __all__ = ["forking", "run_verb"]
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
 _PACKAGES: Final = (
     "shmmap.cli.verbs",
+    "shmmap.daemon.live",
     "shmmap.publishing",
     "shmmap.origin.remote",
     "shmmap_clients.compare_map_filter",

@@ -19,6 +19,7 @@ from shmmap.chunks.layout import OUT_OF_SERVICE
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkMemory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
+from tests.support.forked_verbs import run_verb
 from tests.support.live_drive import RESOLUTION, SCANS, marked, opened, voxels_on_disk
 from tests.support.slow_occupancy import Voxel
 
@@ -44,12 +45,14 @@ def shm() -> Iterator[Path]:
 
 
 def run(
-    shm: Path, disk: Path, first: int, memory: tuple[str, str] = LITTLE, **environment: str
-) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "tests.support.live_drive", str(shm), str(disk), *memory, str(first)],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, **environment},
-    )  # fmt: skip
+    shm: Path, disk: Path, first: int, memory: tuple[str, str] = LITTLE, crash: str = "", code: int = 0
+) -> str:
+    """Drive from a scan to the end, or until it is killed; what it says."""
+    words = [str(shm), str(disk), *memory, str(first)]
+    environment = {**os.environ, **({"SHMMAP_TEST_CRASH": crash} if crash else {})}
+    done = run_verb(words, environment, module="tests.support.live_drive")
+    assert done.returncode == code, done.stderr
+    return done.stdout
 
 
 def said(lines: str, word: str) -> list[int]:
@@ -72,8 +75,7 @@ def assert_equal_to(reference: dict[Voxel, int], shm: Path, disk: Path) -> None:
 
 
 def test_a_drive_with_little_memory(shm: Path, tmp_path: Path, reference: dict[Voxel, int]) -> None:
-    process = run(shm, tmp_path, 1)
-    lines, _ = process.communicate(timeout=120)
+    lines = run(shm, tmp_path, 1)
     assert said(lines, "evicted")[0] > 20
     assert said(lines, "most")[0] <= int(LITTLE[0])
     assert said(lines, "applied") == list(range(1, SCANS + 1))
@@ -84,7 +86,7 @@ def test_a_drive_with_little_memory(shm: Path, tmp_path: Path, reference: dict[V
 def finish(shm: Path, disk: Path, lines: str) -> str:
     """The mapper sends again what it has no answer for."""
     applied = said(lines, "applied")
-    more, _ = run(shm, disk, (max(applied) if applied else 0) + 1).communicate(timeout=120)
+    more = run(shm, disk, (max(applied) if applied else 0) + 1)
     assert more.endswith("done\n")
     return more
 
@@ -102,9 +104,7 @@ def finish(shm: Path, disk: Path, lines: str) -> str:
 def test_a_writer_that_is_killed_at_any_step_loses_nothing(
     shm: Path, tmp_path: Path, reference: dict[Voxel, int], label: str, times: int, memory: tuple[str, str]
 ) -> None:
-    process = run(shm, tmp_path, 1, memory, SHMMAP_TEST_CRASH=f"{label}:{times}")
-    lines, _ = process.communicate(timeout=120)
-    assert process.returncode == -signal.SIGKILL, "it came to that step"
+    lines = run(shm, tmp_path, 1, memory, crash=f"{label}:{times}", code=-signal.SIGKILL)
     finish(shm, tmp_path, lines)
     assert_equal_to(reference, shm, tmp_path)
 
@@ -117,7 +117,11 @@ def test_a_writer_that_is_killed_at_any_time_loses_nothing(
     lines = ""
     for _ in range(4):
         applied = said(lines, "applied")
-        process = run(shm, tmp_path, (max(applied) if applied else 0) + 1)
+        first = str((max(applied) if applied else 0) + 1)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.support.live_drive", str(shm), str(tmp_path), *LITTLE, first],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
         assert process.stdout is not None
         for _ in range(rng.randint(0, 12)):
             lines += process.stdout.readline()
@@ -133,7 +137,7 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
     monkeypatch: pytest.MonkeyPatch, shm: Path, tmp_path: Path, reference: dict[Voxel, int]
 ) -> None:
     """Out of service, and its name still there: nobody is to have that; and what cannot be opened stays."""
-    run(shm, tmp_path, 1).communicate(timeout=120)
+    run(shm, tmp_path, 1)
     name = max(shm.glob("shmmap-live.*"))
     made, folder = opened(shm, tmp_path, 10**9)
     key = next(key for key, chunk in made.chunks.items() if chunk.name == f"/{name.name}")
@@ -159,7 +163,7 @@ def _too_many_files(*_: object) -> None:
 
 
 def test_what_is_damaged_on_disk_is_kept_and_mapping_goes_on(shm: Path, tmp_path: Path) -> None:
-    run(shm, tmp_path, 1).communicate(timeout=120)
+    run(shm, tmp_path, 1)
     for name in os.listdir(shm):
         (shm / name).unlink()
     victim = max(tmp_path.glob("*.chunk"), key=lambda path: path.stat().st_size)
