@@ -103,6 +103,8 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         return _EXIT_INTERRUPTED
     except Exception as error:  # noqa: BLE001
+        if _is_of_interrupt(error):
+            return _EXIT_INTERRUPTED
         if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
             _drop_output()
             complain(
@@ -119,6 +121,14 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         )
         return InternalError.exit_code
     return code
+
+
+def _is_of_interrupt(error: BaseException) -> bool:
+    """Whether an error comes of cleaning up after an interrupt, which came in the middle of a call."""
+    context: BaseException | None = error
+    while context is not None and not isinstance(context, KeyboardInterrupt):
+        context = context.__context__
+    return context is not None
 
 
 def _open_what_is_closed() -> None:

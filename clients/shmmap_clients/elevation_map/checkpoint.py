@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shmmap.formats.npz_writer import write_npz
 from shmmap_clients.elevation_map.seams import Columns, Seams
 
 __all__ = ["Checkpoint", "Journal"]
@@ -44,10 +45,7 @@ class Journal:
             arrays[f"i{number}"], arrays[f"j{number}"] = rows.i, rows.j
             arrays[f"values{number}"] = rows.values
         with open(self._directory / f"seams-{state.done}.npz", "wb") as file:
-            with zipfile.ZipFile(file, "w") as archive:
-                for name, array in arrays.items():
-                    with archive.open(f"{name}.npy", "w") as member:
-                        np.lib.format.write_array(member, array, allow_pickle=False)
+            write_npz(file, arrays)
             file.flush()
             os.fsync(file.fileno())
         with open(self._directory / "heights", "rb") as heights:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
+from shmmap.formats.npz_writer import npz_archive
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.hillshade import hillshade
 from shmmap_clients.png import PngWriter
@@ -118,7 +119,7 @@ def _npz(file: IO[bytes], grid: ElevationGrid, fill_radius: float, document: dic
         "origin": np.array(grid.origin),
         "document": np.array(json.dumps(document)),
     }
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+    with npz_archive(file, zipfile.ZIP_DEFLATED) as archive:
         for name, array in small.items():
             with archive.open(f"{name}.npy", "w") as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)

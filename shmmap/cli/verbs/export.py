@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
@@ -184,21 +184,10 @@ def _inside(area: Area, cell: Cell) -> NDArray[np.bool_]:
     return inside
 
 
-def _write_npz(file: IO[bytes], columns: dict[str, NDArray[Any]]) -> None:
-    """Write an archive for `numpy.load`; numpy's own function cannot name a column "file"."""
-    import zipfile
-
-    from numpy.lib import format as npy
-
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, values in columns.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                npy.write_array(member, values, allow_pickle=False)
-
-
 def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argparse.Namespace) -> None:
     """Write one file; it appears whole or not at all."""
     from shmmap.formats.durable_file import appearing_file, writing_errors
+    from shmmap.formats.npz_writer import write_npz
     from shmmap.formats.pcd.writer import write_pcd
 
     with writing_errors(str(path)):
@@ -206,7 +195,7 @@ def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argpar
         try:
             with appearing_file(path, replace=args.force) as file:
                 if kind == "npz":
-                    _write_npz(file, columns)
+                    write_npz(file, columns)
                 else:
                     write_pcd(file, columns, encoding=args.encoding)
         except FileExistsError as error:

@@ -84,6 +84,16 @@ def test_ctrl_c_is_quiet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert capsys.readouterr() == ("", "")
 
 
+def test_an_error_of_cleaning_up_after_ctrl_c_is_no_defect(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    error = ValueError("it cannot be closed now")
+    error.__context__ = KeyboardInterrupt()
+    fail_with(monkeypatch, error)
+    assert main(["version"]) == 130
+    assert capsys.readouterr() == ("", "")
+
+
 def test_a_reader_that_went_away_is_no_error() -> None:
     reading, writing = os.pipe()
     os.close(reading)

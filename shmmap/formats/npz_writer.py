@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Archives of arrays for `numpy.load`; an interrupt in the middle of one leaves no second error."""
+
+from __future__ import annotations
+
+import contextlib
+import zipfile
+from collections.abc import Iterator, Mapping
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.processes.interrupts import interrupts_later
+
+__all__ = ["npz_archive", "write_npz"]
+
+
+@contextlib.contextmanager
+def npz_archive(file: IO[bytes], compression: int = zipfile.ZIP_STORED) -> Iterator[zipfile.ZipFile]:
+    """Open an archive on a file for writing, and complete it unless the block raises."""
+    archive: zipfile.ZipFile | None = None
+    try:
+        with interrupts_later():
+            archive = zipfile.ZipFile(file, "w", compression)
+        yield archive
+        archive.close()
+    except BaseException:
+        if archive is not None:
+            archive.fp = None  # interrupted within a call it cannot be closed, and its finalizer would try
+        raise
+
+
+def write_npz(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays of any name; numpy's own function can name none "file"."""
+    with npz_archive(file) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
