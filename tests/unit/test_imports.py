@@ -48,7 +48,7 @@ PARTS = {
     "processes": set[str](),
     "geometry": {"errors"},
     "optional_packages": {"errors"},
-    "formats": {"errors", "columns", "geometry", "logfmt"},
+    "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
     "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
     "protocol": {"errors", "columns", "geometry"},
     "kernel_cache": {"logfmt"},
