@@ -101,9 +101,11 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         _drop_output()
         return _EXIT_BROKEN_PIPE
     except KeyboardInterrupt:
+        _forget_interrupt()
         return _EXIT_INTERRUPTED
     except Exception as error:  # noqa: BLE001
         if _is_of_interrupt(error):
+            _forget_interrupt()
             return _EXIT_INTERRUPTED
         if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
             _drop_output()
@@ -121,6 +123,15 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
         )
         return InternalError.exit_code
     return code
+
+
+def _forget_interrupt() -> None:
+    """Let the exit code count.
+
+    CPython remembers that `exec` of a text was interrupted, as dataclasses use it while modules are imported,
+    and ends ``python -m`` by SIGINT instead, although the interrupt was caught; the next `exec` forgets it.
+    """
+    exec("")  # noqa: S102
 
 
 def _is_of_interrupt(error: BaseException) -> bool:

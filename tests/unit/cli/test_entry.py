@@ -84,6 +84,16 @@ def test_ctrl_c_is_quiet(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     assert capsys.readouterr() == ("", "")
 
 
+def test_ctrl_c_within_exec_is_an_exit_code(tmp_path: Path) -> None:
+    """As while a dataclass is made."""
+    (tmp_path / "interrupted.py").write_text(
+        "import sys\nfrom shmmap.cli.program import exit_code_of\n"
+        "sys.exit(exit_code_of('shmmap', lambda: exec('raise KeyboardInterrupt')))\n"
+    )
+    done = subprocess.run([sys.executable, "-m", "interrupted"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_an_error_of_cleaning_up_after_ctrl_c_is_no_defect(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
