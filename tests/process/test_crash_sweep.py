@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.errors import InternalError
+from shmmap.errors import InternalError, StaleSocket
 from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 from tests.process.conftest import DaemonFactory
 from tests.support.cpp_client import CppClient
@@ -124,6 +125,15 @@ def live(client: shmmap.Client, made: DividedMap) -> None:
     assert_right(whole(client, 0, 0, 5), made, near)
 
 
+def connected(one: DaemonProcess) -> shmmap.Client:
+    """Connect, again where the daemon has just died and is started again."""
+    waiting = Patience()
+    while waiting(True):
+        with contextlib.suppress(StaleSocket):
+            return shmmap.connect(one.endpoint, timeout=240.0, connect_timeout=240.0)
+    raise AssertionError("it is not started again")
+
+
 @pytest.mark.more_as_root
 @pytest.mark.parametrize("label", [*DAEMON_STEPS, *WORKER_STEPS])
 def test_daemon_and_worker(
@@ -135,7 +145,7 @@ def test_daemon_and_worker(
         before = reader.checksums()
         with (
             Keeper(one) as keeper,
-            shmmap.connect(one.endpoint, timeout=240.0, connect_timeout=240.0) as client,
+            connected(one) as client,
         ):
             live(client, divided_map)
             assert reader.checksums() == before
