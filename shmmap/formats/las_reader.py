@@ -75,10 +75,12 @@ class LasReader:
         with ExitStack() as undo, _refused(self.path, ""):
             if self.compressed:
                 chunks = check_laz(
-                    self.path, checked.laszip,
-                    point_format=checked.point_format, record_bytes=checked.record_bytes,
+                    self.path,
+                    checked.laszip,
+                    point_format=checked.point_format,
+                    record_bytes=checked.record_bytes,
                     data_at=checked.data_at,
-                )  # fmt: skip
+                )
             if chunks is not None and not chunks.small:
                 backends = {"laz_backend": laspy.LazBackend.Lazrs}  # point by point
             counted = self.points

@@ -38,8 +38,15 @@ _ITEMS: Final = {  # of each point format
     10: (_POINT14, _RGBNIR14, _WAVE14),
 }
 _BYTES: Final = {
-    _POINT10: 20, _GPS: 8, _RGB: 6, _WAVE: 29, _POINT14: 30, _RGB14: 6, _RGBNIR14: 8, _WAVE14: 29
-}  # fmt: skip
+    _POINT10: 20,
+    _GPS: 8,
+    _RGB: 6,
+    _WAVE: 29,
+    _POINT14: 30,
+    _RGB14: 6,
+    _RGBNIR14: 8,
+    _WAVE14: 29,
+}
 _LAYERS: Final = {_POINT14: 9, _RGB14: 1, _RGBNIR14: 2, _WAVE14: 1}
 _WHOLE_CHUNK_BYTES: Final = 256 << 20  # of the points of one chunk, held at once
 
@@ -103,10 +110,8 @@ def check_laz(
             raise refusal("bad_las", f"its table of chunks: {error}", path=path, offset=data_at) from error
         room = size - data_at - 8
         if sum(nbytes for _, nbytes in chunks) > room:
-            raise refusal(
-                "bad_las", f"its table of chunks announces more than the {room} bytes after its header",
-                path=path, offset=data_at,
-            )  # fmt: skip
+            message = f"its table of chunks announces more than the {room} bytes after its header"
+            raise refusal("bad_las", message, path=path, offset=data_at)
         counts = [points for points, _ in chunks]
         if compressor == _LAYERED:
             layers = sum(nbytes if kind == _EXTRA14 else _LAYERS[kind] for kind, nbytes, _ in items)
@@ -137,6 +142,9 @@ def _check_layers(
     form = struct.Struct(f"<{1 + layers}I")
     counted = []
     for _, nbytes in chunks:
+        if not nbytes:  # as some programs end a file whose points fill its chunks
+            counted.append(0)
+            continue
         file.seek(at + record_bytes)
         head = file.read(form.size)
         if len(head) < form.size:

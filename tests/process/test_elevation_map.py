@@ -189,9 +189,16 @@ def test_the_program(daemon: Factory, divided_map: DividedMap, tmp_path: Path) -
     one = daemon(divided_map.root)
     (divided_map.pcd_dir / sorted(divided_map.corners)[5]).write_bytes(b"no cloud")
     command = [
-        "build", "--resolution", "1.0",
-        "--tolerance", "4", "--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint,
-    ]  # fmt: skip
+        "build",
+        "--resolution",
+        "1.0",
+        "--tolerance",
+        "4",
+        "--cache",
+        f"{tmp_path}/cache",
+        "--endpoint",
+        one.endpoint,
+    ]
     words = ["--out", f"{tmp_path}/e.npz", "--hillshade", f"{tmp_path}/h.png", "--json"]
     with shmmap.connect(one.endpoint) as client:
         client.reload()

@@ -69,8 +69,12 @@ def run_verb(
     if not server.may_run(environment) or not server.lock.acquire(blocking=False):
         return subprocess.run(
             [sys.executable, "-m", module, *words],
-            env=environment, cwd=cwd, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            env=environment,
+            cwd=cwd,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     try:
         directory = os.path.abspath(cwd)
         return server.run(
@@ -93,9 +97,12 @@ class _Server:
         with self._theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "tests.support.forked_verbs", str(self._theirs.fileno())],
-                cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
-                pass_fds=[self._theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
-            )  # fmt: skip
+                cwd=ROOT,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                pass_fds=[self._theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
 
     def may_run(self, environment: Mapping[str, str]) -> bool:
         return _at_start(environment) == self._start

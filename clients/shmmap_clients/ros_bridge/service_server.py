@@ -139,9 +139,8 @@ class ServiceServer:
         self.condition = ReadCondition(self._reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)
         self._lock = threading.Lock()  # one thread takes requests, another one replies
         self._requesters: dict[int, Requester] = {}  # by DDS's number of the writer of requests
-        self._readers: dict[
-            int, str
-        ] = {}  # clientid, else participant, by DDS's number of the reader of replies
+        # clientid, or participant where there is none, by DDS's number of the reader of replies
+        self._readers: dict[int, str] = {}
 
     def __repr__(self) -> str:
         return f"<ServiceServer {self.name}>"
@@ -181,7 +180,7 @@ class ServiceServer:
         with self._lock:
             if owner in self._readers.values():
                 return True
-        until_s = requester.found_s + _KNOWN_AT_FIRST_S  # many that nobody can answer share this second
+        until_s = requester.found_s + _KNOWN_AT_FIRST_S
         if not requester.stranger:
             until_s = max(time.monotonic() + _KNOWN_WITHIN_S, until_s)
         while not self._has_reader(owner):

@@ -91,6 +91,22 @@ def test_a_chunk_without_its_first_point_is_refused(tmp_path: Path) -> None:
     refused(patched(path, 247, "Q", 1), "within its first point")
 
 
+@pytest.mark.parametrize("form", [3, 7])
+def test_an_empty_chunk_at_the_end_is_read(tmp_path: Path, form: int) -> None:
+    """Where the points fill the chunks before it."""
+    path, record, data_at = laz_file(tmp_path, form)
+    expected = read_cloud(path)
+    data = path.read_bytes()
+    (table_at,) = struct.unpack_from("<q", data, data_at)
+    table = io.BytesIO()
+    chunks = [(0, table_at - data_at - 8), (0, 0)]
+    lazrs.write_chunk_table(table, chunks, lazrs.LazVlr.new_for_compression(form, 0))
+    path.write_bytes(data[:table_at] + table.getvalue())
+    cloud = read_cloud(patched(path, record + CHUNK_POINTS, "I", POINTS))
+    for name, values in expected.columns.items():
+        assert np.array_equal(cloud.columns[name], values), name
+
+
 def test_a_table_of_more_bytes_than_the_file_is_refused(tmp_path: Path) -> None:
     path, _, data_at = laz_file(tmp_path, 3)
     data = path.read_bytes()
@@ -112,6 +128,6 @@ def test_a_panic_of_the_decompressor_is_a_refusal(tmp_path: Path) -> None:
             reader.seek(0)
 
 
-def test_an_interrupt_is_none() -> None:
+def test_an_interrupt_is_not_a_refusal() -> None:
     with pytest.raises(KeyboardInterrupt), _refused("a.laz", ""):
         raise KeyboardInterrupt

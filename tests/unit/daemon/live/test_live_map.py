@@ -94,13 +94,21 @@ def finish(shm: Path, disk: Path, lines: str) -> str:
 @pytest.mark.parametrize(
     ("label", "times", "memory"),
     [
-        ("live.copied", 60, LITTLE), ("live.odd", 61, LITTLE), ("live.applied", 1, LITTLE),
-        ("live.applied", 90, LITTLE), ("live.even", 97, LITTLE), ("live.map", 1, LITTLE),
-        ("live.written", 9, LITTLE), ("live.synced", 1, LITTLE), ("live.renamed", 12, LITTLE),
-        ("live.flushed", 1, LITTLE), ("live.odd", 61, PLENTY), ("live.applied", 90, PLENTY),
+        ("live.copied", 60, LITTLE),
+        ("live.odd", 61, LITTLE),
+        ("live.applied", 1, LITTLE),
+        ("live.applied", 90, LITTLE),
+        ("live.even", 97, LITTLE),
+        ("live.map", 1, LITTLE),
+        ("live.written", 9, LITTLE),
+        ("live.synced", 1, LITTLE),
+        ("live.renamed", 12, LITTLE),
+        ("live.flushed", 1, LITTLE),
+        ("live.odd", 61, PLENTY),
+        ("live.applied", 90, PLENTY),
         ("live.written", 9, PLENTY),
     ],
-)  # fmt: skip
+)
 def test_a_writer_that_is_killed_at_any_step_loses_nothing(
     shm: Path, tmp_path: Path, reference: dict[Voxel, int], label: str, times: int, memory: tuple[str, str]
 ) -> None:
@@ -120,8 +128,9 @@ def test_a_writer_that_is_killed_at_any_time_loses_nothing(
         first = str((max(applied) if applied else 0) + 1)
         process = subprocess.Popen(
             [sys.executable, "-m", "tests.support.live_drive", str(shm), str(tmp_path), *LITTLE, first],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         assert process.stdout is not None
         for _ in range(rng.randint(0, 12)):
             lines += process.stdout.readline()
