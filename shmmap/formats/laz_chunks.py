@@ -13,6 +13,7 @@ import struct
 from dataclasses import dataclass
 from typing import IO, Final
 
+from shmmap.errors import MapDataError
 from shmmap.formats.causes import refusal
 
 __all__ = ["LazChunks", "check_laz"]
@@ -95,7 +96,7 @@ def check_laz(
     import lazrs
 
     if len(laszip) < _RECORD.size or len(laszip) < _RECORD.size + _ITEM.size * _RECORD.unpack_from(laszip)[2]:
-        raise refusal("bad_las", "its LASzip record is missing or too short", path=path)
+        raise _damaged(path, "its LASzip record is missing or too short")
     compressor, chunk_points, count = _RECORD.unpack_from(laszip)
     items = [_ITEM.unpack_from(laszip, _RECORD.size + place * _ITEM.size) for place in range(count)]
     _check_items(path, items, point_format, record_bytes)
@@ -107,11 +108,11 @@ def check_laz(
         try:
             chunks: list[tuple[int, int]] = lazrs.read_chunk_table(file, lazrs.LazVlr(laszip))
         except (lazrs.LazrsError, OSError, OverflowError, MemoryError) as error:
-            raise refusal("bad_las", f"its table of chunks: {error}", path=path, offset=data_at) from error
+            raise _damaged(path, f"its table of chunks: {error}", data_at) from error
         room = size - data_at - 8
         if sum(nbytes for _, nbytes in chunks) > room:
             message = f"its table of chunks announces more than the {room} bytes after its header"
-            raise refusal("bad_las", message, path=path, offset=data_at)
+            raise _damaged(path, message, data_at)
         counts = [points for points, _ in chunks]
         if compressor == _LAYERED:
             layers = sum(nbytes if kind == _EXTRA14 else _LAYERS[kind] for kind, nbytes, _ in items)
@@ -132,7 +133,7 @@ def _check_items(path: str, items: list[tuple[int, int, int]], point_format: int
         expected.append((_EXTRA14 if needed[:1] == (_POINT14,) else _EXTRA, extra))
     if [(kind, nbytes) for kind, nbytes, _ in items] != expected:
         message = f"its LASzip record is not of point format {point_format} of {record_bytes} bytes"
-        raise refusal("bad_las", message, path=path)
+        raise _damaged(path, message)
 
 
 def _check_layers(
@@ -148,11 +149,16 @@ def _check_layers(
         file.seek(at + record_bytes)
         head = file.read(form.size)
         if len(head) < form.size:
-            raise refusal("bad_las", "a chunk ends within its first point", path=path, offset=at)
+            raise _damaged(path, "a chunk ends within its first point", at)
         points, *sizes = form.unpack(head)
         if record_bytes + form.size + sum(sizes) > nbytes:
             message = f"a chunk of {nbytes} bytes announces {sum(sizes)} bytes of layers"
-            raise refusal("bad_las", message, path=path, offset=at)
+            raise _damaged(path, message, at)
         counted.append(points)
         at += nbytes
     return counted
+
+
+def _damaged(path: str, message: str, offset: int | None = None) -> MapDataError:
+    hint = "the file is damaged: copy it again, or let the program that made it write it again"
+    return refusal("bad_las", message, path=path, offset=offset, hint=hint)
