@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -24,6 +25,8 @@ from tests.support.skips import (  # noqa: F401  hooks
     pytest_terminal_summary,
 )
 from tests.support.survivors import no_survivors  # noqa: F401
+
+_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -68,6 +71,19 @@ def pytest_collection_finish() -> None:
     """Have the garbage collector pass over what stays to the end: modules and tests by the thousand."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def signals_as_before() -> Iterator[None]:
+    """No test leaves a handler or a mask: what is forked after it could not be ended."""
+    before = {number: signal.getsignal(number) for number in _ENDINGS}
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    yield
+    after = {number: signal.getsignal(number) for number in _ENDINGS}
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    assert after == before
+    assert signal.pthread_sigmask(signal.SIG_SETMASK, blocked) == blocked
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Final
 
@@ -33,12 +33,10 @@ def interrupts_later() -> Iterator[None]:
         del frame
         held.append(number)
 
-    before = {number: signal.signal(number, hold) for number in ENDINGS}
     try:
-        yield
+        with _handled_by(hold):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         if held:
             signal.raise_signal(held[0])
 
@@ -53,12 +51,29 @@ def signals_interrupt() -> Iterator[None]:
             signal.signal(again, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in ENDINGS}
+    with _handled_by(interrupt):
+        yield
+
+
+@contextlib.contextmanager
+def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Have a function handle these signals, save one of a program in C, which Python cannot put back."""
+    before = {number: handler for number in ENDINGS if (handler := signal.getsignal(number)) is not None}
     try:
+        for number in before:
+            signal.signal(number, handle)
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        try:
+            _put_back(before)
+        except BaseException:  # a handler that was back already: the others must not stay away
+            _put_back(before)
+            raise
+
+
+def _put_back(handlers: Mapping[signal.Signals, Callable[[int, FrameType | None], object] | int]) -> None:
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 @contextlib.contextmanager

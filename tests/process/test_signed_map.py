@@ -283,7 +283,7 @@ def test_entry_and_current_are_repaired(shmmap: Shmmap, town: DividedMap, store:
 def test_of_two_publishers_one_wins(
     shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
 ) -> None:
-    url, keys = buckets.url("signed"), tmp_path / "keys"
+    url, keys = buckets.url("two_publishers"), tmp_path / "keys"
     shmmap("publish", town.root, url, "--sign", keys, env=buckets.environment)
     running = []
     for seed in (8, 9):

@@ -18,8 +18,12 @@ STUCK = """
 import os, signal, subprocess, sys
 def test_stuck():
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    with open("pid", "w") as file:
-        file.write(str(busy.pid))
+    fork = os.fork()
+    if fork == 0:
+        while True:
+            signal.pause()
+    with open("pids", "w") as file:
+        print(busy.pid, fork, file=file)
     {end}
 """
 
@@ -41,9 +45,9 @@ def test_a_run_that_is_ended_takes_its_processes_with_it(tmp_path: Path, end: st
         check=False,
     )  # fmt: skip
     assert done.returncode == code, done.stdout + done.stderr
-    pid = int((tmp_path / "pid").read_text())
-    try:
-        assert wait_ended(pid)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    for pid in map(int, (tmp_path / "pids").read_text().split()):
+        try:
+            assert wait_ended(pid)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
