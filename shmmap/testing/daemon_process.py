@@ -27,7 +27,7 @@ import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Final, TypeVar
+from typing import IO, Final, TypeVar
 
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
@@ -180,16 +180,21 @@ class DaemonProcess:
             *(self.arguments if arguments is None else arguments),
         ]  # fmt: skip
         with self.log_path.open("ab") as log:
-            return subprocess.Popen(
-                command,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                cwd="/",
-                pass_fds=self.pass_fds,
-                start_new_session=True,  # a Ctrl-C is for whoever started it, who ends it in order
-            )
+            return self._run(command, environment, log)
+
+    def _run(
+        self, command: Sequence[str], environment: Mapping[str, str], log: IO[bytes]
+    ) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd="/",
+            pass_fds=self.pass_fds,
+            start_new_session=True,  # a Ctrl-C is for whoever started it, who ends it in order
+        )
 
     def start(self: _Self, timeout_s: float = READY_S) -> _Self:
         """Start the daemon and wait until it says that it is ready."""

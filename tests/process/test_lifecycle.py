@@ -91,7 +91,7 @@ def test_two_instances_side_by_side(daemon: DaemonFactory, connect: Connect, div
 def test_no_map(daemon: DaemonFactory, tmp_path: Path, make: Callable[[Path], None], code: int) -> None:
     path = tmp_path / "map.pcd"
     make(path)
-    one: DaemonProcess = daemon(path, start=False)
+    one: DaemonProcess = daemon(path, start=False, forked=False)
     assert one.run_to_end() == code
     assert str(path) in one.log
     assert one.leftovers() == []
@@ -101,7 +101,7 @@ def test_no_map(daemon: DaemonFactory, tmp_path: Path, make: Callable[[Path], No
     "flags", [("--budget", "much"), ("--budget", "1000T"), ("--workers", "65"), ("--group", "no such group")]
 )
 def test_bad_settings(daemon: DaemonFactory, divided_map: DividedMap, flags: tuple[str, ...]) -> None:
-    one: DaemonProcess = daemon(divided_map.root, *flags, start=False)
+    one: DaemonProcess = daemon(divided_map.root, *flags, start=False, forked=False)
     assert one.run_to_end() in (2, 78)
     assert one.leftovers() == []
 
@@ -213,7 +213,7 @@ def _open_paths(pid: int) -> list[str]:
 def test_a_stale_socket_is_no_hindrance(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    one: DaemonProcess = daemon(divided_map.root, start=False)
+    one: DaemonProcess = daemon(divided_map.root, start=False, forked=False)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
         left.bind(one.endpoint)
     one.start()
@@ -224,7 +224,7 @@ def test_strangers_segments_are_left_alone(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Leftovers of this instance go, damaged ones included; other files stay."""
-    one: DaemonProcess = daemon(divided_map.root, start=False)
+    one: DaemonProcess = daemon(divided_map.root, start=False, forked=False)
     other = Path(one.shm_dir, "shmmap.other.0011223344556677")
     longer = Path(one.shm_dir, f"shmmap.{one.instance}x.0011223344556677")
     for path in (other, longer):
@@ -244,7 +244,7 @@ def test_directories_are_named_from_where_the_daemon_was_started(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
 ) -> None:
     """Its loaders and its clients, who are elsewhere, mean the same ones."""
-    one = daemon(divided_map.root, start=False)
+    one = daemon(divided_map.root, start=False, forked=False)
     one.command = ["env", "-C", str(tmp_path)]
     one.arguments = ["--shm-dir", os.path.relpath(one.shm_dir, tmp_path), "--cache-dir", "cache"]
     one.start()

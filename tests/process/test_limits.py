@@ -78,7 +78,7 @@ def test_a_daemon_with_limited_files_says_so_at_its_start(daemon: Factory, divid
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16 << 20, hard))
     try:
-        one = daemon(divided_map.root, "--budget", "32M")
+        one = daemon(divided_map.root, "--budget", "32M", forked=False)  # a fork has its parent's limits
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert re.search(

@@ -52,14 +52,14 @@ def test_moved_cells_are_named_everywhere(daemon: DaemonFactory, divided_map: Di
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as client:
         with pytest.warns(ShmmapWarning, match=rf"{MOVED}: 300 of the cell's points lie outside its box"):
-            cells = client.around(0, 0, 30).cells
+            cells = client.around(0, 0, 30, wait=60).cells
         assert len(cells) > 1
         assert count(client) == 1
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # once a cell
             del cells
             client.around(0, 0, 30)
-            client.around(0, 0, 30, layers=["voxel(leaf=2.0)"])
+            client.around(0, 0, 30, layers=["voxel(leaf=2.0)"], wait=60)
         assert one.log.count("points outside the cell's box") == 1
         assert divided_map.id(MOVED) in one.log
         assert "1 cell with points outside the cell's box" in cli(one, "status")[1]
@@ -102,7 +102,7 @@ def test_a_sound_map_says_nothing(daemon: DaemonFactory, divided_map: DividedMap
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint) as client, warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(client.around(0, 0, 100).cells) == 36
+        assert len(client.around(0, 0, 100, wait=60).cells) == 36
         assert count(client) == 0
     assert "outside" not in one.log
     code, said = cli(one, "status")

@@ -715,7 +715,7 @@ def loaded(pid: int) -> str:
 
 
 def test_a_daemon_of_files_loads_nothing_of_this(daemon: DaemonFactory, town: DividedMap) -> None:
-    one = daemon(town.root)
+    one = daemon(town.root, forked=False)
     with shmmap.connect(one.endpoint) as client:
         assert client.area(ALL, wait=60.0).complete
     for pid in (one.pid, *one.children()):

@@ -26,7 +26,7 @@ def test_a_full_file_system(
     other = Path(directory, "other")
     with other.open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, 16 << 20)
-    one = daemon(divided_map.root, *flags, shm_dir=directory, start=False)
+    one = daemon(divided_map.root, *flags, shm_dir=directory, start=False, forked=False)
     assert one.run_to_end() == 71
     assert f"{directory}" in one.log
     assert "hint: free some" in one.log
@@ -39,7 +39,7 @@ def test_a_file_system_that_is_not_mounted_yet(
     daemon: DaemonFactory, divided_map: DividedMap, private_tmpfs: Callable[[str], str]
 ) -> None:
     directory = private_tmpfs("16m") + "/not/yet"
-    one = daemon(divided_map.root, shm_dir=directory, start=False)
+    one = daemon(divided_map.root, shm_dir=directory, start=False, forked=False)
     assert one.run_to_end() == 71
     os.makedirs(directory)
     one.start()
@@ -47,7 +47,7 @@ def test_a_file_system_that_is_not_mounted_yet(
 
 def test_a_name_that_is_squatted(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     """A directory stands for a stranger's file: not even root replaces it by renaming."""
-    one = daemon(divided_map.root, start=False)
+    one = daemon(divided_map.root, start=False, forked=False)
     place = Path(one.shm_dir, f"shmmap.{one.instance}.statistics")
     place.mkdir()
     assert one.run_to_end() == 71
@@ -81,7 +81,7 @@ def test_endless_metadata(daemon: DaemonFactory, divided_map: DividedMap) -> Non
     metadata = divided_map.root / "pointcloud_map_metadata.yaml"
     good = metadata.read_text()
     metadata.write_text(f"{good}a.pcd: [{'7' * 1_000_000}, 0]\n")
-    one = daemon(divided_map.root, start=False)
+    one = daemon(divided_map.root, start=False, forked=False)
     assert one.run_to_end() == 65
     assert f"shmmap: {metadata}: line " in one.log
     assert "a.pcd: the corner must be two numbers, not [777" in one.log

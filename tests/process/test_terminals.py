@@ -48,7 +48,7 @@ def at_terminal(one: DaemonProcess, *before: str, **variables: str) -> tuple[sub
 
 @pytest.mark.parametrize("how", ["closed", "hung up"])
 def test_it_ends_with_its_terminal(daemon: DaemonFactory, divided_map: DividedMap, how: str) -> None:
-    one = daemon(divided_map.root, start=False)
+    one = daemon(divided_map.root, start=False, forked=False)
     process, terminal = at_terminal(one)
     if how == "closed":
         os.close(terminal)
@@ -66,7 +66,7 @@ def test_it_ends_with_its_terminal(daemon: DaemonFactory, divided_map: DividedMa
 def test_who_is_kept_reads_the_map_again(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, how: str
 ) -> None:
-    one = daemon(divided_map.root, start=False)
+    one = daemon(divided_map.root, start=False, forked=False)
     terminal = -1
     if how == "nohup":
         ignoring = (
@@ -87,7 +87,7 @@ def test_who_is_kept_reads_the_map_again(
 
 
 def test_a_terminal_that_closes_while_it_starts(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root, start=False)
+    one = daemon(divided_map.root, start=False, forked=False)
     ours, theirs = pty.openpty()
     with one.log_path.open("ab") as log:
         process = subprocess.Popen(

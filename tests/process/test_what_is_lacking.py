@@ -56,7 +56,7 @@ def test_beside_the_map(served: DaemonProcess, client: shmmap.Client, tmp_path: 
     with pytest.raises(UnknownCell, match=r"no cell within 5 m of \(9000, -70\); the map spans"):
         ask(9000, -70, 5, strict=True)
     assert len(ask(9000, -70, 5, strict=None)) == 0
-    assert len(ask(0, 0, 5)) == len(ask(0, 0, 5, strict=True)) == 4, "nothing lacks, nothing is said"
+    assert len(ask(0, 0, 5, wait=60)) == len(ask(0, 0, 5, strict=True)) == 4, "nothing lacks, nothing is said"
 
 
 def test_an_empty_difference_is_an_answer(client: shmmap.Client) -> None:

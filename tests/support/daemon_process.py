@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from shmmap.testing import daemon_process
 from shmmap.testing.daemon_process import READY_S, STOP_S
 from shmmap.testing.process_watch import open_files, processes_marked, wait_ended, wait_readable
+from tests.support.forked_verbs import ROOT, fork_program
 from tests.support.patience import Patience
 
 __all__ = [
@@ -25,8 +27,6 @@ __all__ = [
     "wait_ended",
     "wait_readable",
 ]
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def _stat(pid: int) -> list[str]:
@@ -47,12 +47,29 @@ def stop(pid: int) -> None:
 
 
 class DaemonProcess(daemon_process.DaemonProcess):
-    """The daemon of this tree, whatever is installed."""
+    """The daemon of this tree, whatever is installed.
 
-    def __init__(self, map_path: Path | str, *arguments: str, **options: Any) -> None:
+    Parameters
+    ----------
+    forked
+        Whether it may be a fork of a process that has imported it; for what an interpreter's start decides
+        (memory, modules, the command line in ``/proc``) it may not.
+    """
+
+    def __init__(self, map_path: Path | str, *arguments: str, forked: bool = True, **options: Any) -> None:
         super().__init__(map_path, *arguments, **options)
+        self._forked = forked
         self.environment["PYTHONPATH"] = str(ROOT)
         self.environment.update(options.get("environment") or {})
+
+    def _run(
+        self, command: Sequence[str], environment: Mapping[str, str], log: IO[bytes]
+    ) -> subprocess.Popen[bytes]:
+        if self._forked and not self.command and not self.pass_fds:
+            _, _, module, *words = command
+            if (process := fork_program(module, words, environment, log)) is not None:
+                return process
+        return super()._run(command, environment, log)
 
     def give_to(self, uid: int) -> None:
         """Let the daemon run as another user: its directories become that user's."""

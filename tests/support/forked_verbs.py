@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs ``shmmap`` and its programs in forks of a process that has imported them: a second less for each.
+"""Runs ``shmmap``, its programs and daemons in forks of a process that has imported them, which is quicker.
 
 Whatever a process does after its imports is done: arguments, environment, directory, exit code, a crash at a
 step.  Command lines of the pages, programs that are sent signals, and what depends on the interpreter's
@@ -11,6 +11,8 @@ As a program: ``python -m tests.support.forked_verbs FD`` serves requests on a s
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
 import importlib
 import json
 import os
@@ -23,11 +25,12 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any, Final
+from pathlib import Path
+from typing import IO, Any, Final
 
-from tests.support.daemon_process import ROOT
+__all__ = ["ROOT", "fork_program", "forking", "run_verb"]
 
-__all__ = ["forking", "run_verb"]
+ROOT: Final = Path(__file__).resolve().parents[2]
 
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")
 _PACKAGES: Final = (
@@ -44,6 +47,9 @@ _PACKAGES: Final = (
 _MODULES: Final = (
     "shmmap.cli.entry",
     "shmmap.client.client",
+    "shmmap.daemon.loading.worker_main",
+    "shmmap.daemon.main",
+    "shmmap.daemon.map.published_origin",
     "cryptography.hazmat.primitives.serialization",
     "numba",
     "obstore",
@@ -52,6 +58,10 @@ _MODULES: Final = (
     "tuf.ngclient",
     "zstandard",
 )
+_ROOM: Final = 1 << 14
+"""Bytes of a command line, and of an environment, more than the fork server has itself."""
+_PR_SET_CHILD_SUBREAPER: Final = 36
+_prctl: Final = ctypes.CDLL(None).prctl
 _REQUEST_BYTES: Final = 1 << 18
 _FDS: Final = 2
 
@@ -76,12 +86,57 @@ def run_verb(
             check=False,
         )
     try:
-        directory = os.path.abspath(cwd)
-        return server.run(
-            {"words": list(words), "environment": environment, "cwd": directory, "module": module}
-        )
+        return server.run(_request(module, words, environment, os.path.abspath(cwd), adopted=False))
     finally:
         server.lock.release()
+
+
+def fork_program(
+    module: str, words: Sequence[str], environment: Mapping[str, str], output: IO[bytes]
+) -> subprocess.Popen[bytes] | None:
+    """Start ``python -m MODULE WORDS`` in ``/`` and in a session of its own; None if it cannot be a fork.
+
+    It is this process's child, and has its command line and environment in ``/proc``.
+    """
+    server = _server()
+    if not server.may_run(environment) or not server.lock.acquire(blocking=False):
+        return None
+    request = _request(module, words, environment, "/", adopted=True)
+    fd = output.fileno()
+    try:
+        # what is orphaned becomes this process's child, as the fork does when who forked it ends
+        _prctl(_PR_SET_CHILD_SUBREAPER, 1)
+        pid = server.ask(request, [fd, fd])
+        _prctl(_PR_SET_CHILD_SUBREAPER, 0)
+    finally:
+        server.lock.release()
+    return _Adopted(pid, [sys.executable, "-m", module, *words])
+
+
+def _request(
+    module: str, words: Sequence[str], environment: Mapping[str, str], cwd: str, *, adopted: bool
+) -> dict[str, Any]:
+    return {
+        "module": module,
+        "words": list(words),
+        "environment": dict(environment),
+        "cwd": cwd,
+        "adopted": adopted,
+    }
+
+
+class _Adopted(subprocess.Popen[bytes]):
+    """A child that `subprocess` has not started."""
+
+    def __init__(self, pid: int, arguments: list[str]) -> None:  # instead of its own, which would start one
+        self.pid = pid
+        self.args = arguments
+        self.stdin = self.stdout = self.stderr = None
+        self.returncode: Any = None
+        self._child_created = True
+        self._waitpid_lock = threading.Lock()
+        self._communication_started = False
+        self._sigint_wait_secs = 0.25
 
 
 class _Server:
@@ -96,9 +151,9 @@ class _Server:
     def _begin(self) -> None:
         with self._theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.support.forked_verbs", str(self._theirs.fileno())],
+                [sys.executable, "-m", "tests.support.forked_verbs", str(self._theirs.fileno()), "." * _ROOM],
                 cwd=ROOT,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                env={**os.environ, "PYTHONPATH": str(ROOT), "PYTEST_ROOM": "." * _ROOM},
                 pass_fds=[self._theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
@@ -107,13 +162,15 @@ class _Server:
     def may_run(self, environment: Mapping[str, str]) -> bool:
         return _at_start(environment) == self._start
 
-    def run(self, request: dict[str, Any]) -> subprocess.CompletedProcess[str]:
+    def ask(self, request: dict[str, Any], fds: Sequence[int]) -> int:
         if self._process is None:
             self._begin()
+        socket.send_fds(self._socket, [json.dumps(request).encode()], fds)
+        return int(self._socket.recv(64))
+
+    def run(self, request: dict[str, Any]) -> subprocess.CompletedProcess[str]:
         with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
-            fds = [out.fileno(), errors.fileno()]
-            socket.send_fds(self._socket, [json.dumps(request).encode()], fds)
-            code = int(self._socket.recv(64))
+            code = self.ask(request, [out.fileno(), errors.fileno()])
             texts = []
             for file in (out, errors):
                 file.seek(0)
@@ -168,6 +225,10 @@ def _become(request: dict[str, Any], fds: list[int]) -> None:
         os.close(fd)
     os.environ.clear()
     os.environ.update(request["environment"])
+    _show(request)
+    if request["adopted"]:
+        os.setsid()
+    tempfile.tempdir = None
     os.chdir(request["cwd"])
     sys.argv[1:] = request["words"]
     from shmmap import failpoints
@@ -180,26 +241,63 @@ def _become(request: dict[str, Any], fds: list[int]) -> None:
                 module.step = new  # type: ignore[attr-defined]
 
 
-def main() -> int:
+def _show(request: dict[str, Any]) -> None:
+    """Write the command line and the environment to where ``/proc/PID`` has them from, see proc(5)."""
+    command = [sys.executable, "-m", request["module"], *request["words"]]
+    environment = [f"{name}={value}" for name, value in request["environment"].items()]
+    fields = Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()
+    first, end_of_command, start, end = map(int, fields[45:49])
+    for what, begin, behind in ((command, first, end_of_command), (environment, start, end)):
+        text = b"".join(os.fsencode(one) + b"\0" for one in what)
+        assert len(text) <= behind - begin
+        ctypes.memset(begin, 0, behind - begin)
+        ctypes.memmove(begin, text, len(text))
+
+
+def _fork(request: dict[str, Any], fds: list[int], *sockets: socket.socket) -> int:
+    """Fork for a request; the fork closes these sockets."""
+    pid = os.fork()
+    if pid:
+        return pid
+    for one in sockets:
+        one.close()
+    _become(request, fds)
+    runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
+    sys.exit(0)
+
+
+def _fork_for_adoption(request: dict[str, Any], fds: list[int], requests: socket.socket) -> int:
+    """Fork, and end between: the fork's parent is the nearest ancestor that adopts orphans."""
+    ours, theirs = socket.socketpair()
+    with ours:
+        between = os.fork()
+        if between == 0:
+            ours.close()
+            theirs.send(str(_fork(request, fds, theirs, requests)).encode())
+            os._exit(0)
+        theirs.close()
+        os.waitpid(between, 0)
+        return int(ours.recv(64))
+
+
+def main() -> None:
     """Fork for each request; a fork ends as its program does."""
     requests = socket.socket(fileno=int(sys.argv[1]))
     _import_all()
+    gc.freeze()
     while True:
         data, fds, _, _ = socket.recv_fds(requests, _REQUEST_BYTES, _FDS)
         if not data:
-            return 0
-        pid = os.fork()
-        if pid == 0:
-            requests.close()
-            request = json.loads(data)
-            _become(request, fds)
-            runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
-            return 0
+            return
+        request = json.loads(data)
+        if request["adopted"]:
+            answer = _fork_for_adoption(request, fds, requests)
+        else:
+            answer = os.waitstatus_to_exitcode(os.waitpid(_fork(request, fds, requests), 0)[1])
         for fd in fds:
             os.close(fd)
-        _, status = os.waitpid(pid, 0)
-        requests.send(str(os.waitstatus_to_exitcode(status)).encode())
+        requests.send(str(answer).encode())
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

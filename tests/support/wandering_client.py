@@ -33,7 +33,8 @@ def main() -> None:
                 intent = shmmap.Intent(x, y)
                 cells = [cell for cell, _ in held.values()]
                 area = shmmap.Circle(x, y, radius)
-                reply = client.differential(area, cells, wait=rng.choice([None, 1.0]), intent=intent)
+                wait = rng.choice([None, 1.0])
+                reply = client.differential(area, cells, wait=wait, intent=intent, strict=None)
                 del cells
                 for cell_id in reply.removed:
                     _check(*held.pop(cell_id))
