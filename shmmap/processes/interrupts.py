@@ -66,7 +66,7 @@ def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[Non
     finally:
         try:
             _put_back(before)
-        except BaseException:  # a handler that was back already: the others must not stay away
+        except BaseException:  # raised by a handler that is back: the others must come back, too
             _put_back(before)
             raise
 

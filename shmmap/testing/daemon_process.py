@@ -193,7 +193,7 @@ class DaemonProcess:
             stderr=log,
             cwd="/",
             pass_fds=self.pass_fds,
-            start_new_session=True,  # a Ctrl-C is for whoever started it, who ends it in order
+            start_new_session=True,  # Ctrl-C is for the program that started it, which ends it in order
         )
 
     def start(self: _Self, timeout_s: float = READY_S) -> _Self:

@@ -15,7 +15,7 @@ import pytest
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 
 VERBS = (("health",), ("status",), ("top", "--once"), ("metrics",), ("doctor", "--json"))
 

@@ -19,7 +19,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.patience import Patience
 from tests.support.pcd_files import read_pcd
 

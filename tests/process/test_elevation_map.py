@@ -24,7 +24,7 @@ from shmmap.origin.map_writer import MapWriter
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]

@@ -17,7 +17,7 @@ from shmmap import ShmmapWarning
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 
 MOVED = "0_0.pcd"
 

@@ -28,7 +28,7 @@ from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import stop
 from tests.support.drive_sender import PERIOD_S, to_and_fro
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.patience import Patience
 from tests.support.town_drive import TownDrive, make_town_drive
 

@@ -17,7 +17,7 @@ from shmmap_clients.scans.scan_file import read_scan
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.town_drive import TownDrive, make_town_drive
 
 

@@ -23,7 +23,7 @@ from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
 import shmmap
 from tests.support.daemon_process import DaemonProcess
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, reference

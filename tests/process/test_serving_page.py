@@ -18,7 +18,7 @@ from tests.support.bucket_server import KEYS, BucketServer
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import make_map
 from tests.support.faulty_web import faulty_web
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.pages import read_page
 from tests.support.patience import Patience
 from tests.support.publishing import publish

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 
 
 class Shmmap:

@@ -13,7 +13,7 @@ from typing import IO, Any
 from shmmap.testing import daemon_process
 from shmmap.testing.daemon_process import READY_S, STOP_S
 from shmmap.testing.process_watch import open_files, processes_marked, wait_ended, wait_readable
-from tests.support.forked_verbs import ROOT, fork_program
+from tests.support.forked_programs import ROOT, fork_program
 from tests.support.patience import Patience
 
 __all__ = [

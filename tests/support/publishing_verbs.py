@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support.daemon_process import ROOT
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 
 __all__ = ["Shmmap", "files_of", "locked"]
 

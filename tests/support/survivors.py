@@ -21,7 +21,7 @@ from typing import Final
 import pytest
 
 from tests.support.daemon_process import ROOT, processes_marked, wait_ended
-from tests.support.forked_verbs import forking
+from tests.support.forked_programs import forking
 
 __all__ = ["no_survivors"]
 

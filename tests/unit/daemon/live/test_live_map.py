@@ -19,7 +19,7 @@ from shmmap.chunks.layout import OUT_OF_SERVICE
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkMemory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
-from tests.support.forked_verbs import run_verb
+from tests.support.forked_programs import run_verb
 from tests.support.live_drive import RESOLUTION, SCANS, marked, opened, voxels_on_disk
 from tests.support.slow_occupancy import Voxel
 

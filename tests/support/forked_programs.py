@@ -2,10 +2,10 @@
 """Runs ``shmmap``, its programs and daemons in forks of a process that has imported them, which is quicker.
 
 Whatever a process does after its imports is done: arguments, environment, directory, exit code, a crash at a
-step.  Command lines of the pages, programs that are sent signals, and what depends on the interpreter's
-start (``PYTHONPATH``, ``LD_PRELOAD``, the locale) are processes of their own elsewhere.
+step.  Command lines of the pages, programs other than the daemon that are sent signals, and what depends on
+the interpreter's start (``PYTHONPATH``, ``LD_PRELOAD``, the locale) are processes of their own elsewhere.
 
-As a program: ``python -m tests.support.forked_verbs FD`` serves requests on a socket until its end.
+As a program: ``python -m tests.support.forked_programs FD`` serves requests on a socket until its end.
 """
 
 from __future__ import annotations
@@ -104,11 +104,11 @@ def fork_program(
     request = _request(module, words, environment, "/", adopted=True)
     fd = output.fileno()
     try:
-        # what is orphaned becomes this process's child, as the fork does when who forked it ends
+        # an orphan becomes this process's child, and so does the fork, when the process that forked it ends
         _prctl(_PR_SET_CHILD_SUBREAPER, 1)
         pid = server.ask(request, [fd, fd])
-        _prctl(_PR_SET_CHILD_SUBREAPER, 0)
     finally:
+        _prctl(_PR_SET_CHILD_SUBREAPER, 0)
         server.lock.release()
     return _Adopted(pid, [sys.executable, "-m", module, *words])
 
@@ -151,7 +151,13 @@ class _Server:
     def _begin(self) -> None:
         with self._theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.support.forked_verbs", str(self._theirs.fileno()), "." * _ROOM],
+                [
+                    sys.executable,
+                    "-m",
+                    "tests.support.forked_programs",
+                    str(self._theirs.fileno()),
+                    "." * _ROOM,
+                ],
                 cwd=ROOT,
                 env={**os.environ, "PYTHONPATH": str(ROOT), "PYTEST_ROOM": "." * _ROOM},
                 pass_fds=[self._theirs.fileno()],
@@ -191,7 +197,7 @@ def _server() -> _Server:
 
 @contextlib.contextmanager
 def forking() -> Iterator[None]:
-    """Fork verbs until this ends."""
+    """Fork programs until this ends."""
     server = _server()
     try:
         yield
