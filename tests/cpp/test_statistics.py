@@ -43,8 +43,9 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
         going = shmmap.Intent(1.5, 2.0, vx=5.0, route=((0.0, 0.0), (60.0, 0.0)))
         client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, intent=going)
         waiting = Patience()
-        while waiting(not any(row.ahead for row in read_statistics(one.instance, one.shm_dir).cells)):
-            pass
+        seen = read_statistics(one.instance, one.shm_dir)
+        while waiting(not (seen.clients and any(row.ahead for row in seen.cells))):
+            seen = read_statistics(one.instance, one.shm_dir)
         one.send(signal.SIGSTOP)
         os.waitid(os.P_PID, one.pid, os.WSTOPPED)
         answer = program.told("statistics", one.instance, one.shm_dir)
