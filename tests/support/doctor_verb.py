@@ -5,27 +5,19 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from typing import Any
 
 from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.forked_programs import run_verb
 
 __all__ = ["doctor"]
 
 
 def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
     """Exit code, and the findings by name."""
-    done = subprocess.run(
-        [
-            sys.executable, "-m", "shmmap.cli", "doctor", "--json", "--instance", one.instance,
-            "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir, *words,
-        ],
-        env={**{k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )  # fmt: skip
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
+    address = ["--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir]
+    done = run_verb(["doctor", "--json", *address, *words], {**environment, "PYTHONPATH": str(ROOT)})
     assert done.stdout, done.stderr
     told = json.loads(done.stdout)
     found = {finding["name"]: finding for finding in told["findings"]}

@@ -24,7 +24,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -75,8 +74,8 @@ def run_verb(
 ) -> subprocess.CompletedProcess[str]:
     """Run ``python -m MODULE WORDS``, as `subprocess.run` does, and return its output and exit code."""
     environment = dict(os.environ if environment is None else environment)
-    server = _server()
-    if not server.may_run(environment) or not server.lock.acquire(blocking=False):
+    server = _ready_for(environment)
+    if server is None:
         return subprocess.run(
             [sys.executable, "-m", module, *words],
             env=environment,
@@ -98,8 +97,8 @@ def fork_program(
 
     It is this process's child, and has its command line and environment in ``/proc``.
     """
-    server = _server()
-    if not server.may_run(environment) or not server.lock.acquire(blocking=False):
+    server = _ready_for(environment)
+    if server is None:
         return None
     request = _request(module, words, environment, "/", adopted=True)
     fd = output.fileno()
@@ -190,20 +189,26 @@ class _Server:
             self._process.wait()
 
 
-@cache
-def _server() -> _Server:
-    return _Server()
+_servers: Final[list[_Server]] = []
+"""The one that forks, where there is one."""
 
 
 @contextlib.contextmanager
 def forking() -> Iterator[None]:
-    """Fork programs until this ends."""
-    server = _server()
+    """Fork programs until this ends; outside of it, as in benchmarks, each is an interpreter of its own."""
+    _servers.append(_Server())
     try:
         yield
     finally:
-        server.close()
-        _server.cache_clear()
+        _servers.pop().close()
+
+
+def _ready_for(environment: Mapping[str, str]) -> _Server | None:
+    """Return the server, locked, where it may and can fork a program with this environment now."""
+    for server in _servers:
+        if server.may_run(environment) and server.lock.acquire(blocking=False):
+            return server
+    return None
 
 
 def _at_start(environment: Mapping[str, str]) -> dict[str, str]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
 from tests.support.daemon_process import ROOT
+from tests.support.forked_programs import run_verb
 
 __all__ = ["make_older", "publish"]
 
@@ -20,10 +19,7 @@ def publish(source: Path, url: str | Path, *words: str, environment: Mapping[str
     """Run ``shmmap publish``; returns what it prints."""
     given = {k: v for k, v in os.environ.items() if not k.startswith(("SHMMAP_", "GOOGLE_", "AZURE_"))}
     given |= {"PYTHONPATH": str(ROOT), **(environment or {})}
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", "publish", str(source), str(url), "--workers", "1", *words],
-        env=given, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run_verb(["publish", str(source), str(url), "--workers", "1", *words], given)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
