@@ -17,7 +17,7 @@ __all__ = ["day_picture"]
 
 _SCALE: Final = 2
 """Factor by which all is drawn larger and finally reduced, for smooth lines."""
-_COLUMN, _GAP, _LEFT, _TOP = 640, 70, 76, 146
+_COLUMN, _GAP, _LEFT, _TOP = 640, 70, 76, 172
 _MAP_HEIGHT, _CHART_HEIGHT, _CHART_GAP = 400, 104, 62
 _WARM, _LATE, _LINK, _MEMORY, _BAND = "#2b8a3e", "#c92a2a", "#1f6fb4", "#5f3dc4", "#ffe8cc"
 _INK, _SOFT, _AXIS = "#1f2933", "#52606d", "#ced4da"
@@ -105,7 +105,7 @@ def day_picture(days: Sequence[Day], factor: float) -> Image.Image:
     speed = f"driven {factor:g} times as fast" if factor > 1 else "in real time"
     subtitle = f"{days[0].way_km:.0f} km, {speed}; 2 GiB of memory, 8 GiB of disk, empty at the start"
     sheet.text(_LEFT, 66, subtitle, colour=_SOFT)
-    _key(sheet, _LEFT + len(days) * (_COLUMN + _GAP) - _GAP - 300)
+    _key(sheet)
     rates = [_rates(day) for day in days]
     most = (
         _round_up(max(day.longest_wait_s for day in days)),
@@ -139,7 +139,7 @@ def _round_up(value: float) -> float:
     return float(steps[min(int(np.searchsorted(steps, value)), len(steps) - 1)])
 
 
-def _key(sheet: _Sheet, left: float) -> None:
+def _key(sheet: _Sheet) -> None:
     """What the colours mean."""
     entries = (
         (_WARM, "all there at once", 4.0),
@@ -147,19 +147,19 @@ def _key(sheet: _Sheet, left: float) -> None:
         (_BAND, "the link is out", 14.0),
     )
     for number, (colour, text, wide) in enumerate(entries):
-        y = 32 + 21 * number
-        sheet.line([(left, y), (left + 26, y)], colour, wide)
-        sheet.text(left + 36, y, text, size=13, anchor="lm")
+        left = _LEFT + 180 * number
+        sheet.line([(left, 92), (left + 26, 92)], colour, wide)
+        sheet.text(left + 36, 92, text, size=13, anchor="lm")
 
 
 def _heading(sheet: _Sheet, day: Day, left: float) -> None:
-    sheet.text(left, 108, _TITLES[day.kind], size=18)
+    sheet.text(left, 134, _TITLES[day.kind], size=18)
     warm = 100.0 - 100.0 * day.misses / max(1, len(day.counted))
     found = (
         f"{warm:.2f} % of queries complete at once, {day.misses} not; {day.mb_per_km:.0f} MB/km,"
         f" loaded / used {day.over_fetch:.2f}, from the disk {100 * day.disk_hits:.0f} %"
     )
-    sheet.text(left, 130, found, size=13, colour=_SOFT)
+    sheet.text(left, 156, found, size=13, colour=_SOFT)
 
 
 def _way(sheet: _Sheet, day: Day, left: float) -> None:
