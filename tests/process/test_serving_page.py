@@ -136,7 +136,7 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             while waiting(not client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=5.0).complete):
                 time.sleep(0.02)
         for line in PAGE.blocks["log"]:
-            while waiting(line not in one.log):
+            while waiting(not is_shown(line, one.log)):
                 time.sleep(0.02)
         while waiting(verb(one, "shmmap health --strict")[0] != 0):
             pass

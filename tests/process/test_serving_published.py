@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -20,7 +21,7 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.bucket_server import BucketServer
+from tests.support.bucket_server import KEYS, BucketServer
 from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -277,6 +278,34 @@ def test_an_origin_out_of_reach_costs_only_what_is_not_here(
             time.sleep(0.05)
 
 
+def test_credentials_that_expire_cost_only_what_is_not_here(
+    daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path
+) -> None:
+    (tmp_path / "store").mkdir()
+    web.folder = web.folder.rename(tmp_path / "store/town").parent
+    one = daemon("s3://town", environment={**KEYS, "AWS_ENDPOINT_URL": web.url})
+    with shmmap.connect(one.endpoint) as client:
+        assert client.around(0.0, 0.0, 1.0, wait=60.0).complete
+        web.fault = lambda _path: "400 ExpiredToken"
+        cold = client.area(ALL, wait=60.0)
+        assert (len(cold), offline_codes(cold)) == (4, {"offline"})
+        assert all("the credentials have expired" in failure.message for failure in cold.failed)
+        assert client.around(0.0, 0.0, 1.0, wait=60.0).complete
+        waiting = Patience()
+        while waiting((said := health(one))[0] != 1):
+            time.sleep(0.05)
+        assert "(`shmmap doctor`)" in said[1]
+        while waiting("out of reach" not in one.log):
+            time.sleep(0.05)
+        assert re.search(r"out of reach reason=.*the credentials have expired", one.log)
+        web.heal()
+        waiting = Patience()
+        while waiting(not client.area(ALL, wait=5.0).complete):
+            time.sleep(0.05)
+    for secret in (KEYS["AWS_ACCESS_KEY_ID"], KEYS["AWS_SECRET_ACCESS_KEY"]):
+        assert secret not in one.log
+
+
 def test_bodies_that_end_early_are_no_cells(daemon: DaemonFactory, web: FaultyWeb) -> None:
     one = daemon(web.url)
     web.fault = lambda path: "truncate" if path.startswith("blobs/") else ""
@@ -468,6 +497,42 @@ def test_polls_are_conditional(daemon: DaemonFactory, web: FaultyWeb) -> None:
     while waiting(("CURRENT", 304) not in web.requests()):
         time.sleep(0.05)
     assert "reload done" not in one.log
+
+
+def test_tags_that_differ_each_time_are_no_other_version(daemon: DaemonFactory, web: FaultyWeb) -> None:
+    numbers = itertools.count()
+    web.tag = lambda _data: str(next(numbers))
+    one = daemon(web.url, "--poll", "1")
+    web.requests()
+    polls: list[tuple[str, int]] = []
+    waiting = Patience()
+    while waiting(polls.count(("CURRENT", 200)) < 3):
+        polls += web.requests()
+        time.sleep(0.05)
+    assert "reload done" not in one.log
+    with shmmap.connect(one.endpoint) as client:
+        assert client.area(ALL, wait=60.0).complete
+
+
+def test_a_tag_that_stays_hides_a_version_from_polls_and_not_from_a_reload(
+    daemon: DaemonFactory, web: FaultyWeb, publish_change: Callable[[], None]
+) -> None:
+    web.tag = lambda _data: "always this"
+    one = daemon(web.url, "--poll", "1")
+    with shmmap.connect(one.endpoint) as client:
+        before = client.area(ALL, wait=60.0)
+        publish_change()
+        web.requests()
+        polls = 0
+        waiting = Patience()
+        while waiting(polls < 2):
+            polls += web.requests().count(("CURRENT", 304))
+            time.sleep(0.05)
+        assert client.area(ALL, wait=60.0).map_version == before.map_version
+        client.reload()
+        after = client.area(ALL, wait=60.0)
+        assert after.complete
+        assert after.map_version != before.map_version
 
 
 # --- many shards --------------------------------------------------------------------------------------

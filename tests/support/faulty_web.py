@@ -32,6 +32,10 @@ def _no_fault(_path: str) -> str:
     return ""
 
 
+def _digest(data: bytes) -> str:
+    return hashlib.md5(data).hexdigest()
+
+
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 128
@@ -76,7 +80,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         except OSError:
             self._answer(404, b"")
             return
-        tag = f'"{hashlib.md5(data).hexdigest()}"'
+        tag = f'"{web.tag(data)}"'
         if self.headers.get("If-None-Match") == tag:
             self._answer(304, b"", tag)
             return
@@ -113,12 +117,13 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
 
 class FaultyWeb:
-    """A running server; `fault` says what becomes of each request."""
+    """A running server; `fault` says what becomes of each request, `tag` what the ETag of a content is."""
 
     def __init__(self, source: Path | Read) -> None:
         self.folder = source if isinstance(source, Path) else Path(os.devnull)
         self.read: Read = self._read_file if isinstance(source, Path) else source
         self.fault: Fault = _no_fault
+        self.tag: Callable[[bytes], str] = _digest
         self.clock_ahead_s = 0.0
         self.connections: set[socket.socket] = set()
         self._requests: list[tuple[str, int]] = []

@@ -92,7 +92,7 @@ def _troubles(found: Snapshot) -> list[str]:
     )
     troubles = [f"{count:,} {text}" for count, text in counted_troubles if count]
     if counts.get("origin_out", 0):
-        troubles.append("no load succeeds: the map's files are out of reach")
+        troubles.append("no load succeeds: the map's files are out of reach (`shmmap doctor`)")
     troubles += trust_problems(counts, time.time())
     if counts.get("last_reload_failed", 0) and not counts.get("published_refusal", 0):
         troubles.append("the map could not be read again: its old state is served")

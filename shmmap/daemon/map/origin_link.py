@@ -135,21 +135,22 @@ class OriginLink:
         return asked_s + (wait_s or math.inf)
 
     def _look(self) -> None:
+        reason = ""
         try:
             changed, answers = self._ask(), True
-        except Offline:
-            changed, answers = False, False
+        except Offline as error:
+            changed, answers, reason = False, False, error.message
         except ShmmapError as error:
             log.error("the map's origin names no usable version", reason=error)
             changed, answers = False, True
         except Exception:  # noqa: BLE001  else it would never be asked again
             log.exception("the map's origin cannot be asked", cause="a defect in shmmap")
-            changed, answers = False, False
+            changed, answers, reason = False, False, "a defect in shmmap"
         with self._condition:
             if answers:
                 self._note_answer(time.monotonic())
             elif not self._has_failed:
-                log.warning("the map's origin is out of reach")
+                log.warning("the map's origin is out of reach", reason=reason)
             self._has_failed = self._is_out = not answers
             self._is_doubted = False
             self._changed = self._changed or changed
