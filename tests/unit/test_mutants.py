@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mutants: the same seed draws the same ones, of every kind; each is a valid program that differs."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.mutants import Mutant, draw, mutants_of
+from tests.support.daemon_process import ROOT
+
+CODE = """
+import os
+
+def write(fd: int = 1, version: int = 2, *, room=3) -> None:
+    "Text."
+    with self._lock, self._blocked:
+        os.fsync(fd)
+        self.after_s = now_ns / 1e9
+    if version != 7 or "\u00e4" and fd is None:
+        raise ValueError(f"{fd == 1}")
+    return min(fd, limit)
+"""
+WANTED = {
+    ("fsync left out", "os.fsync(fd)", "pass"),
+    ("lock not taken", "self._lock", "__import__('contextlib').nullcontext()"),
+    ("nanoseconds for seconds", "1e9", "1"),
+    ("version not compared", "version != 7", "False"),
+    ("comparison turned", "fd is None", "fd is not None"),
+    ("error not raised", 'raise ValueError(f"{fd == 1}")', "pass"),
+    ("bound dropped", "min(fd, limit)", "(fd)"),
+    ("bound dropped", "min(fd, limit)", "(limit)"),
+    ("number one off", "3", "4"),
+}
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> list[Mutant]:
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package/module.py").write_text(CODE, encoding="utf-8")
+    return mutants_of(tmp_path, "package")
+
+
+def test_each_kind_is_found(made: list[Mutant]) -> None:
+    assert {(one.kind, one.old, one.new) for one in made} >= WANTED
+    kinds = Counter(one.kind for one in made)
+    assert (kinds["lock not taken"], kinds["error not raised"], kinds["call left out"]) == (1, 1, 0)
+    assert kinds["condition dropped"] == 4
+    assert kinds["number one off"] == 4, "three defaults, one number; none in texts"
+
+
+def test_a_mutant_is_a_program_that_differs_in_one_place(made: list[Mutant], tmp_path: Path) -> None:
+    file = tmp_path / "package/module.py"
+    for one in made:
+        one.apply(tmp_path)
+        text = file.read_text(encoding="utf-8")
+        assert ast.dump(ast.parse(text)) != ast.dump(ast.parse(CODE)), one
+        assert text.splitlines()[one.line - 1] != CODE.splitlines()[one.line - 1]
+        file.write_text(CODE, encoding="utf-8")
+
+
+def test_the_same_seed_draws_the_same_ones_spread_over_packages() -> None:
+    first = draw(ROOT, "a seed", 28)
+    assert first == draw(ROOT, "a seed", 28)
+    assert first != draw(ROOT, "another", 28)
+    assert Counter("/".join(one.path.split("/")[:3 if "daemon" in one.path else 2]) for one in first) == {
+        "shmmap/daemon/cache": 4, "shmmap/daemon/loading": 4, "shmmap/daemon/requests": 4,
+        "shmmap/daemon/live": 4, "shmmap/client": 4, "shmmap/segment": 4, "shmmap/origin": 4,
+    }  # fmt: skip
