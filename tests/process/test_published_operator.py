@@ -96,7 +96,8 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
     kept = [path for path in Path(one.cache_dir).rglob("objects/cells/*/*") if path.is_file()]
     assert len(kept) == CELLS
     one.stop()
-    kept[0].write_bytes(kept[0].read_bytes()[:-1] + b"?")
+    content = kept[0].read_bytes()
+    kept[0].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     kept[1].unlink()
     lost = kept[1].name
     web.fault = lambda path: "corrupt" if path.endswith(lost) else ""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any, cast
@@ -29,10 +29,18 @@ LEFT_OUT = {"_poll", "_patience_s", "_look_after_the_rest"}
 
 
 class Walker:
-    """Which files of the daemon are entered."""
+    """Which files of the daemon are entered.
 
-    def __init__(self, *, under: str = "", until: str = "", leaving_out: Collection[str] = ()) -> None:
-        self._under, self._until, self._left_out = under, until, LEFT_OUT.union(leaving_out)
+    Parameters
+    ----------
+    under
+        Functions count that a function of this name calls, and what they call.
+    since, until
+        Names of the function with which it begins, and of the one with which it ends.
+    """
+
+    def __init__(self, *, under: str = "", since: str = "", until: str = "") -> None:
+        self._under, self._since, self._until = under, since, until
         self._over = False
         self.files: set[str] = set()
 
@@ -49,12 +57,18 @@ class Walker:
             self._over = True
         if event != "call" or self._over or not frame.f_code.co_filename.startswith(DAEMON):
             return
-        callers, above = [], cast("FrameType | None", frame)
+        if self._since not in ("", frame.f_code.co_name):
+            return
+        callers, above = list[str](), cast("FrameType | None", frame)
+        files = {frame.f_code.co_filename}
         while above is not None:
             callers.append(above.f_code.co_name)
+            if self._since and above.f_code.co_filename.startswith(DAEMON):
+                files.add(above.f_code.co_filename)
             above = above.f_back
-        if not self._left_out.intersection(callers) and (not self._under or self._under in callers):
-            self.files.add(str(Path(frame.f_code.co_filename).relative_to(DAEMON)))
+        if not LEFT_OUT.intersection(callers) and (not self._under or self._under in callers):
+            self.files.update(str(Path(file).relative_to(DAEMON)) for file in files)
+            self._since = ""
 
 
 def listed(number: int) -> set[str]:
@@ -69,7 +83,7 @@ def test_warm_differential(whole: Callable[..., WholeDaemon], small_map: Divided
     one = whole(small_map.root)
     cells = one.ask(m.Area(2, EVERYWHERE, wait=30.0)).cells
     held = [cell.version for cell in cells[:8]]
-    walker = Walker(until="reply", leaving_out=("free", "pump"))  # of a turn before the request has come
+    walker = Walker(since="_ready", until="reply")
     named = tuple(m.HeldCell(cell.id, cell.version) for cell in cells[8:10])
     reply = one.ask(m.Differential(3, EVERYWHERE, held=named, packed=pack_versions(held)), walker.walking())
     assert len(reply.cells) == 6
