@@ -2,17 +2,17 @@
 """Whether tests notice when the code is broken: mutants drawn at random, and the tests that catch them.
 
     python -m tests.benchmarks.mutants draw --seed 29ca3b8 --count 60 > mutants.json
-    python -m tests.benchmarks.mutants run mutants.json [--only 3,17] [--results FILE] [TESTS ...]
+    python -m tests.benchmarks.mutants run mutants.json [--only 3,17] [--results FILE] [STAGE ...]
 
 A mutant is one change of one place: a bound dropped, a comparison turned, a version not compared, a lock not
 taken, an fsync left out, nanoseconds for seconds, an error not raised, a condition turned, a number one
 off, a call left out.  The same seed draws the same mutants of the same code.  They are spread over the
 packages and, in each, over the kinds.
 
-``run`` copies the tree, breaks the copy, and runs TESTS there (default: `STAGES`, the nearest first) until
-the first failure, mutant by mutant.  Each is printed with what caught it, or as a survivor.  Tests fail at
-random, too, where they are flaky: a mutant counts as caught only if the first test that failed passes in
-the copy that is not broken.
+``run`` copies the tree, breaks the copy, and runs tests there, stage by stage, until the first failure;
+mutant by mutant.  Each is printed with what caught it, or as a survivor.  A stage is a word as pytest takes
+them; ``own`` are the unit tests of the package (default: `STAGES`).  Where tests fail at random a mutant
+counts as caught only if the first test that failed passes in the copy that is not broken.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ PACKAGES: Final = (
     "shmmap/segment",
     "shmmap/origin",
 )
-STAGES: Final = ("tests/unit", "tests/model", "tests/process", "tests/cpp tests/clients")
-"""Tests in the order in which they are tried; before all of them those of the package alone."""
+OWN: Final = "own"
+STAGES: Final = (OWN, "tests/unit", "tests/model", "tests/process", "tests/cpp tests/clients")
+"""Tests in the order in which they are tried, the nearest first."""
 LIMIT_S: Final = 2400.0
 """A stage that takes longer has caught its mutant: something waits for ever."""
 _TURNED: Final = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
@@ -231,10 +232,11 @@ def _own_tests(tree: Path, path: str) -> str:
     return ""
 
 
-def _first_failure(tree: Path, tests: str, limit_s: float) -> str:
+def _first_failure(tree: Path, tests: str, limit_s: float, *words: str) -> str:
     """Run tests until one fails; returns its name, or empty."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests.split()]
-    environment = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": ""}
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *words, *tests.split()]
+    paths = os.pathsep.join((str(tree), str(tree / "clients")))
+    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
     with tempfile.TemporaryFile("w+") as output:
         process = subprocess.Popen(
             command, cwd=tree, env=environment, stdout=output, stderr=subprocess.STDOUT, text=True
@@ -255,13 +257,14 @@ def _first_failure(tree: Path, tests: str, limit_s: float) -> str:
 
 def _caught_by(mutant: Mutant, whole: Path, broken: Path, stages: Sequence[str], limit_s: float) -> str:
     """Return what catches a mutant; empty if nothing does."""
-    own = _own_tests(whole, mutant.path)
     original = (broken / mutant.path).read_text(encoding="utf-8")
     mutant.apply(broken)
     try:
-        for tests in filter(None, (own if stages == STAGES else "", *stages)):
-            failed = _first_failure(broken, tests, limit_s)
-            if failed and (" " in failed or not _first_failure(whole, failed, limit_s)):
+        for stage in stages:
+            tests = _own_tests(whole, mutant.path) if stage == OWN else stage
+            one_at_a_time = ("-n", "0") if stage == OWN else ()
+            failed = _first_failure(broken, tests, limit_s, *one_at_a_time) if tests else ""
+            if failed and (" " in failed or not _first_failure(whole, failed, limit_s, "-n", "0")):
                 return failed
             if failed:
                 print(f"    {failed} fails without it, too", flush=True)
@@ -278,7 +281,7 @@ def _copy(folder: Path) -> Path:
 def _run(args: argparse.Namespace) -> None:
     mutants = [Mutant(**one) for one in json.loads(args.mutants.read_text(encoding="utf-8"))]
     only = {int(number) for number in args.only.split(",")} if args.only else set(range(len(mutants)))
-    stages = tuple(args.tests) or STAGES
+    stages = tuple(args.stages) or STAGES
     caught = 0
     say: Callable[[str], object] = args.results.open("a").write if args.results else lambda _line: None
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
@@ -306,7 +309,7 @@ def main() -> None:
     drawing.add_argument("--count", type=int, default=60)
     running = verbs.add_parser("run", help="run tests against them")
     running.add_argument("mutants", type=Path)
-    running.add_argument("tests", nargs="*", help="a stage each, as pytest takes them")
+    running.add_argument("stages", nargs="*", metavar="STAGE", help="files and folders for pytest")
     running.add_argument("--only", default="", help="numbers of mutants, with commas")
     running.add_argument("--limit", type=float, default=LIMIT_S, help="of a stage, seconds")
     running.add_argument("--results", type=Path, help="append a line of JSON for each")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -255,14 +256,13 @@ def test_deadlines_count_from_the_begin_of_the_work(pool: WorkerPool) -> None:
     for number in (1, 2):
         give(pool, number, 0.0)
     (worker,) = pool
-    pool.begun(worker, os.getpid(), os.pidfd_open(os.getpid()), 1.0)
-    assert (worker.at_work, pool.next_deadline_s()) == (0, 31.0)
-    pool.works_on(worker, 2, 20.0)
-    assert (worker.at_work, pool.next_deadline_s()) == (2, 50.0)
-    fd, spent_s = pool.finished(worker, 2, 25.0)
-    os.close(fd)
-    assert (spent_s, worker.at_work, pool.next_deadline_s()) == (5.0, 0, 55.0)
-    assert pool.overdue(54.9) == []
-    assert pool.overdue(55.0) == [worker]
-    os.close(worker.pidfd)
-    worker.pidfd = -1  # it is this process
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as loader:
+        pool.begun(worker, loader.pid, os.pidfd_open(loader.pid), 1.0)
+        assert (worker.at_work, pool.next_deadline_s()) == (0, 31.0)
+        pool.works_on(worker, 2, 20.0)
+        assert (worker.at_work, pool.next_deadline_s()) == (2, 50.0)
+        fd, spent_s = pool.finished(worker, 2, 25.0)
+        os.close(fd)
+        assert (spent_s, worker.at_work, pool.next_deadline_s()) == (5.0, 0, 55.0)
+        assert pool.overdue(54.9) == []
+        assert pool.overdue(55.0) == [worker]
