@@ -29,7 +29,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -283,7 +283,6 @@ def _run(args: argparse.Namespace) -> None:
     only = {int(number) for number in args.only.split(",")} if args.only else set(range(len(mutants)))
     stages = tuple(args.stages) or STAGES
     caught = 0
-    say: Callable[[str], object] = args.results.open("a").write if args.results else lambda _line: None
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         whole, broken = _copy(Path(folder, "whole")), _copy(Path(folder, "broken"))
         for number in sorted(only):
@@ -294,7 +293,9 @@ def _run(args: argparse.Namespace) -> None:
                 f"{number:3} {mutants[number]}\n    {by or 'SURVIVES'}, {time.monotonic() - begin_s:.0f} s",
                 flush=True,
             )
-            say(json.dumps({"number": number, "by": by}) + "\n")
+            if args.results:
+                with args.results.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"number": number, "by": by}) + "\n")
     print(f"{caught} of {len(only)} are caught")
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A localizing process: ``python -m tests.support.ndt_client ENDPOINT SCAN X,Y,Z,R,P,Y RADIUS``.
 
-Prints ``ready``, waits for a line, attaches the whole window, aligns, prints what it found and how much
-memory of its own that took, and keeps the map until its input ends.
+Prints ``ready``, waits for a line, attaches the whole window, aligns, prints what it found, how much memory
+of its own that took, and which of the map's arrays are not shared; keeps the map until its input ends.
 """
 
 from __future__ import annotations
@@ -10,14 +10,33 @@ from __future__ import annotations
 import json
 import os
 import sys
+from pathlib import Path
 
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.cli.warmup_alignment import warmup_alignment
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.scans.scan_file import read_scan
 
 from shmmap.demo.process_memory import process_memory
+
+
+def not_shared(voxel_map: VoxelMap) -> list[str]:
+    """Return the cells' arrays that do not lie in shared memory."""
+    shared = []
+    for line in Path("/proc/self/maps").read_text(encoding="ascii", errors="replace").splitlines():
+        where, flags, *_ = line.split()
+        if flags.endswith("s"):
+            shared.append(tuple(int(end, 16) for end in where.split("-")))
+    found = []
+    for key, cell in voxel_map.cells.items():
+        for name in ("lattice", "mean", "inverse"):
+            array = getattr(cell, name)
+            address = array.__array_interface__["data"][0]
+            if array.size and not any(begin <= address < end for begin, end in shared):
+                found.append(f"{key} {name}")
+    return found
 
 
 def main() -> None:
@@ -43,6 +62,7 @@ def main() -> None:
                 "iterations": result.iterations,
                 "nvtl": result.nvtl,
                 "converged": result.converged,
+                "not_shared": not_shared(voxel_map),
                 "growth_bytes": process_memory(os.getpid()).private_bytes - before,
             }
             print(json.dumps(found), flush=True)
