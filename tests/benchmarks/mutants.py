@@ -52,9 +52,7 @@ STAGES: Final = (OWN, "tests/unit", "tests/model", "tests/process", "tests/cpp t
 LIMIT_S: Final = 2400.0
 """A stage that takes longer has caught its mutant: something waits for ever."""
 _TURNED: Final = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
-_OPERATORS: Final = {
-    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="
-}  # fmt: skip
+_OPERATORS: Final = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _BILLIONS: Final = ("1e9", "1_000_000_000", "10**9", "1e-9", "1000000000")
 
 

@@ -66,7 +66,12 @@ def test_the_same_seed_draws_the_same_ones_spread_over_packages() -> None:
     first = draw(ROOT, "a seed", 28)
     assert first == draw(ROOT, "a seed", 28)
     assert first != draw(ROOT, "another", 28)
-    assert Counter("/".join(one.path.split("/")[:3 if "daemon" in one.path else 2]) for one in first) == {
-        "shmmap/daemon/cache": 4, "shmmap/daemon/loading": 4, "shmmap/daemon/requests": 4,
-        "shmmap/daemon/live": 4, "shmmap/client": 4, "shmmap/segment": 4, "shmmap/origin": 4,
-    }  # fmt: skip
+    assert Counter("/".join(one.path.split("/")[: 3 if "daemon" in one.path else 2]) for one in first) == {
+        "shmmap/daemon/cache": 4,
+        "shmmap/daemon/loading": 4,
+        "shmmap/daemon/requests": 4,
+        "shmmap/daemon/live": 4,
+        "shmmap/client": 4,
+        "shmmap/segment": 4,
+        "shmmap/origin": 4,
+    }
