@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether tests notice when the code is broken: mutants drawn at random, and the tests that catch them.
 
-    python -m tests.benchmarks.mutants draw --seed 29ca3b8 --count 60 > mutants.json
-    python -m tests.benchmarks.mutants run mutants.json [--only 3,17] [--results FILE] [STAGE ...]
+    python -m tests.benchmarks.mutants [--tree DIR] draw --seed 29ca3b8 --count 60 > mutants.json
+    python -m tests.benchmarks.mutants [--tree DIR] run mutants.json [--only 3,17] [--together 5]
+                                                                     [--results FILE] [STAGE ...]
 
 A mutant is one change of one place: a bound dropped, a comparison turned, a version not compared, a lock not
 taken, an fsync left out, nanoseconds for seconds, an error not raised, a condition turned, a number one
@@ -13,12 +14,19 @@ packages and, in each, over the kinds.
 mutant by mutant.  Each is printed with what caught it, or as a survivor.  A stage is a word as pytest takes
 them; ``own`` are the unit tests of the package (default: `STAGES`).  Where tests fail at random a mutant
 counts as caught only if the first test that failed passes in the copy that is not broken.
+
+``--together N`` spares most of the time where whole stages are run and few mutants are caught: each stage is
+run once with N mutants in the copy.  What fails then is run with each of them alone, and where some are
+caught the stage is run again with the rest.
+
+``--tree`` is another checkout, such as an older one, whose code is broken and whose tests are run.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import json
 import os
 import random
@@ -27,14 +35,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-__all__ = ["Mutant", "draw", "mutants_of"]
+__all__ = ["Mutant", "caught_together", "draw", "mutants_of"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = (
@@ -51,6 +58,8 @@ STAGES: Final = (OWN, "tests/unit", "tests/model", "tests/process", "tests/cpp t
 """Tests in the order in which they are tried, the nearest first."""
 LIMIT_S: Final = 2400.0
 """A stage that takes longer has caught its mutant: something waits for ever."""
+MOST_ALONE: Final = 20
+"""Failed tests that are run with each mutant of a group alone."""
 _TURNED: Final = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
 _OPERATORS: Final = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _BILLIONS: Final = ("1e9", "1_000_000_000", "10**9", "1e-9", "1000000000")
@@ -230,9 +239,9 @@ def _own_tests(tree: Path, path: str) -> str:
     return ""
 
 
-def _first_failure(tree: Path, tests: str, limit_s: float, *words: str) -> str:
-    """Run tests until one fails; returns its name, or empty."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *words, *tests.split()]
+def _failures(tree: Path, tests: str, limit_s: float, *words: str) -> list[str]:
+    """Run tests; returns the names of those that fail, or why there are none to name."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words, *tests.split()]
     paths = os.pathsep.join((str(tree), str(tree / "clients")))
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": ""}
     with tempfile.TemporaryFile("w+") as output:
@@ -244,20 +253,78 @@ def _first_failure(tree: Path, tests: str, limit_s: float, *words: str) -> str:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-            return f"no end within {limit_s:.0f} s"
+            return [f"no end within {limit_s:.0f} s"]
         output.seek(0)
         text = output.read()
     if code in (0, 5):  # 5: no tests there
-        return ""
-    found = re.search(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)
-    return found[1] if found is not None else f"exit code {code}: {text[-200:]!r}"
+        return []
+    found = list(dict.fromkeys(re.findall(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE)))
+    return found or [f"exit code {code}: {text[-200:]!r}"]
+
+
+def _first_failure(tree: Path, tests: str, limit_s: float, *words: str) -> str:
+    """Run tests until one fails; returns its name, or empty."""
+    return next(iter(_failures(tree, tests, limit_s, "-x", *words)), "")
+
+
+@contextlib.contextmanager
+def _broken(tree: Path, mutants: Sequence[Mutant]) -> Iterator[None]:
+    """Apply mutants that do not overlap to a copy, and mend it at the end."""
+    original = {path: (tree / path).read_text(encoding="utf-8") for path in {one.path for one in mutants}}
+    try:
+        for mutant in sorted(mutants, key=lambda one: -one.at):  # the places before it stay
+            mutant.apply(tree)
+        yield
+    finally:
+        for path, text in original.items():
+            (tree / path).write_text(text, encoding="utf-8")
+
+
+def _overlap(one: Mutant, other: Mutant) -> bool:
+    return one.path == other.path and one.at < other.at + len(other.old) and other.at < one.at + len(one.old)
+
+
+def _groups(numbers: Sequence[int], mutants: Sequence[Mutant], size: int) -> list[list[int]]:
+    """Return groups of at most ``size`` mutants that do not overlap."""
+    groups: list[list[int]] = []
+    for number in numbers:
+        for group in groups:
+            if len(group) < size and not any(_overlap(mutants[number], mutants[one]) for one in group):
+                group.append(number)
+                break
+        else:
+            groups.append([number])
+    return groups
+
+
+def caught_together(
+    group: Sequence[int], mutants: Sequence[Mutant], whole: Path, broken: Path, stage: str, limit_s: float
+) -> dict[int, str]:
+    """Return what catches each of a group of mutants in a stage; those that nothing catches are left out."""
+    caught: dict[int, str] = {}
+    while rest := [number for number in group if number not in caught]:
+        with _broken(broken, [mutants[number] for number in rest]):
+            failed = _failures(broken, stage, limit_s)
+        named = [name for name in failed if " " not in name]
+        if failed and not named and len(rest) > 1:  # it does not end, or nothing can be imported
+            for half in (rest[::2], rest[1::2]):
+                caught |= caught_together(half, mutants, whole, broken, stage, limit_s)
+            return caught
+        found = {rest[0]: failed[0]} if failed and not named else {}
+        for number in rest if named else ():
+            with _broken(broken, [mutants[number]]):
+                alone = _first_failure(broken, " ".join(named[:MOST_ALONE]), limit_s)
+            if alone and (" " in alone or not _first_failure(whole, alone, limit_s, "-n", "0")):
+                found[number] = alone
+        if not found:
+            return caught
+        caught |= found
+    return caught
 
 
 def _caught_by(mutant: Mutant, whole: Path, broken: Path, stages: Sequence[str], limit_s: float) -> str:
     """Return what catches a mutant; empty if nothing does."""
-    original = (broken / mutant.path).read_text(encoding="utf-8")
-    mutant.apply(broken)
-    try:
+    with _broken(broken, [mutant]):
         for stage in stages:
             tests = _own_tests(whole, mutant.path) if stage == OWN else stage
             one_at_a_time = ("-n", "0") if stage == OWN else ()
@@ -266,35 +333,45 @@ def _caught_by(mutant: Mutant, whole: Path, broken: Path, stages: Sequence[str],
                 return failed
             if failed:
                 print(f"    {failed} fails without it, too", flush=True)
-    finally:
-        (broken / mutant.path).write_text(original, encoding="utf-8")
     return ""
 
 
-def _copy(folder: Path) -> Path:
+def _copy(tree: Path, folder: Path) -> Path:
     ignored = shutil.ignore_patterns(".git", ".venv", "__pycache__", ".*_cache", ".hypothesis")
-    return Path(shutil.copytree(ROOT, folder, ignore=ignored, symlinks=True))
+    return Path(shutil.copytree(tree, folder, ignore=ignored, symlinks=True))
 
 
 def _run(args: argparse.Namespace) -> None:
     mutants = [Mutant(**one) for one in json.loads(args.mutants.read_text(encoding="utf-8"))]
     only = {int(number) for number in args.only.split(",")} if args.only else set(range(len(mutants)))
     stages = tuple(args.stages) or STAGES
-    caught = 0
+    caught: dict[int, str] = {}
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
-        whole, broken = _copy(Path(folder, "whole")), _copy(Path(folder, "broken"))
+        whole, broken = _copy(args.tree, Path(folder, "whole")), _copy(args.tree, Path(folder, "broken"))
+        alone = tuple(stage for stage in stages if stage == OWN) if args.together > 1 else stages
         for number in sorted(only):
-            begin_s = time.monotonic()
-            by = _caught_by(mutants[number], whole, broken, stages, args.limit)
-            caught += bool(by)
-            print(
-                f"{number:3} {mutants[number]}\n    {by or 'SURVIVES'}, {time.monotonic() - begin_s:.0f} s",
-                flush=True,
-            )
-            if args.results:
-                with args.results.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps({"number": number, "by": by}) + "\n")
-    print(f"{caught} of {len(only)} are caught")
+            if by := _caught_by(mutants[number], whole, broken, alone, args.limit):
+                caught[number] = by
+            if by or alone == stages:
+                _report(number, mutants[number], by, args.results)
+        for stage in stages[len(alone) :]:
+            left = [number for number in sorted(only) if number not in caught]
+            for group in _groups(left, mutants, args.together):
+                found = caught_together(group, mutants, whole, broken, stage, args.limit)
+                caught |= found
+                for number, by in found.items():
+                    _report(number, mutants[number], by, args.results)
+        if alone != stages:
+            for number in sorted(only - caught.keys()):
+                _report(number, mutants[number], "", args.results)
+    print(f"{len(caught)} of {len(only)} are caught")
+
+
+def _report(number: int, mutant: Mutant, by: str, results: Path | None) -> None:
+    print(f"{number:3} {mutant}\n    {by or 'SURVIVES'}", flush=True)
+    if results is not None:
+        with results.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"number": number, "by": by}) + "\n")
 
 
 def main() -> None:
@@ -302,6 +379,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--tree", type=Path, default=ROOT, metavar="DIR", help="checkout (default: this one)")
     verbs = parser.add_subparsers(required=True, dest="verb")
     drawing = verbs.add_parser("draw", help="print mutants as JSON")
     drawing.add_argument("--seed", required=True)
@@ -310,11 +388,12 @@ def main() -> None:
     running.add_argument("mutants", type=Path)
     running.add_argument("stages", nargs="*", metavar="STAGE", help="files and folders for pytest")
     running.add_argument("--only", default="", help="numbers of mutants, with commas")
+    running.add_argument("--together", type=int, default=1, metavar="N", help="how many in a stage at once")
     running.add_argument("--limit", type=float, default=LIMIT_S, help="of a stage, seconds")
     running.add_argument("--results", type=Path, help="append a line of JSON for each")
     args = parser.parse_args()
     if args.verb == "draw":
-        print(json.dumps([asdict(one) for one in draw(ROOT, args.seed, args.count)], indent=1))
+        print(json.dumps([asdict(one) for one in draw(args.tree, args.seed, args.count)], indent=1))
     else:
         _run(args)
 

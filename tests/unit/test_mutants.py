@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.mutants import Mutant, draw, mutants_of
+from tests.benchmarks.mutants import Mutant, caught_together, draw, mutants_of
 from tests.support.daemon_process import ROOT
 
 CODE = """
@@ -75,3 +75,26 @@ def test_the_same_seed_draws_the_same_ones_spread_over_packages() -> None:
         "shmmap/segment": 4,
         "shmmap/origin": 4,
     }
+
+
+def test_mutants_broken_together_are_caught_one_by_one(tmp_path: Path) -> None:
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for tree in (whole, broken):
+        (tree / "package").mkdir(parents=True)
+        (tree / "package/__init__.py").write_text("")
+        (tree / "package/sums.py").write_text(
+            "def more(x):\n    return x + 1\n\ndef less(x):\n    return x - 1\n"
+        )
+        (tree / "package/unseen.py").write_text("def unseen(x):\n    return x + 1\n")
+        (tree / "test_sums.py").write_text(
+            "from package.sums import less, more\n"
+            "def test_both():\n    assert (more(1), less(1)) == (2, 0)\n"
+            "def test_random():\n    raise OSError\n"
+        )
+    mutants = [one for one in mutants_of(whole, "package") if one.kind == "number one off"]
+    assert [one.path for one in mutants] == ["package/sums.py", "package/sums.py", "package/unseen.py"]
+
+    caught = caught_together([0, 1, 2], mutants, whole, broken, "test_sums.py", 60.0)
+
+    assert caught == {0: "test_sums.py::test_both", 1: "test_sums.py::test_both"}
+    assert (broken / "package/sums.py").read_text() == (whole / "package/sums.py").read_text()
