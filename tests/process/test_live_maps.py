@@ -83,6 +83,31 @@ def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -
             assert mapper.add(np.zeros((0, 3)), np.eye(4)) > len(numbers)  # never a number again
 
 
+@pytest.mark.parametrize("killed", [1, 2], ids=["starting", "none"])
+def test_a_worker_killed_just_before_the_end_leaves_nothing_behind(
+    live_daemon: LiveDaemon, killed: int
+) -> None:
+    """The next one saves what it left in memory; after the second kill that one would start later."""
+    one = live_daemon(checkpoint=600.0)
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        live = client.live("lidar")
+        with live.mapper("front", FILTER) as mapper:
+            for scan in drive(3):
+                mapper.add(*scan)
+            mapper.wait_applied()
+        expected = held(live)
+    for _ in range(killed - 1):
+        os.kill(worker_of(one), signal.SIGKILL)
+        with shmmap.connect(one.endpoint, timeout=60.0) as client:
+            client.live("lidar")
+    os.kill(worker_of(one), signal.SIGKILL)
+    assert one.stop() == 0
+    assert not [name for name in os.listdir(one.shm_dir) if "live" in name]
+    one.start()
+    with shmmap.connect(one.endpoint, timeout=60.0) as client:
+        assert held(client.live("lidar"), "disk") == expected
+
+
 def test_voxels_of_an_area_and_since_a_change(live_daemon: LiveDaemon) -> None:
     expected = reference(drive(1))
     one = live_daemon()

@@ -347,10 +347,18 @@ class LiveRelay:
 
         What could not be saved is `unsaved` then, and stays in memory.
         """
-        if self._channel is None:
-            return
-        was_serving = self._serving
-        ended = self._ask_to_end(time.monotonic() + (END_S if was_serving else BEGINNING_S), keep=keep)
+        end_s = time.monotonic() + END_S
+        ended, was_serving = None, False
+        for _ in range(2):  # a worker that dies meanwhile leaves its chunks to another one
+            if self._served_s and not self._serving and self._ended is None and not keep:
+                self._start_to_save(end_s)
+            if self._channel is None:
+                break
+            was_serving = self._serving
+            until_s = end_s if was_serving else min(end_s, time.monotonic() + BEGINNING_S)
+            ended = self._ask_to_end(until_s, keep=keep)
+            if ended is not None or self._channel is not None:
+                break
         if ended is not None and not keep:
             for one in ended.unsaved:
                 self.unsaved[one.map] = one.chunks
@@ -363,6 +371,19 @@ class LiveRelay:
             self.unsaved = {} if keep else unsaved
             log.error("live worker did not end in time: what is in memory stays there for the next start")
         self._forget()
+
+    def _start_to_save(self, end_s: float) -> None:
+        """Have another worker take over what one that ended has left in memory."""
+        if self._channel is None:
+            try:
+                self.start()
+            except OSError as error:
+                log.error("live worker not started", reason=error.strerror)
+        while self._channel is not None and not self._serving and (left_s := end_s - time.monotonic()) > 0:
+            self._wait(left_s)
+            self.hear()
+        if not self._serving:
+            log.error("live worker does not start: what is in memory stays there for the next start")
 
     def _ask_to_end(self, end_s: float, *, keep: bool) -> messages.Ended | None:
         """Have the worker end; what it says at last, if it does by then."""

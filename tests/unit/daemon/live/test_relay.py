@@ -16,6 +16,8 @@ from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.live import messages, relay
 from shmmap.daemon.live.relay import (
+    BEGINNING_S,
+    END_S,
     IN_ORDER_S,
     MOST_BYTES,
     MOST_UNSENT,
@@ -320,6 +322,53 @@ def test_a_worker_that_does_not_end(world: World, monkeypatch: pytest.MonkeyPatc
     world.say(messages.Status((row,)))
     world.relay.close(keep=False)
     assert world.relay.unsaved == {"lidar": 5}
+
+
+@pytest.mark.parametrize("started", [False, True], ids=["none", "starting"])
+def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(
+    world: World, monkeypatch: pytest.MonkeyPatch, started: bool
+) -> None:
+    world.die()
+    if started:
+        world.relay.start()
+
+    def wait(_seconds: float) -> None:
+        heard = world.heard()
+        if isinstance(heard[0], messages.Begin):
+            world.workers[-1].send(messages.encode(messages.Begun(1, 5)))
+        else:
+            assert heard == [messages.End(False)]
+            world.workers[-1].send(messages.encode(messages.Ended(())))
+
+    monkeypatch.setattr(world.relay, "_wait", wait)
+    world.relay.close(keep=False)
+    assert len(world.workers) == 2
+    assert world.relay.unsaved == {}
+
+
+@pytest.mark.parametrize("dies", [False, True], ids=["hangs", "dies"])
+def test_memory_stays_where_no_worker_starts_to_save_it(
+    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, dies: bool
+) -> None:
+    world.die()
+
+    def wait(seconds: float) -> None:
+        if dies:
+            world.workers[-1].close()
+        world.now_s += seconds
+
+    monkeypatch.setattr(world.relay, "_wait", wait)
+    begin_s = world.now_s
+    world.relay.close(keep=False)
+    assert len(world.workers) == 2
+    assert world.now_s <= begin_s + END_S + BEGINNING_S
+    assert "does not start: what is in memory stays" in caplog.text
+
+
+def test_memory_that_is_kept_needs_no_worker(world: World) -> None:
+    world.die()
+    world.relay.close(keep=True)
+    assert len(world.workers) == 1
 
 
 def test_where_there_are_no_live_maps() -> None:
