@@ -15,7 +15,7 @@ import numpy as np
 
 from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit
 from shmmap.dividing.check import check_cells
-from shmmap.dividing.finishing import thin_out, write_ordered
+from shmmap.dividing.finishing import thin_out, write_encoded
 from shmmap.dividing.frame import choose_frame
 from shmmap.dividing.inputs import (
     InputFile,
@@ -143,7 +143,7 @@ class _Run:
         if settings.leaf:
             self._buckets = self._bucket_lattice()
             stage = self._cell_files(space.directory("buckets"), lambda x, y: f"{x}_{y}")
-        elif settings.order != "input" or settings.encoding != "binary":
+        elif settings.encoding != "binary":
             self._buckets = self._lattice
             stage = self._cell_files(space.directory("buckets"), self._name)
         else:
@@ -222,7 +222,7 @@ class _Run:
         settings = self._settings
         room = memory_left(settings.memory_bytes)
         if settings.leaf:
-            later = settings.order != "input" or settings.encoding != "binary"
+            later = settings.encoding != "binary"
             thinned = self._space.directory("thinned") if later else final
             _empty_directory(thinned)
             cells = self._cell_files(thinned, self._name)
@@ -230,12 +230,10 @@ class _Run:
             voxels = CellLattice.of(settings.leaf, self._settings.origin).moved(*self._frame.origin[:2])
             thin_out(stage, cells, voxels, self._lattice, room, self._progress)
             stage = cells
-        if settings.order != "input" or settings.encoding != "binary":
+        if settings.encoding != "binary":
             _empty_directory(final)
             stage.close()
-            return write_ordered(
-                stage, final, self._lattice, settings.order, settings.encoding, room, self._progress
-            )
+            return write_encoded(stage, final, settings.encoding, room, self._progress)
         stage.finish()
         return stage
 
@@ -261,7 +259,7 @@ class _Run:
             "lattice": asdict(self._lattice),
             "buckets": asdict(self._buckets),
             "prefix": settings.prefix,
-            "staged": bool(settings.leaf or settings.order != "input" or settings.encoding != "binary"),
+            "staged": bool(settings.leaf or settings.encoding != "binary"),
         }
         loaded: dict[str, Any] = json.loads(json.dumps(job))
         return loaded
@@ -269,7 +267,7 @@ class _Run:
     def _check_space(self) -> None:
         """Refuse what cannot fit, before anything is read."""
         needed = self._points * self._row.itemsize
-        if self._settings.order != "input" or self._settings.encoding != "binary":
+        if self._settings.encoding != "binary":
             needed *= 2  # cells as they were read, and in their final form
         have = os.statvfs(self._space.path)
         free = have.f_bavail * have.f_frsize
@@ -311,7 +309,6 @@ class _Run:
             origin=self._frame.origin,
             cell_size=settings.cell_size,
             leaf=settings.leaf,
-            order=settings.order,
             encoding=settings.encoding,
             fields=[(name, self._row[name].str) for name in self._row.names or ()],
             bounds=bounds,

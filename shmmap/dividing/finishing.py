@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What needs all points of a place at once: voxels, the order in a cell, compression."""
+"""What needs all points of a place at once: voxels, and compression."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.dividing.cell_files import CellFiles
-from shmmap.dividing.cell_order import morton_order
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
 from shmmap.dividing.progress import Progress
@@ -21,7 +20,7 @@ from shmmap.dividing.voxels import BYTES_PER_POINT, reduce_voxels
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import write_pcd
 
-__all__ = ["thin_out", "write_ordered"]
+__all__ = ["thin_out", "write_encoded"]
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -60,16 +59,10 @@ def thin_out(
         partition.drain()
 
 
-def write_ordered(
-    stage: CellFiles,
-    final: str,
-    lattice: CellLattice,
-    order: str,
-    encoding: str,
-    memory_bytes: int,
-    progress: Progress,
+def write_encoded(
+    stage: CellFiles, final: str, encoding: str, memory_bytes: int, progress: Progress
 ) -> CellFiles:
-    """Write the cells of ``stage`` to the directory ``final``, ordered and encoded; returns what was written.
+    """Write the cells of ``stage`` to the directory ``final`` in ``encoding``; return what was written.
 
     Raises
     ------
@@ -77,14 +70,12 @@ def write_ordered(
         A cell does not fit in memory.
     """
     _check_fits(stage, 4 * stage.row.itemsize + 32, memory_bytes)
-    progress.stage("sorting" if order != "input" else "encoding", sum(stage.counts.values()))
+    progress.stage("encoding", sum(stage.counts.values()))
     cells = CellFiles(final, stage.row, stage.name)
     cells.counts = dict(stage.counts)
 
     def write(where: tuple[int, int]) -> None:
         rows = stage.read(where)
-        if order == "morton":
-            rows = rows[morton_order(rows, lattice.size)]
         columns: dict[str, NDArray[np.generic]] = {name: rows[name] for name in rows.dtype.names or ()}
         with open(cells.path(where), "wb") as file:
             write_pcd(file, columns, encoding=encoding)
