@@ -31,7 +31,7 @@ from shmmap.layers.contract import (
     PointTable,
 )
 
-__all__ = ["KIND", "TILE_COLUMNS", "build_search"]
+__all__ = ["SEARCH", "TILE_COLUMNS", "build_search"]
 
 TILE_COLUMNS: Final = 8
 """Columns of a tile along x and along y."""
@@ -124,7 +124,7 @@ def _number_tiles(
     return numbers[place], used
 
 
-KIND: Final = LayerKind(
+SEARCH: Final = LayerKind(
     name="search",
     builder_version=1,
     summary="points sorted by column and height, with a table of columns, for finding neighbours",
