@@ -18,8 +18,8 @@ from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 import shmmap
 from shmmap.origin.map_writer import MapWriter
 from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.lidar_drive import Traffic
 from shmmap.simulation.town import Town
-from shmmap.simulation.town_traffic import Traffic
 from tests.support.daemon_process import DaemonProcess
 
 Factory = Callable[..., DaemonProcess]

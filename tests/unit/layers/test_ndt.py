@@ -14,7 +14,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.build import build_layer
 from shmmap.layers.contract import LayerTable
 from shmmap.layers.ndt import CONVENTIONS, Convention, voxel_covariances
-from shmmap.testing.layer_clouds import CORNERS, corner, surface
+from shmmap.testing.layer_conformance import CORNERS, corner, surface
 from tests.support.layer_oracles import covariance_of, voxels_of
 
 MOVED = np.array([89570.0, 42300.0, 0.0])
