@@ -224,8 +224,8 @@ def _footprints(surfaces: Surfaces) -> NDArray[np.bool_]:
 def drive(seed: int, blocks: tuple[int, int], length: float, step: float) -> NDArray[np.float64]:
     """Drive through the street grid, on the right, round the corners in arcs; ``length`` metres at least.
 
-    Returns poses every ``step`` metres, (N, 3) float64: x, y in town coordinates, metres; heading in radians counter-clockwise from +x, continuous
-    (not wrapped).
+    Returns poses every ``step`` metres, (N, 3) float64: x, y in town coordinates, metres; heading in
+    radians counter-clockwise from +x, continuous (not wrapped).
     """
     crossings = _walk(seed, blocks, max(2, math.ceil(length / BLOCK_METRES) + 2))
     poses = _follow(crossings)
