@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.dividing.map_writer import MapWriter, WrittenMap
 from shmmap.errors import BadRequest
-from shmmap.origin.map_writer import MapWriter, WrittenMap
 from shmmap.simulation.town_blocks import build_block
 from shmmap.simulation.town_ground import BLOCK_METRES, ROAD_HALF_METRES, Ground, street_distance
 from shmmap.simulation.town_surfaces import Surfaces
@@ -127,9 +127,7 @@ class Town:
         intensity = np.concatenate((ground_intensity, above_intensity[seen]))
         return {"xyz": self._placed(xyz, corner), "intensity": np.clip(intensity, 0.0, 255.0, out=intensity)}
 
-    def write(
-        self, out_dir: str | os.PathLike[str], *, prefix: str = "town", encoding: str = "binary"
-    ) -> WrittenMap:
+    def write(self, out_dir: str | os.PathLike[str], *, prefix: str = "town") -> WrittenMap:
         """Write the town as a divided map of 20 m cells.
 
         Raises
@@ -137,9 +135,9 @@ class Town:
         BadRequest
             ``out_dir`` exists and is not empty.
         """
-        with MapWriter(out_dir, prefix=prefix, encoding=encoding, durable=False) as writer:
+        with MapWriter(out_dir, prefix=prefix, durable=False) as writer:
             for columns in self.tiles():
-                writer.add(columns, complete=True)
+                writer.add(columns)
             return writer.finish()
 
     def _sample_ground(
