@@ -30,7 +30,7 @@ _Daemon = TypeVar("_Daemon", bound=DaemonProcess)
 
 @pytest.fixture
 def shmmap_daemon() -> Iterator[Callable[..., DaemonProcess]]:
-    """Start daemons, ``shmmap_daemon(map_path, *options)``, see `shmmap.testing.daemon_process.isolated_daemons`."""
+    """Start daemons, ``shmmap_daemon(map_path, *options)``, see `isolated_daemons`."""
     yield from judged_daemons(DaemonProcess)
 
 
