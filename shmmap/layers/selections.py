@@ -81,8 +81,8 @@ CROP: Final = LayerKind(
 def _mixed(rows: int, seed: int) -> NDArray[np.uint64]:
     """Return a random number for each row: SplitMix64 (Steele, Lea, Flood 2014) of seed and row.
 
-    numpy's generators may give other streams in other versions of numpy; this gives the same
-    choice for ever.
+    numpy's generators may give other streams in other versions of numpy; this always
+    gives the same choice.
     """
     with np.errstate(over="ignore"):
         state = np.arange(1, rows + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -121,10 +121,12 @@ SAMPLE: Final = LayerKind(
     name="sample",
     builder_version=1,
     summary="some of the points, with every column: every n-th, or a random choice",
-    borders="each cell is sampled alone: count is a cell's, and every starts anew in each cell",
+    borders="each cell is sampled alone: count is a cell's, and every begins with the first point of each cell",
     parameters=(
-        Parameter("every", int, "keep the first of each so many points", minimum=1, maximum=1 << 40),
-        Parameter("count", int, "keep so many points, chosen at random", minimum=1, maximum=1 << 40),
+        Parameter(
+            "every", int, "keep the first of each group of this many points", minimum=1, maximum=1 << 40
+        ),
+        Parameter("count", int, "number of points to keep, chosen at random", minimum=1, maximum=1 << 40),
         Parameter("seed", int, "which random choice", default=0, minimum=0, maximum=(1 << 32) - 1),
     ),
     columns=_SOURCE_COLUMNS,
@@ -224,7 +226,14 @@ NORMALS: Final = LayerKind(
     borders="neighbours' points within radius of the border are looked at: no seam",
     parameters=(
         Parameter("radius", float, "how far around a point", "m", required=True, above=0.0, maximum=50.0),
-        Parameter("neighbors", int, "at most so many of the nearest", default=30, minimum=3, maximum=1000),
+        Parameter(
+            "neighbors",
+            int,
+            "greatest number of nearest points to look at",
+            default=30,
+            minimum=3,
+            maximum=1000,
+        ),
     ),
     columns=(
         _XYZ,
