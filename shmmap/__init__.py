@@ -85,8 +85,8 @@ if TYPE_CHECKING:
     from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
     from shmmap.layers.build import build_layer
     from shmmap.layers.contract import LayerKind, LayerTable
-    from shmmap.layers.covariance import voxel_covariances
     from shmmap.layers.ground import ground_height
+    from shmmap.layers.ndt import voxel_covariances
     from shmmap.layers.spec import canonical_layer
     from shmmap.protocol.live import LiveMapRow
     from shmmap.protocol.messages import HeldCell, Holder, Intent
@@ -189,7 +189,7 @@ _LAYERS: Final = {
     "build_layer": "build",
     "canonical_layer": "spec",
     "ground_height": "ground",
-    "voxel_covariances": "covariance",
+    "voxel_covariances": "ndt",
 }
 _CLIENT: Final = frozenset(
     {

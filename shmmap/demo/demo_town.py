@@ -14,8 +14,8 @@ from typing import Final, Protocol
 
 from shmmap.demo.consumer import Pose
 from shmmap.demo.fleet import StepReport
+from shmmap.dividing.map_writer import MapWriter
 from shmmap.errors import ConfigError
-from shmmap.origin.map_writer import MapWriter
 from shmmap.simulation.height_image import HeightImage
 from shmmap.simulation.town import Town
 from shmmap.simulation.town_ground import BLOCK_METRES
@@ -183,7 +183,7 @@ def build_town(settings: DemoSettings, map_dir: str, progress: Progress) -> Town
     with MapWriter(map_dir, prefix="town", durable=False) as writer:
         progress.stage("Building a town", settings.blocks[0] * settings.blocks[1])
         for columns in town.tiles():
-            writer.add(columns, complete=True)
+            writer.add(columns)
             image.add(columns["xyz"], columns["intensity"])
             progress.step()
         written = writer.finish()

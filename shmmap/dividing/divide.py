@@ -6,16 +6,16 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit
-from shmmap.dividing.check import check_cells
-from shmmap.dividing.finishing import thin_out, write_ordered
+from shmmap.dividing.finishing import thin_out, write_encoded
 from shmmap.dividing.frame import choose_frame
 from shmmap.dividing.inputs import (
     InputFile,
@@ -32,12 +32,13 @@ from shmmap.dividing.report import DividedMap, write_report
 from shmmap.dividing.row_layout import AXES, RowLayout, common_rows
 from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.sources import Source, open_source
-from shmmap.dividing.stream import Stream
 from shmmap.dividing.units import choose_units
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
+from shmmap.formats.causes import refusal
 from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.far_cells import far_cells_notes
 from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
 from shmmap.quantities import format_bytes
@@ -137,13 +138,14 @@ class _Run:
         self._points = sum(source.points for source in self._sources)
 
     def run(self) -> DividedMap:
+        """Divide, and let the map appear; return what was made."""
         settings, space = self._settings, self._space
         self._check_space()
         final = space.directory("map/" + _CELLS)
         if settings.leaf:
             self._buckets = self._bucket_lattice()
             stage = self._cell_files(space.directory("buckets"), lambda x, y: f"{x}_{y}")
-        elif settings.order != "input" or settings.encoding != "binary":
+        elif settings.encoding != "binary":
             self._buckets = self._lattice
             stage = self._cell_files(space.directory("buckets"), self._name)
         else:
@@ -163,7 +165,7 @@ class _Run:
         report = self._report(stream, cells)
         self._write_texts(cells, report)
         if settings.check:
-            check_cells(final, cells.counts, self._name, self._lattice, self._row, self._progress)
+            _check_cells(final, cells.counts, self._name, self._lattice, self._row, self._progress)
         self._progress.stage("forcing to the disk" if settings.durable else "publishing", 0)
         check_output_directory(space.out, force=settings.force)
         space.publish(replace=settings.force, durable=settings.durable)
@@ -178,11 +180,11 @@ class _Run:
         self._stack.callback(files.close)
         return files
 
-    def _read_into(self, files: CellFiles) -> Stream:
+    def _read_into(self, files: CellFiles) -> _Stream:
         settings = self._settings
         threads = worker_count()
         room = memory_left(settings.memory_bytes)
-        stream = Stream(self._sources, RowLayout(self._row, self._frame.move))
+        stream = _Stream(self._sources, RowLayout(self._row, self._frame.move))
         job = self._job()
         if self._state is not None and not self._restore(self._state, job, stream, files):
             self._space.empty()
@@ -206,7 +208,7 @@ class _Run:
             )
         return stream
 
-    def _restore(self, state: dict[str, Any], job: dict[str, Any], stream: Stream, files: CellFiles) -> bool:
+    def _restore(self, state: dict[str, Any], job: dict[str, Any], stream: _Stream, files: CellFiles) -> bool:
         """Return to ``state``; False if it is another job's, or the files are not those it speaks of."""
         if state.get("job") != job:
             return False
@@ -222,7 +224,7 @@ class _Run:
         settings = self._settings
         room = memory_left(settings.memory_bytes)
         if settings.leaf:
-            later = settings.order != "input" or settings.encoding != "binary"
+            later = settings.encoding != "binary"
             thinned = self._space.directory("thinned") if later else final
             _empty_directory(thinned)
             cells = self._cell_files(thinned, self._name)
@@ -230,12 +232,10 @@ class _Run:
             voxels = CellLattice.of(settings.leaf, self._settings.origin).moved(*self._frame.origin[:2])
             thin_out(stage, cells, voxels, self._lattice, room, self._progress)
             stage = cells
-        if settings.order != "input" or settings.encoding != "binary":
+        if settings.encoding != "binary":
             _empty_directory(final)
             stage.close()
-            return write_ordered(
-                stage, final, self._lattice, settings.order, settings.encoding, room, self._progress
-            )
+            return write_encoded(stage, final, settings.encoding, room, self._progress)
         stage.finish()
         return stage
 
@@ -261,7 +261,7 @@ class _Run:
             "lattice": asdict(self._lattice),
             "buckets": asdict(self._buckets),
             "prefix": settings.prefix,
-            "staged": bool(settings.leaf or settings.order != "input" or settings.encoding != "binary"),
+            "staged": bool(settings.leaf or settings.encoding != "binary"),
         }
         loaded: dict[str, Any] = json.loads(json.dumps(job))
         return loaded
@@ -269,7 +269,7 @@ class _Run:
     def _check_space(self) -> None:
         """Refuse what cannot fit, before anything is read."""
         needed = self._points * self._row.itemsize
-        if self._settings.order != "input" or self._settings.encoding != "binary":
+        if self._settings.encoding != "binary":
             needed *= 2  # cells as they were read, and in their final form
         have = os.statvfs(self._space.path)
         free = have.f_bavail * have.f_frsize
@@ -282,7 +282,7 @@ class _Run:
                 hint="free some space, or choose another disk",
             )
 
-    def _report(self, stream: Stream, cells: CellFiles) -> DividedMap:
+    def _report(self, stream: _Stream, cells: CellFiles) -> DividedMap:
         notes = [*self._units.notes, *self._frame.notes]
         for source in self._sources:
             notes += [f"{source.path}: {warning}" for warning in source.warnings]
@@ -311,7 +311,6 @@ class _Run:
             origin=self._frame.origin,
             cell_size=settings.cell_size,
             leaf=settings.leaf,
-            order=settings.order,
             encoding=settings.encoding,
             fields=[(name, self._row[name].str) for name in self._row.names or ()],
             bounds=bounds,
@@ -335,3 +334,125 @@ class _Run:
 def _empty_directory(path: str) -> None:
     for name in os.listdir(path):
         os.unlink(os.path.join(path, name))
+
+
+class _Stream:
+    """All inputs as one stream of rows into a `Partition`, with a place to continue from.
+
+    Attributes
+    ----------
+    position
+        Points read, of all sources together.
+    kept, dropped, extremes
+        As in `Partition`, with what an earlier run did.
+    """
+
+    def __init__(self, sources: Sequence[Source], layout: RowLayout) -> None:
+        self._sources = sources
+        self._layout = layout
+        self.position = 0
+        self.kept = self.dropped = 0
+        self.extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Return to where ``save`` was called; the state has passed through JSON."""
+        self.position = state["position"]
+        self.kept, self.dropped = state["kept"], state["dropped"]
+        if self.kept:
+            self.extremes = np.array(state["extremes"])
+
+    def run(
+        self,
+        partition: Partition,
+        progress: Progress,
+        *,
+        save: Callable[[dict[str, Any]], None],
+        every_s: float,
+    ) -> None:
+        """Read everything from the present position on; call ``save`` with the state now and then."""
+        progress.stage("dividing", sum(source.points for source in self._sources))
+        progress.advance(self.position)
+        before = self.kept, self.dropped, self.extremes
+        saved_s = time.monotonic()
+        skip = self.position
+        for source in self._sources:
+            if skip >= source.points:
+                skip -= source.points
+                continue
+            source.begin(replace(self._layout, scale=source.scale), skip)
+            left = source.points - skip
+            skip = 0
+            while left:
+                if time.monotonic() - saved_s >= every_s:
+                    partition.drain()
+                    self._take(partition, before)
+                    save(
+                        {
+                            "position": self.position,
+                            "kept": self.kept,
+                            "dropped": self.dropped,
+                            "extremes": self.extremes.tolist() if self.kept else None,
+                        }
+                    )
+                    saved_s = time.monotonic()
+                buffer = partition.buffer()
+                count = source.read(buffer[:left])
+                if not count:
+                    points = source.points
+                    raise refusal(
+                        "truncated", f"{points} points announced, {points - left} are there", path=source.path
+                    )
+                partition.submit(buffer, count)
+                self.position += count
+                left -= count
+                progress.advance(count)
+            source.close()
+        partition.drain()
+        self._take(partition, before)
+
+    def _take(self, partition: Partition, before: tuple[int, int, Any]) -> None:
+        kept, dropped, extremes = before
+        self.kept = kept + partition.kept
+        self.dropped = dropped + partition.dropped
+        self.extremes = np.array(
+            [np.minimum(extremes[0], partition.extremes[0]), np.maximum(extremes[1], partition.extremes[1])]
+        )
+
+
+def _check_cells(
+    directory: str,
+    counts: Mapping[tuple[int, int], int],
+    name: Callable[[int, int], str],
+    lattice: CellLattice,
+    row: Any,
+    progress: Progress,
+) -> None:
+    """Read the cells back: the files are those of ``counts``, have as many points, and all in their cell.
+
+    Raises
+    ------
+    MapDataError
+        Something is not as it was written: a defect of the disk, of the memory, or of shmmap.
+    """
+    progress.stage("checking", sum(counts.values()))
+    wanted = {name(*where): where for where in counts}
+    if set(os.listdir(directory)) != set(wanted):
+        raise MapDataError("not the files that were written", path=directory, cause="check_failed")
+    fields = set(row.names)
+    for file, where in wanted.items():
+        path = os.path.join(directory, file)
+        with PcdReader(path) as reader:
+            for block in reader.blocks():
+                progress.advance(len(block[0]))
+            (low_x, low_y, _), (high_x, high_y, _) = reader.bounds
+            names = {field.name for field in reader.header.fields}
+            points, kept = reader.header.points, reader.kept
+        (x, y), (next_x, next_y) = lattice.corner(*where), lattice.corner(where[0] + 1, where[1] + 1)
+        if not (points == kept == counts[where] and names == fields):
+            raise MapDataError(
+                f"{kept} of {points} points read, {counts[where]} were written",
+                path=path,
+                cause="check_failed",
+            )
+        if not (x <= low_x and high_x < next_x and y <= low_y and high_y < next_y):
+            raise MapDataError("it has points outside its cell", path=path, cause="check_failed")

@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What needs all points of a place at once: voxels, the order in a cell, compression."""
+"""Second passes over what was divided: points of a voxel into one, and cells into their encoding."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.dividing.cell_files import CellFiles
-from shmmap.dividing.cell_order import morton_order
+from shmmap.dividing.kernels import assign_cells
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
 from shmmap.dividing.progress import Progress
-from shmmap.dividing.voxels import BYTES_PER_POINT, reduce_voxels
+from shmmap.dividing.row_layout import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import write_pcd
 
-__all__ = ["thin_out", "write_ordered"]
+__all__ = ["reduce_voxels", "thin_out", "write_encoded"]
+
+_BYTES_PER_POINT: Final = 96
+"""What reducing takes for each point, beside two copies of the points."""
+
+_MOST_KEYS: Final = (1 << 63) - 1
+_PACKED_COLOURS: Final = frozenset({"rgb", "rgba"})  # PCL keeps four bytes in a float32
+_AMOUNTS: Final = frozenset({"intensity", "red", "green", "blue", "nir"})  # integers that have a mean
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -45,7 +53,7 @@ def thin_out(
     BadRequest
         A bucket does not fit in memory, or its points cannot be numbered by voxel.
     """
-    _check_fits(buckets, 2 * buckets.row.itemsize + BYTES_PER_POINT, memory_bytes)
+    _check_fits(buckets, 2 * buckets.row.itemsize + _BYTES_PER_POINT, memory_bytes)
     progress.stage("thinning out", sum(buckets.counts.values()))
     block_points = block_points_for(memory_bytes // 4, cells.row.itemsize, 1)
     wheres = sorted(buckets.counts)
@@ -60,16 +68,10 @@ def thin_out(
         partition.drain()
 
 
-def write_ordered(
-    stage: CellFiles,
-    final: str,
-    lattice: CellLattice,
-    order: str,
-    encoding: str,
-    memory_bytes: int,
-    progress: Progress,
+def write_encoded(
+    stage: CellFiles, final: str, encoding: str, memory_bytes: int, progress: Progress
 ) -> CellFiles:
-    """Write the cells of ``stage`` to the directory ``final``, ordered and encoded; returns what was written.
+    """Write the cells of ``stage`` to the directory ``final`` in ``encoding``; return what was written.
 
     Raises
     ------
@@ -77,14 +79,12 @@ def write_ordered(
         A cell does not fit in memory.
     """
     _check_fits(stage, 4 * stage.row.itemsize + 32, memory_bytes)
-    progress.stage("sorting" if order != "input" else "encoding", sum(stage.counts.values()))
+    progress.stage("encoding", sum(stage.counts.values()))
     cells = CellFiles(final, stage.row, stage.name)
     cells.counts = dict(stage.counts)
 
     def write(where: tuple[int, int]) -> None:
         rows = stage.read(where)
-        if order == "morton":
-            rows = rows[morton_order(rows, lattice.size)]
         columns: dict[str, NDArray[np.generic]] = {name: rows[name] for name in rows.dtype.names or ()}
         with open(cells.path(where), "wb") as file:
             write_pcd(file, columns, encoding=encoding)
@@ -122,3 +122,72 @@ def _in_order(
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
+
+
+def reduce_voxels(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.void]:
+    """Return one row for each voxel that has points, in the order of x, y, z of the voxels.
+
+    The coordinates are the centroid, summed in float64.  Float fields are means too; integers that say
+    how much (intensity, colours) are rounded means; all others (labels, rings, packed colours) are those
+    of the voxel's first point, so that they stay values that occur.
+
+    Parameters
+    ----------
+    rows
+        (N,) finite points.
+    voxels
+        Lattice in x and y; z has the same step about 0.
+
+    Raises
+    ------
+    BadRequest
+        A point is too far from the origin of the lattice, or the points too far from each other, for voxels
+        to be numbered.
+    """
+    if not len(rows):
+        return rows
+    keys = _keys(rows, voxels)
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    starts = np.flatnonzero(np.concatenate(([True], ordered[1:] != ordered[:-1])))
+    counts = np.diff(starts, append=len(rows)).astype(np.float64)
+    out = np.empty(len(starts), rows.dtype)
+    for name in rows.dtype.names or ():
+        kind = rows.dtype[name].base.kind
+        if (kind == "f" and name not in _PACKED_COLOURS) or name in _AMOUNTS:
+            values = rows[name][order].astype(np.float64)
+            with np.errstate(invalid="ignore"):
+                means = np.add.reduceat(values, starts) / counts.reshape(-1, *[1] * (values.ndim - 1))
+            out[name] = means if kind == "f" else np.rint(means)
+        else:
+            out[name] = rows[name][order[starts]]
+    return out
+
+
+def _keys(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.int64]:
+    """A number for each point's voxel, ascending in x, then y, then z."""
+    flat = CellLattice(voxels.step, 0, 0, voxels.scale)
+    ix, iy, iz = (np.empty(len(rows), np.int32) for _ in AXES)
+    extremes = np.zeros((2, 3))
+    x, y, z = (rows[axis] for axis in AXES)
+    level, low_x, high_x, low_y, high_y = assign_cells(x, y, z, _numbers(voxels), ix, iy, extremes)
+    spare = np.empty(len(rows), np.int32)
+    upright, low_z, high_z, _, _ = assign_cells(z, z, z, _numbers(flat), iz, spare, extremes)
+    spans = (high_x - low_x + 1, high_y - low_y + 1, high_z - low_z + 1)
+    if level < 0 or upright < 0 or math.prod(spans) > _MOST_KEYS:
+        raise BadRequest(
+            f"the points span too many voxels of {voxels.size:g} m to number them",
+            hint="larger --leaf, or look for a damaged coordinate with `shmmap inspect`",
+        )
+    keys: NDArray[np.int64] = ix.astype(np.int64) - low_x
+    for index, low, high in ((iy, low_y, high_y), (iz, low_z, high_z)):
+        keys *= high - low + 1
+        keys += index
+        keys -= low
+    return keys
+
+
+def _numbers(lattice: CellLattice) -> Any:
+    return (
+        lattice.size, *lattice.origin, lattice.step, lattice.origin_x, lattice.origin_y, lattice.scale,
+    )  # fmt: skip

@@ -33,7 +33,7 @@ class DividedMap:
         Where the map's frame lies in that of the inputs: add it to a point to come back, metres.
     crs, unit_m
         The inputs' coordinate system and unit, as in `shmmap.origin.map_frame.MapFrame`.
-    cell_size, leaf, order, encoding
+    cell_size, leaf, encoding
         As in `DivideSettings`.
     fields
         Names and dtypes of what each point has.
@@ -55,7 +55,6 @@ class DividedMap:
     origin: tuple[float, float, float]
     cell_size: float
     leaf: float
-    order: str
     encoding: str
     fields: list[tuple[str, str]]
     bounds: list[list[float]] | None

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from shmmap.dividing.cell_order import ORDERS
 from shmmap.dividing.frame import Translation
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.memory import MIN_MEMORY_BYTES
@@ -40,8 +39,6 @@ class DivideSettings:
         Start of every file name.
     encoding
         Of the PCD files: ``binary``, ``binary_compressed`` or ``ascii``.
-    order
-        Of the points in a cell: ``input`` or ``morton``; see `shmmap.dividing.cell_order`.
     memory_bytes
         Most memory that the process may take, code and libraries included.
     common_fields
@@ -69,7 +66,6 @@ class DivideSettings:
     leaf: float = 0.0
     prefix: str = ""
     encoding: str = "binary"
-    order: str = "input"
     memory_bytes: int = 1 << 30
     common_fields: bool = False
     fields: tuple[str, ...] = ()
@@ -98,10 +94,8 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
     # hidden files would be no cells for whoever looks for clouds in a directory
     if "/" in settings.prefix or settings.prefix.startswith(".") or not settings.prefix.isprintable():
         raise BadRequest(f"{settings.prefix!r} cannot start a file name")
-    choices = (("encoding", settings.encoding, ENCODINGS), ("order", settings.order, ORDERS))
-    for name, value, allowed in choices:
-        if value not in allowed:
-            raise BadRequest(f"{name} {value!r} is not one of {', '.join(allowed)}")
+    if settings.encoding not in ENCODINGS:
+        raise BadRequest(f"encoding {settings.encoding!r} is not one of {', '.join(ENCODINGS)}")
     if settings.fields and (missing := [axis for axis in AXES if axis not in settings.fields]):
         raise BadRequest(
             f"the fields to keep lack {', '.join(missing)}", hint="name x, y and z, too: x,y,z,intensity"

@@ -19,8 +19,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 import msgspec
@@ -28,14 +30,48 @@ import xxhash
 
 from shmmap.disk_budget import INTERIM, LAYERS, DiskBudget, mark_used
 from shmmap.errors import CannotWrite, SegmentCorrupt
-from shmmap.layers.cache_key import CacheKey
+from shmmap.layers.derive import CellJob
+from shmmap.layers.spec import LayerSpec
 from shmmap.segment.header import pack_header, unpack_header
-from shmmap.segment.layout import PAGE_BYTES, SegmentHeader, header_size
+from shmmap.segment.layout import LAYOUT_VERSION, PAGE_BYTES, SegmentHeader, SourceStamp, header_size
 from shmmap.segment.writer import write_all
 
-__all__ = ["LayerCache"]
+__all__ = ["CacheKey", "LayerCache"]
+
 
 _BLOCK_BYTES: Final = 1 << 18  # stays in the second-level cache while it is hashed and written
+
+
+@dataclass(frozen=True, slots=True)
+class CacheKey:
+    """What an entry is of: a layer of a cell at a version, or computed from some content.
+
+    Attributes
+    ----------
+    source, neighbours
+        State of the cell's file, and of those around it for a layer with a halo.
+    """
+
+    spec: LayerSpec
+    job: CellJob
+    source: SourceStamp
+    neighbours: tuple[SourceStamp, ...] = ()
+
+    @property
+    def version(self) -> int:
+        """Version of the layer."""
+        return self.job.version(self.spec, self.source, self.neighbours)
+
+    def version_name(self) -> str:
+        """Name of the entry for this version, in the present layout of segments."""
+        major, minor = LAYOUT_VERSION
+        return f"{self.version:016x}-{major}.{minor}"
+
+    def content_name(self, digest: bytes) -> str:
+        """Name of the entry for what was computed from, by `shmmap.layers.derive.combined_digest`."""
+        made = struct.pack("<IHH4d", self.spec.builder_version, *LAYOUT_VERSION, *self.job.box)
+        name: str = digest.hex() + xxhash.xxh3_64_hexdigest(str(self.spec).encode() + b"\0" + made)
+        return name
 
 
 class LayerCache:

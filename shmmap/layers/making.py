@@ -6,9 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.derive import CellJob, derive
-from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.disk_cache import CacheKey, LayerCache
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
 from shmmap.logfmt import log

@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import Block, PcdReader
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
-from shmmap.layers.outside import OutsideBox
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.writer import SegmentWriter
 
-__all__ = ["BUILDER_VERSION", "KIND", "LAYER", "build_points"]
+__all__ = ["BUILDER_VERSION", "LAYER", "POINTS", "OutsideBox", "build_points"]
 
 LAYER: Final = "points"
 BUILDER_VERSION: Final = 1  # raise it when the same source would give other bytes
@@ -127,7 +129,7 @@ def _from_arrays(points: PointTable, parameters: Parameters) -> LayerTable:
     return points.selected(points.finite())
 
 
-KIND: Final = LayerKind(
+POINTS: Final = LayerKind(
     name=LAYER,
     builder_version=BUILDER_VERSION,
     summary="the source itself: every field a column, the bits unchanged",
@@ -143,3 +145,38 @@ KIND: Final = LayerKind(
     needs=None,
     bytes_ratio=1.0,
 )
+
+
+class OutsideBox:
+    """Counts points farther outside a box than float32 steps there; next to nothing where there are none.
+
+    Attributes
+    ----------
+    count
+        Points outside so far.
+    """
+
+    def __init__(self, box: tuple[float, float, float, float]) -> None:
+        self._box = box
+        # what wrote the file may have rounded to float32 on either side of the border
+        step = float(np.spacing(np.float32(max(map(abs, box)))))
+        self._low = box[0] - step, box[1] - step
+        self._high = box[2] + step, box[3] + step
+        self.count = 0
+
+    def add(self, xyz: NDArray[Any], low: Sequence[float], high: Sequence[float]) -> None:
+        """Count those of a block (N, 3); the bounds are of all points up to now, this block's included."""
+        inside_x = low[0] >= self._low[0] and high[0] <= self._high[0]
+        if inside_x and low[1] >= self._low[1] and high[1] <= self._high[1]:
+            return
+        outside = np.zeros(len(xyz), np.bool_)
+        for axis in (0, 1):
+            column = np.ascontiguousarray(xyz[:, axis])
+            if column.dtype.kind != "f":
+                column = column.astype(np.float64)
+            # limits in the points' own type, rounded outwards: a comparison of two types is much slower
+            least = np.nextafter(column.dtype.type(self._low[axis]), column.dtype.type(-np.inf))
+            most = np.nextafter(column.dtype.type(self._high[axis]), column.dtype.type(np.inf))
+            outside |= column < least
+            outside |= column > most
+        self.count += int(np.count_nonzero(outside))

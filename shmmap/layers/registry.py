@@ -13,19 +13,13 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Final
 
-from shmmap.layers import (
-    crop,
-    denoise,
-    elevation,
-    ground,
-    ndt,
-    normals,
-    points,
-    sample,
-    search,
-    voxel,
-)  # fmt: skip
 from shmmap.layers.contract import LayerKind
+from shmmap.layers.ground import ELEVATION, GROUND
+from shmmap.layers.ndt import NDT
+from shmmap.layers.points import POINTS
+from shmmap.layers.search import SEARCH
+from shmmap.layers.selections import CROP, DENOISE, NORMALS, SAMPLE
+from shmmap.layers.voxel import VOXEL
 from shmmap.logfmt import log
 
 __all__ = ["find_kind", "kinds", "register"]
@@ -33,8 +27,8 @@ __all__ = ["find_kind", "kinds", "register"]
 GROUP: Final = "shmmap.layers"
 
 _own: Final[dict[str, LayerKind]] = {
-    module.KIND.name: module.KIND
-    for module in (points, voxel, ndt, search, sample, crop, denoise, normals, elevation, ground)
+    kind.name: kind
+    for kind in (POINTS, VOXEL, NDT, SEARCH, SAMPLE, CROP, DENOISE, NORMALS, ELEVATION, GROUND)
 }
 _registered: Final[dict[str, LayerKind]] = {}
 

@@ -30,14 +30,14 @@ from shmmap.layers.contract import (
     Parameters,
     PointTable,
 )
+from shmmap.layers.lattice import group_points
 
-__all__ = ["KIND", "TILE_COLUMNS", "build_search"]
+__all__ = ["SEARCH", "TILE_COLUMNS", "build_search"]
 
 TILE_COLUMNS: Final = 8
 """Columns of a tile along x and along y."""
 
 _MAX_TILES: Final = 1 << 24  # 64 MiB of table: 16 km x 16 km in tiles of 4 m
-_INDEX_LIMIT: Final = float(1 << 31)
 
 
 def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
@@ -61,24 +61,38 @@ def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
             "start": np.zeros(1, np.int32),
         }
         return LayerTable(empty, 0, units, _lattice(leaf, (0, 0), (0, 0)))
-    column_x, column_y, first, tiles = _columns(xyz, leaf)
-    number, used = _number_tiles(column_x, column_y, tiles)
+    # in float64 also where the points are float32
+    grouping = group_points(np.ascontiguousarray(xyz, np.float64), (leaf, leaf, math.inf))
+    column = grouping.indices[:, :2]
+    first = column.min(axis=0) // TILE_COLUMNS * TILE_COLUMNS  # whole tiles of one lattice for all cells
+    column_x, column_y = (column - first).T
+    tiles_x, tiles_y = int(column_x.max()) // TILE_COLUMNS + 1, int(column_y.max()) // TILE_COLUMNS + 1
+    if tiles_x * tiles_y > _MAX_TILES:
+        raise MapDataError(
+            f"the points lie too far apart for a search table of {leaf:g} m",
+            cause="coordinate_range",
+            hint="divide the map into cells, remove stray points, or use a larger leaf",
+        )
+    used, number = np.unique(
+        column_y // TILE_COLUMNS * tiles_x + column_x // TILE_COLUMNS, return_inverse=True
+    )
     key = number * TILE_COLUMNS**2 + column_y % TILE_COLUMNS * TILE_COLUMNS + column_x % TILE_COLUMNS
+    key = key[grouping.rows]
     order = np.argsort(xyz[:, 2], kind="stable")
     # numpy sorts 16 bits by their digits, in no time
     narrow = key if len(used) * TILE_COLUMNS**2 > 1 << 16 else key.astype(np.uint16)
     order = order[np.argsort(narrow[order], kind="stable")]
     start = np.zeros(len(used) * TILE_COLUMNS * TILE_COLUMNS + 1, np.int32)
     np.cumsum(np.bincount(key, minlength=len(start) - 1), out=start[1:], dtype=np.int32)
-    table = np.full(tiles[0] * tiles[1], -1, np.int32)
+    table = np.full(tiles_x * tiles_y, -1, np.int32)
     table[used] = np.arange(len(used), dtype=np.int32)
     columns: dict[str, NDArray[np.generic]] = {
         "xyz": np.ascontiguousarray(xyz[order]),
-        "tile": table.reshape(tiles[1], tiles[0]),
+        "tile": table.reshape(tiles_y, tiles_x),
         "start": start,
     }
-    shape = (tiles[0] * TILE_COLUMNS, tiles[1] * TILE_COLUMNS)
-    return LayerTable(columns, len(xyz), units, _lattice(leaf, first, shape))
+    shape = (tiles_x * TILE_COLUMNS, tiles_y * TILE_COLUMNS)
+    return LayerTable(columns, len(xyz), units, _lattice(leaf, (int(first[0]), int(first[1])), shape))
 
 
 def _lattice(leaf: float, first: tuple[int, int], shape: tuple[int, int]) -> Lattice:
@@ -86,45 +100,7 @@ def _lattice(leaf: float, first: tuple[int, int], shape: tuple[int, int]) -> Lat
     return Lattice((leaf, leaf, math.inf), (*first, 0), (*shape, depth))
 
 
-def _columns(
-    xyz: NDArray[np.generic], leaf: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int], tuple[int, int]]:
-    """Column of each point along x and along y, counted from the first; the first; and tiles."""
-    columns, first, tiles = [], [], []
-    for axis in range(2):
-        place = np.floor(xyz[:, axis].astype(np.float64) * (1.0 / leaf))
-        low, high = float(place.min()), float(place.max())
-        if not max(abs(low), abs(high)) < _INDEX_LIMIT:
-            raise _too_far(leaf)
-        # whole tiles of one lattice for all cells
-        first.append(int(low) // TILE_COLUMNS * TILE_COLUMNS)
-        tiles.append((int(high) - first[axis]) // TILE_COLUMNS + 1)
-        columns.append(place.astype(np.int64) - first[axis])
-    if tiles[0] * tiles[1] > _MAX_TILES:
-        raise _too_far(leaf)
-    return columns[0], columns[1], (first[0], first[1]), (tiles[0], tiles[1])
-
-
-def _too_far(leaf: float) -> MapDataError:
-    return MapDataError(
-        f"the points lie too far apart for a search table of {leaf:g} m",
-        cause="coordinate_range",
-        hint="divide the map into cells, remove stray points, or use a larger leaf",
-    )
-
-
-def _number_tiles(
-    column_x: NDArray[np.int64], column_y: NDArray[np.int64], tiles: tuple[int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of each point's tile among those that have points, and their places in the table."""
-    place = column_y // TILE_COLUMNS * tiles[0] + column_x // TILE_COLUMNS
-    used = np.flatnonzero(np.bincount(place, minlength=1))
-    numbers = np.empty(int(used[-1]) + 1, np.int64)
-    numbers[used] = np.arange(len(used))
-    return numbers[place], used
-
-
-KIND: Final = LayerKind(
+SEARCH: Final = LayerKind(
     name="search",
     builder_version=1,
     summary="points sorted by column and height, with a table of columns, for finding neighbours",

@@ -15,7 +15,7 @@ from shmmap.errors import SegmentCorrupt
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers.contract import Box, PointTable
-from shmmap.layers.outside import OutsideBox
+from shmmap.layers.points import OutsideBox
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.verify import read_header

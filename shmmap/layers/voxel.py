@@ -13,7 +13,7 @@ from shmmap.errors import BadRequest
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
 from shmmap.layers.lattice import Grouping, group_points
 
-__all__ = ["KIND", "build_voxel"]
+__all__ = ["VOXEL", "build_voxel"]
 
 _EDGES: Final = ("leaf_x", "leaf_y", "leaf_z")
 
@@ -93,7 +93,7 @@ def _resolve(parameters: Parameters) -> Parameters:
     return parameters
 
 
-KIND: Final = LayerKind(
+VOXEL: Final = LayerKind(
     name="voxel",
     builder_version=1,
     summary="one point for each voxel: the mean of the points in it, of every column, and their number",

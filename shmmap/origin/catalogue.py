@@ -283,11 +283,6 @@ class Catalogue:
     """All cells of the map are here, see `shmmap.daemon.map.catalogue_view.CatalogueView`."""
     complete = True
 
-    @property
-    def tables(self) -> Catalogue:
-        """Its cells as tables: itself."""
-        return self
-
     def changes_from(self, before: object) -> CatalogueChange:
         """Find what differs from an earlier catalogue of the map."""
         if not isinstance(before, Catalogue):

@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a divided map's metadata file (``pointcloud_map_metadata.yaml``)."""
+"""Reads a divided map's metadata file (``pointcloud_map_metadata.yaml``): by lines, or by a YAML parser.
+
+A YAML parser takes minutes for a million entries.  So `collect_lines` takes files as writers really write
+them, one ``name: [x, y]`` a line.  A line that it does not understand declines the whole file, and the
+parser reads it: what the lines accept means the same to the parser, so nothing is guessed.
+"""
 
 from __future__ import annotations
 
 import re
 from typing import Any, Final
 
+import numpy as np
 import yaml
 
 from shmmap.errors import MapDataError, MapMissing
 from shmmap.origin.metadata_entries import MOST_NAME_BYTES, EntryCollector, MapMetadata, shortened
-from shmmap.origin.metadata_lines import collect_lines
 
-__all__ = ["MOST_METADATA_BYTES", "TOO_LARGE", "metadata_bytes", "parse_metadata"]
+__all__ = ["MOST_METADATA_BYTES", "TOO_LARGE", "collect_lines", "metadata_bytes", "parse_metadata"]
 
 MOST_METADATA_BYTES: Final = 1 << 30
 """A map of ten million cells has half of that."""
@@ -28,6 +33,28 @@ _TOO_DEEP_FOR_LIBYAML = "exceeded maximum nesting depth"
 
 # It grows with the square of the number of tag directives, too; metadata needs none.
 _TAG_DIRECTIVE = re.compile(rb"^%TAG", re.MULTILINE)
+
+_BLOCK_BYTES = 1 << 17  # so that one odd line sends few others to the slower pattern
+_PLAIN_NAME = rb"([A-Za-z0-9_.+()/][A-Za-z0-9_.+()/=@-]{0,254})"
+_PLAIN_INTEGER = rb"(-?(?:0|[1-9][0-9]{0,8}))"
+_PLAIN_LINE = re.compile(  # as the divider writes it
+    rb"^%b: \[%b, %b\]\n" % (_PLAIN_NAME, _PLAIN_INTEGER, _PLAIN_INTEGER), re.MULTILINE
+)
+_LINE = re.compile(
+    rb"""
+    (?: \#[\x20-\x7e\t]*
+      | (?: (?P<plain> -?[A-Za-z0-9_./+(][A-Za-z0-9_./+()=@-]* )
+          | "(?P<double> [ A-Za-z0-9_./+()=@-]+ )"
+          | '(?P<single> [ A-Za-z0-9_./+()=@-]+ )' )
+        [ ]* : [ ]+
+        (?: \[ [ ]* (?P<x> [-+.0-9a-zA-Z]+ ) [ ]* , [ ]* (?P<y> [-+.0-9a-zA-Z]+ ) [ ]* \]
+          | (?P<scalar> [A-Za-z0-9_.+-]+ ) )
+        (?: [ ]+ \#[\x20-\x7e\t]* )?
+    )?
+    [ ]* \r?\n
+    """,
+    re.VERBOSE,
+)
 
 
 def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES, *, at: str = "") -> bytes:
@@ -69,6 +96,52 @@ def parse_metadata(data: bytes, *, path: str, strict: bool = False, lines: bool 
         )
         raise MapDataError(f"{missing} missing", path=path, cause="no_resolution")
     return metadata
+
+
+def collect_lines(data: bytes, entries: EntryCollector) -> bool:
+    """Read the whole of ``data`` into ``entries``; False if some line needs the real parser."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    for opening in (b"---\n", b"---\r\n"):
+        data = data.removeprefix(opening)
+    if not data.endswith(b"\n"):
+        data += b"\n"
+    start = 0
+    while start < len(data):
+        stop = data.find(b"\n", min(start + _BLOCK_BYTES, len(data) - 1)) + 1
+        block = data[start:stop]
+        if not (_collect_plain(block, entries) or _collect_each(block, entries)):
+            return False
+        start = stop
+    return True
+
+
+def _collect_plain(block: bytes, entries: EntryCollector) -> bool:
+    """Take a block all of whose lines are `_PLAIN_LINE`, in a quarter of the time."""
+    found = _PLAIN_LINE.findall(block)
+    if not found or len(found) != block.count(b"\n"):
+        return False
+    names, x, y = zip(*found, strict=True)
+    return entries.block(np.array(names), np.array((x, y)).astype(np.int64).T.astype(np.float64))
+
+
+def _collect_each(block: bytes, entries: EntryCollector) -> bool:
+    """Take a block line by line: quotes, comments, floats, spaces, CRLF."""
+    position = 0
+    while position < len(block):
+        line = _LINE.match(block, position)  # here or nowhere: to search a long line takes time by its square
+        if line is None:
+            return False
+        position = line.end()
+        name = line["plain"] or line["double"] or line["single"]
+        if name is None:
+            continue
+        if line["scalar"] is not None:
+            taken = entries.scalar(name, line["scalar"].decode())
+        else:
+            taken = entries.entry(name, line["x"].decode(), line["y"].decode())
+        if not taken:
+            return False
+    return True
 
 
 def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:

@@ -16,10 +16,9 @@ from typing import Final
 import xxhash
 
 from shmmap.errors import ShmmapError
-from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob, combined_digest
-from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.disk_cache import CacheKey, LayerCache
 from shmmap.layers.making import cache_key, make_layer
 from shmmap.layers.points import LAYER
 from shmmap.layers.source_reader import FILES, SourceReader

@@ -13,6 +13,7 @@ With pytest the fixture of `shmmap.testing.fixtures` does all of that.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import re
 import secrets
@@ -24,24 +25,25 @@ import sys
 import tempfile
 import time
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Final, TypeVar
+from typing import IO, Any, Final, TypeVar
 
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.testing.environment import without_settings
-from shmmap.testing.process_watch import processes_marked, wait_ended, wait_readable
+from shmmap.testing.process_watch import open_files, processes_marked, wait_ended, wait_readable
 
-__all__ = ["READY_S", "STOP_S", "DaemonProcess"]
+__all__ = ["READY_S", "STOP_S", "DaemonProcess", "isolated_daemons"]
 
 READY_S: Final = 60.0
 STOP_S: Final = 30.0
 _MARK: Final = "SHMMAP_TEST_DAEMON"
 
 _Self = TypeVar("_Self", bound="DaemonProcess")
+_Daemon = TypeVar("_Daemon", bound="DaemonProcess")
 
 
 class DaemonProcess:
@@ -355,3 +357,57 @@ def _kernels_dir() -> str:
     """Where kernels are kept, see `shmmap.compiling`, which loads numba."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return str(Path(base if base.startswith("/") else os.path.expanduser("~/.cache"), "shmmap", "kernels"))
+
+
+@contextlib.contextmanager
+def isolated_daemons(kind: type[_Daemon]) -> Iterator[Callable[..., _Daemon]]:
+    """Start daemons for one test, ``make(map_path, *options, environment=..., shm_dir=..., start=True)``.
+
+    At the end each one still running gets SIGTERM and must exit 0 and leave no name, no socket, no
+    process, no temporary file (one that was killed and not started again is judged by its processes
+    alone); and this process must have no more open files than before.
+
+    Parameters
+    ----------
+    kind
+        `DaemonProcess`, or a class made of it.
+
+    Raises
+    ------
+    InternalError
+        At the end: something was left behind; the message names it and holds the daemon's log.
+    """
+    before = open_files()
+    started: list[_Daemon] = []
+
+    def make(map_path: str | os.PathLike[str], *options: str, start: bool = True, **more: Any) -> _Daemon:
+        one = kind(map_path, *options, **more)
+        started.append(one)
+        return one.start() if start else one
+
+    try:
+        yield make
+    finally:
+        problems: list[str] = []
+        for one in reversed(started):  # a later one may live in an earlier one's directory
+            problems += _stopped(one)
+    gc.collect()
+    problems += [
+        f"descriptor {fd} -> {target}"
+        for fd, target in open_files().items()
+        if fd not in before and not target.startswith("/dev/null")
+    ]
+    if problems:
+        raise InternalError("left behind:\n" + "\n".join(problems))
+
+
+def _stopped(one: DaemonProcess) -> list[str]:
+    """Stop a daemon and remove all it had; return what it should not have left."""
+    problems = []
+    try:
+        if one.process is not None and (code := one.stop()) != 0:
+            problems.append(f"the daemon's exit code is {code}")
+        problems += one.leftovers()
+        return [*problems, one.log] if problems else []
+    finally:
+        one.dispose()

@@ -21,8 +21,7 @@ from typing import TypeVar
 import pytest
 
 from shmmap.errors import InternalError
-from shmmap.testing.daemon_process import DaemonProcess
-from shmmap.testing.isolation import isolated_daemons
+from shmmap.testing.daemon_process import DaemonProcess, isolated_daemons
 
 __all__ = ["judged_daemons", "shmmap_daemon"]
 
@@ -31,7 +30,7 @@ _Daemon = TypeVar("_Daemon", bound=DaemonProcess)
 
 @pytest.fixture
 def shmmap_daemon() -> Iterator[Callable[..., DaemonProcess]]:
-    """Start daemons, ``shmmap_daemon(map_path, *options)``, see `shmmap.testing.isolation`."""
+    """Start daemons, ``shmmap_daemon(map_path, *options)``, see `isolated_daemons`."""
     yield from judged_daemons(DaemonProcess)
 
 

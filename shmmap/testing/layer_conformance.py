@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,16 @@ from shmmap.layers.spec import LayerSpec, parse_layer
 from shmmap.segment.header import unpack_header
 from shmmap.segment.layout import NO_SOURCE
 from shmmap.segment.table_writer import SegmentOrigin, write_table
-from shmmap.testing.layer_clouds import CORNERS, corner
 
-__all__ = ["CORNERS", "check_layer"]
+__all__ = ["CORNERS", "check_layer", "corner", "surface"]
+
+CORNERS: Final = (
+    "origin", "negative", "large_f4", "large_f8", "borders", "empty", "one_point", "duplicates", "not_finite",
+    "flat", "far_apart",
+)  # fmt: skip
+
+MOVED: Final[NDArray[Any]] = np.array([89570.0, 42300.0, 3.0])
+
 
 _BOX = (0.0, 0.0, 20.0, 20.0)
 MAY_BE_REFUSED = frozenset({"far_apart"})
@@ -147,3 +154,53 @@ def _check_segment(spec: LayerSpec, table: LayerTable) -> None:
     for column in back.columns:
         same = data[column.offset : column.offset + column.nbytes] == table[column.name].tobytes()
         _must(same, f"column {column.name} is not the same in a segment")
+
+
+def surface(rng: np.random.Generator, points: int, size_m: float = 20.0) -> NDArray[np.float64]:
+    """Gently hilly ground with a wall: (points, 3), metres, x and y in 0 .. size_m."""
+    xy = rng.uniform(0, size_m, (points, 2))
+    z = np.sin(xy[:, 0] / 4) + rng.normal(0, 0.02, points)
+    wall = rng.random(points) < 0.3
+    xy[wall, 0] = size_m / 3 + rng.normal(0, 0.02, wall.sum())
+    z[wall] += rng.uniform(0, 4, wall.sum())
+    return np.column_stack([xy, z])
+
+
+def corner(name: str, points: int = 600) -> Any:
+    """One cloud of `CORNERS`, (N, 3) float32 or float64."""
+    rng = np.random.default_rng(CORNERS.index(name))
+    base: NDArray[Any] = surface(rng, points)
+    if name == "origin":
+        return (base - [10, 10, 0]).astype(np.float32)
+    if name == "negative":
+        return (base - [1000, 2000, 50]).astype(np.float32)
+    if name == "large_f4":
+        base = base + MOVED
+        return base.astype(np.float32)
+    if name == "large_f8":
+        return base + MOVED
+    if name == "borders":  # exactly on faces of voxels, and a hair to either side
+        steps = rng.integers(-4, 5, (points, 3)).astype(np.float32) * np.float32(0.5)
+        hairs: NDArray[Any] = np.nextafter(steps, steps + rng.integers(-1, 2, steps.shape).astype(np.float32))
+        return hairs
+    if name == "empty":
+        return np.empty((0, 3), np.float32)
+    if name == "one_point":
+        return np.array([[-3.25, 4.5, 0.125]], np.float32)
+    if name == "duplicates":
+        return np.repeat(base[:40], 15, axis=0).astype(np.float32)
+    if name == "not_finite":
+        cloud = base.astype(np.float32)
+        cloud[::7, 0] = np.nan
+        cloud[3::11, 2] = np.inf
+        cloud[5::13, 1] = -np.inf
+        return cloud
+    if name == "flat":
+        base[:, 2] = 1.0
+        return base.astype(np.float32)
+    if name != "far_apart":
+        raise KeyError(name)
+    # no table can cover the box
+    cloud = base.astype(np.float64)
+    cloud[0] = [3e6, -4e6, 2e6]
+    return cloud

@@ -31,10 +31,10 @@ from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 
 import shmmap
-from shmmap.origin.map_writer import MapWriter
+from shmmap.dividing.map_writer import MapWriter
 from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.lidar_drive import Traffic
 from shmmap.simulation.town import Town
-from shmmap.simulation.town_traffic import Traffic
 from tests.benchmarks.street_data import street
 from tests.support.daemon_process import DaemonProcess
 
@@ -71,7 +71,7 @@ def street_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
     way = street()
     cloud = shmmap.read_cloud(way.map_file).xyz
     with MapWriter(directory / "map", durable=False) as writer:
-        writer.add({"xyz": cloud}, complete=True)
+        writer.add({"xyz": cloud})
         writer.finish()
     trajectory = read_trajectory(way.scan_poses_file)
 

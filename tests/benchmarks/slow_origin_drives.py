@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.layout import SourceStamp
-from shmmap.simulation.town_route import drive as town_path
+from shmmap.simulation.town import drive as town_path
 
 __all__ = [
     "CELL_M",

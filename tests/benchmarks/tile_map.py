@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.dividing.map_writer import MapWriter, WrittenMap
 from shmmap.formats.cloud import read_pcd
-from shmmap.origin.map_writer import MapWriter, WrittenMap
 
 Columns = dict[str, NDArray[Any]]
 
@@ -50,7 +50,7 @@ def tile_map(
     with MapWriter(out, cell_size=cell, prefix="tiled", durable=False) as writer:
         for row in range(copies):
             for column in range(copies):
-                writer.add(shifted(columns, (pitch * column, pitch * row), cell), complete=True)
+                writer.add(shifted(columns, (pitch * column, pitch * row), cell))
         return writer.finish()
 
 

@@ -96,7 +96,7 @@ def short_path() -> Iterator[Path]:
 def daemon(private_tmpfs: Callable[[str], str]) -> Iterator[DaemonFactory]:
     """Start daemons, ``daemon(map_path, *flags, environment=..., shm_dir=..., start=True)``.
 
-    What they may leave behind: `shmmap.testing.isolation`.
+    What they may leave behind: `shmmap.testing.daemon_process.isolated_daemons`.
     """
     yield from judged_daemons(DaemonProcess)
 

@@ -193,7 +193,7 @@ def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
     while waiting(re.search(r'cells evicted count=1 bytes=\d+ of="1 request"', shmmap.daemon.log) is None):
         pass
     shmmap("unpin", "--all")
-    assert shmmap.json("evict", "--all")["pinned"] == 0
+    assert shmmap.json("evict", "--all")["still_mapped"] == 0
 
 
 def test_export_merged_pcd(shmmap: Shmmap, divided_map: DividedMap) -> None:

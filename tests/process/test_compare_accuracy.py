@@ -16,10 +16,10 @@ from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 
 import shmmap
-from shmmap.origin.map_writer import MapWriter
+from shmmap.dividing.map_writer import MapWriter
 from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.lidar_drive import Traffic
 from shmmap.simulation.town import Town
-from shmmap.simulation.town_traffic import Traffic
 from tests.support.daemon_process import DaemonProcess
 
 Factory = Callable[..., DaemonProcess]
@@ -81,7 +81,7 @@ def test_objects_stay_and_the_town_goes(daemon: Factory, tmp_path: Path) -> None
 def test_real_scans_on_a_real_map(daemon: Factory, data_dir: Path, tmp_path: Path) -> None:
     cloud = shmmap.read_cloud(data_dir / "kitti0005_map" / "map_static_v005.pcd").xyz
     with MapWriter(tmp_path / "map", durable=False) as writer:
-        writer.add({"xyz": cloud}, complete=True)
+        writer.add({"xyz": cloud})
         writer.finish()
     one = daemon(tmp_path / "map")
     trajectory = read_trajectory(data_dir / "kitti0005_scans" / "poses_heldout_tum.txt")

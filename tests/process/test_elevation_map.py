@@ -20,7 +20,7 @@ from shmmap_clients.elevation_map.build import BuildProgress, MapChanged
 from shmmap_clients.elevation_map.surface import surface_heights
 
 import shmmap
-from shmmap.origin.map_writer import MapWriter
+from shmmap.dividing.map_writer import MapWriter
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
@@ -253,7 +253,7 @@ def test_no_height_at_all_is_no_answer(daemon: Factory, divided_map: DividedMap,
 
 def a_map_of(folder: Path, *parts: NDArray[np.float32]) -> Path:
     with MapWriter(folder, durable=False) as writer:
-        writer.add({"xyz": np.concatenate(parts)}, complete=True)
+        writer.add({"xyz": np.concatenate(parts)})
         writer.finish()
     return folder
 

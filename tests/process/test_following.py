@@ -61,7 +61,7 @@ def written_map(root: Path) -> DividedMap:
 
 def cut(columns: dict[str, np.ndarray], out: Path) -> DividedMap:
     """Cut a cloud with the project's own writer, as a user would."""
-    from shmmap.origin.map_writer import MapWriter
+    from shmmap.dividing.map_writer import MapWriter
 
     xyz = np.column_stack([columns["x"], columns["y"], columns["z"]])
     with MapWriter(out, cell_size=20.0, durable=False) as writer:

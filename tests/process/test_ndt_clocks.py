@@ -19,7 +19,7 @@ from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
-from shmmap.origin.map_writer import MapWriter
+from shmmap.dividing.map_writer import MapWriter
 from tests.process.conftest import DaemonFactory
 
 BEFORE, SCANS, PERIOD_S = 2, 5, 0.828  # 2.6 m apart
@@ -52,7 +52,7 @@ def street(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cloud = shmmap.read_cloud(data_dir / "kitti0005_map" / "map_static_v010.pcd").xyz
     folder = tmp_path_factory.mktemp("street") / "map"
     with MapWriter(folder, durable=False) as writer:
-        writer.add({"xyz": cloud[(np.abs(cloud[:, :2]) < 80).all(axis=1)]}, complete=True)
+        writer.add({"xyz": cloud[(np.abs(cloud[:, :2]) < 80).all(axis=1)]})
         writer.finish()
     return folder
 

@@ -96,7 +96,7 @@ def test_areas_for_pins_and_evictions(shmmap: Shmmap, divided_map: DividedMap) -
     assert shmmap.run("evict", "--all", "--circle", "10,10,5").returncode == 2
     shmmap("query", "--circle", "0,0,60")
     answer = shmmap.json("evict", "--square", "10,10,5")
-    assert (answer["kept"], answer["freed"] + answer["pinned"]) == (len(near), 0)
+    assert (answer["kept"], answer["freed"] + answer["still_mapped"]) == (len(near), 0)
     assert shmmap.json("unpin", "--box", "5,5,15,15")["cells"] == []
     answer = shmmap.json("evict", "--circle", "10,10,5")
     assert (answer["kept"], answer["freed"]) == (0, len(near))

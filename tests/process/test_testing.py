@@ -14,8 +14,7 @@ import pytest
 
 import shmmap
 from shmmap.errors import InternalError
-from shmmap.testing.daemon_process import DaemonProcess
-from shmmap.testing.isolation import isolated_daemons
+from shmmap.testing.daemon_process import DaemonProcess, isolated_daemons
 from tests.support.daemon_process import wait_ended
 from tests.support.divided_map import DividedMap
 
@@ -55,7 +54,7 @@ def test_the_fixture_for_pytest(divided_map: DividedMap, tmp_path: Path) -> None
 def test_no_pytest_is_needed() -> None:
     code = (
         "import sys; sys.modules['pytest'] = None\n"
-        "import shmmap.testing.daemon_process, shmmap.testing.isolation, shmmap.testing.layer_conformance"
+        "import shmmap.testing.daemon_process, shmmap.testing.layer_conformance"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

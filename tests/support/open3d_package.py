@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from shmmap.formats.open3d_package import SYSTEM_PACKAGES
+from shmmap.layers.selections import SYSTEM_PACKAGES
 
 __all__ = ["open3d_or_skip"]
 

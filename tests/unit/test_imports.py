@@ -76,11 +76,11 @@ PARTS = {
         "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
         "daemon.pins.probe", "daemon.service_manager", "daemon.host.budget",
     },
-    "simulation": BASE | {"formats", "origin"},
+    "simulation": BASE | {"dividing", "formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},
     "demo": BASE | {
-        "formats", "origin", "layers", "segment", "protocol", "client", "statistics", "simulation", "testing",
-        "chunks", "daemon.live.disk",
+        "dividing", "formats", "origin", "layers", "segment", "protocol", "client", "statistics",
+        "simulation", "testing", "chunks", "daemon.live.disk",
     },
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",

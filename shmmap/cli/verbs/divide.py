@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from shmmap.cli.options import Subparsers, add_json_option, add_unit_options, add_verb, numbers, size_bytes
 from shmmap.cli.program import complain
@@ -25,7 +25,7 @@ left out and counted.  All fields are kept, with their types, unless --fields na
 OUT appears complete or not at all.  Autoware's map loader reads it.
 JSON (fields may be added, none is removed):
   {"path", "cells", "points": in the map, "points_read", "dropped": not finite,
-   "origin": [x, y, z] to add to come back to the frame of the inputs, "cell_size", "leaf", "order",
+   "origin": [x, y, z] to add to come back to the frame of the inputs, "cell_size", "leaf",
    "encoding", "fields": [[name, dtype]], "bounds": [[x, y, z], [x, y, z]],
    "sources": [{"path", "size", "mtime_ns", "ctime_ns", "points"}], "notes": [text],
    "resumed_points", "crs": name of the inputs' coordinate system, "unit_m": [metres per unit of the inputs
@@ -78,9 +78,8 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     points.add_argument(
         "--order",
-        choices=("input", "morton"),
-        default="input",
-        help="order of the points in a cell: as in the input, or along a Morton curve (default: input)",
+        type=_order_is_gone,
+        help=argparse.SUPPRESS,
     )
     points.add_argument(
         "--encoding",
@@ -136,7 +135,6 @@ def run(args: argparse.Namespace) -> int:
         leaf=args.leaf,
         prefix=args.prefix,
         encoding=args.encoding,
-        order=args.order,
         memory_bytes=args.max_memory,
         common_fields=args.common_fields,
         fields=tuple(dict.fromkeys(args.fields)),
@@ -161,6 +159,13 @@ def metres(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected metres, not {text!r}") from None
+
+
+def _order_is_gone(text: str) -> NoReturn:
+    """Refuse an option of earlier versions."""
+    raise argparse.ArgumentTypeError(
+        f"{text}: this option is gone, leave it out; points keep the order of the input"
+    )
 
 
 def translation(text: str) -> Translation:

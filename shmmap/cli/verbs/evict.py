@@ -30,7 +30,7 @@ _NAMED: Final = 20
 _JSON = """\
   {"freed": segments whose memory is free, "still_mapped": segments retired, freed when no client maps them,
    "kept": segments kept in service because an operator pinned them (`shmmap pin`),
-   "unknown": [ids the map does not have], "pinned": as still_mapped, its older name: not `shmmap pin`}
+   "unknown": [ids the map does not have]}
 Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 
@@ -99,7 +99,6 @@ def _as_json(answer: Evicted) -> dict[str, object]:
     return {
         "freed": answer.freed,
         "still_mapped": answer.pinned,
-        "pinned": answer.pinned,
         "kept": answer.kept,
         "unknown": list(answer.unknown),
     }

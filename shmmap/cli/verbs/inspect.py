@@ -179,7 +179,7 @@ def _as_map(path: str, found: list[CloudDescription]) -> dict[str, Any] | None:
     """What the metadata says of files as cells of a map, and where it is wrong; None where there is none."""
     import numpy as np
 
-    from shmmap.layers.outside import OutsideBox
+    from shmmap.layers.points import OutsideBox
     from shmmap.origin.far_cells import far_cells_notes
     from shmmap.origin.map_directory import open_map
     from shmmap.origin.map_layout import absolute_path, find_layout

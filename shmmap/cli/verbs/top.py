@@ -30,8 +30,6 @@ __all__ = ["add_parser", "run"]
 _JSON = """\
   {"state": as in `shmmap status`, "beat_age_s",
    "memory": {"in_use": mapped by clients, "idle", "retired", "loading", "statistics", "free"} in bytes,
-   "budget": the same by older names: {"pinned": in use, "idle", "zombie": retired,
-              "reserved": loading and statistics, "free"},
    "hit_ratio": {"10s", "1min", "10min"} each 0 to 1 or null, "cache_too_small": bool, "cache": why, "hint",
    "ahead": as in `shmmap status`, "published": as in `shmmap status`,
    "latency_s": {"request", "wait", "load", and a loader's own time: "load_points" from the map's files,
@@ -187,7 +185,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
     from shmmap.statistics.counters import SPANS
 
     count = found.counters
-    verdict, parts = cache_verdict(count), budget_parts(count)
+    verdict = cache_verdict(count)
     ratios = {}
     for span in SPANS:
         hits, asked = count[f"hits_{span}"], count[f"hits_{span}"] + count[f"misses_{span}"]
@@ -195,14 +193,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
     return {
         "state": found.state,
         "beat_age_s": round(found.beat_age_s, 6),
-        "memory": parts,
-        "budget": {
-            "pinned": parts["in_use"],
-            "idle": parts["idle"],
-            "zombie": parts["retired"],
-            "reserved": parts["loading"] + parts["statistics"],
-            "free": parts["free"],
-        },
+        "memory": budget_parts(count),
         "hit_ratio": ratios,
         "cache_too_small": verdict.too_small,
         "cache": verdict.why,

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from shmmap.daemon.map.catalogue_view import CatalogueView, ViewOrigin
-from shmmap.daemon.map.old_tables import give_back_apart
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.logfmt import log
 from shmmap.origin.catalogue_change import CatalogueChange
@@ -30,7 +29,6 @@ class Reread:
 
     catalogue: CatalogueView
     change: CatalogueChange
-    before: CatalogueView
 
 
 Answer = Callable[[Reread | ShmmapError], None]
@@ -92,7 +90,7 @@ class Reloader:
         try:
             catalogue = self._origin.load(fresh=True, before=before)
             _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # found here, not in the loop
-            self._result = Reread(catalogue, catalogue.changes_from(before), before)
+            self._result = Reread(catalogue, catalogue.changes_from(before))
         except ShmmapError as error:
             self._result = error
         except OSError as error:
@@ -129,8 +127,6 @@ class Reloader:
         asked, self._held_asked, self._held = self._held_asked, [], None
         for answer in asked:
             answer(applied)
-        if self._served() is applied.catalogue:
-            give_back_apart(applied.before.tables, applied.catalogue.tables)
 
     def close(self) -> None:
         """Forget a running load; its thread ends with the process."""

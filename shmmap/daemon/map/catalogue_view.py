@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.geometry import Area
-from shmmap.origin.catalogue_change import CatalogueChange, Tables
+from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.origin.map_frame import MapFrame
 from shmmap.origin.opened_directories import OpenedDirectories
 from shmmap.segment.source import Source
@@ -212,10 +212,6 @@ class CatalogueView(Protocol):
 
     def changes_from(self, before: CatalogueView) -> CatalogueChange:
         """Find what differs from an earlier state, as far as both know it."""
-
-    @property
-    def tables(self) -> Tables | None:
-        """The cells of a map all of whose cells are known, as tables."""
 
 
 class ViewOrigin(Protocol):

@@ -66,7 +66,6 @@ class PublishedView:
 
     problems: Final = ()
     opened: Final = None
-    tables: Final = None
 
     def __init__(
         self, root: Root, number: int, fetcher: ShardFetcher, known: Mapping[int, Shard], *, most_bytes: int

@@ -46,8 +46,7 @@ class MapChange:
         """Serve another state of the map from now on; None if it does not know enough yet."""
         statistics, catalogue = self.cache.statistics, reread.catalogue
         if catalogue.pages is not None:  # more of both is known by now; they are compared a page at a time
-            before = self.cache.catalogue
-            reread = Reread(catalogue, catalogue.changes_from(before), before)
+            reread = Reread(catalogue, catalogue.changes_from(self.cache.catalogue))
         if not self.paging.is_ready(catalogue, self._try_again):
             return None
         self.map_switch.switch(catalogue, reread.change)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from shmmap.formats.causes import refusal
 from shmmap.formats.pcd import lzf
-from shmmap.formats.pcd.binary import check_sizes, field_arrays
+from shmmap.formats.pcd.body import check_sizes, field_arrays
 from shmmap.formats.pcd.fields import AXES
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.pcd.table import coordinate_dtype

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.formats.finite import Bounds
-from shmmap.formats.pcd.ascii import ascii_blocks
-from shmmap.formats.pcd.binary import binary_blocks, compressed_blocks
+from shmmap.formats.pcd.body import ascii_blocks, binary_blocks, compressed_blocks
 from shmmap.formats.pcd.header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
 from shmmap.formats.pcd.table import field_table
 from shmmap.formats.source_file import SourceFile, open_regular

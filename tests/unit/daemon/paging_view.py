@@ -143,7 +143,6 @@ class PagedView:
 
     frame_id: Final = "map"
     problems: Final = ()
-    tables: Final = None
     opened: Final = None
 
     def __init__(self, whole: Catalogue, page_boxes: NDArray[np.float64], known: Iterable[int]) -> None:

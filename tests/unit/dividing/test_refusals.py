@@ -58,7 +58,7 @@ def test_bad_inputs_leave_nothing(
     assert sorted(os.listdir(tmp_path)) == before
 
 
-@pytest.mark.parametrize("settings", [{}, {"leaf": 0.5}, {"order": "morton"}])
+@pytest.mark.parametrize("settings", [{}, {"leaf": 0.5}, {"encoding": "ascii"}])
 def test_a_run_that_fails_leaves_no_file_open(tmp_path: Path, settings: dict[str, Any]) -> None:
     good = cloud_file(tmp_path / "good.pcd", xyzircaedt(20_000, reach=90.0))
     bad = cloud_file(tmp_path / "bad.pcd", xyzircaedt(20_000, reach=90.0), "ascii")
@@ -124,7 +124,7 @@ def test_an_empty_directory_and_settings_that_make_no_sense(tmp_path: Path) -> N
         divide_quickly([tmp_path / "empty"], tmp_path / "map")
     for options in (
         {"cell_size": 0.0}, {"leaf": -1.0}, {"leaf": 30.0}, {"prefix": "a/b"}, {"encoding": "zip"},
-        {"order": "hilbert"}, {"memory_bytes": 1 << 20}, {"translate": (0.0, float("nan"), 0.0)},
+        {"memory_bytes": 1 << 20}, {"translate": (0.0, float("nan"), 0.0)},
         {"translate": (1 / 3, 0.0, 0.0)}, {"prefix": ".hidden"},
     ):  # fmt: skip
         with pytest.raises(BadRequest):  # before any file is looked at

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shmmap.dividing.divide import divide
+from shmmap.dividing.finishing import reduce_voxels
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.settings import DivideSettings
-from shmmap.dividing.voxels import reduce_voxels
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import write_pcd
 

@@ -14,10 +14,9 @@ import pytest
 
 from shmmap.formats.causes import refusal
 from shmmap.layers import source_reader, sources
-from shmmap.layers.cache_key import CacheKey
 from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob, Neighbour
-from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.disk_cache import CacheKey, LayerCache
 from shmmap.layers.making import Made, cache_key, make_layer
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import parse_layer

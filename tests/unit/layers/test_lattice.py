@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from shmmap import build_layer
 from shmmap.layers import lattice
-from shmmap.layers.covariance import CONVENTIONS, voxel_covariances
 from shmmap.layers.lattice import group_points
+from shmmap.layers.ndt import CONVENTIONS, voxel_covariances
 from tests.support.layer_oracles import covariance_of, voxels_of
 
 ORIGINS = st.sampled_from([0.0, 89_570.0, -42_300.5, 1e6, -3e5])

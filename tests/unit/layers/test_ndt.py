@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.build import build_layer
 from shmmap.layers.contract import LayerTable
-from shmmap.layers.covariance import CONVENTIONS, Convention, voxel_covariances
-from shmmap.testing.layer_clouds import CORNERS, corner, surface
+from shmmap.layers.ndt import CONVENTIONS, Convention, voxel_covariances
+from shmmap.testing.layer_conformance import CORNERS, corner, surface
 from tests.support.layer_oracles import covariance_of, voxels_of
 
 MOVED = np.array([89570.0, 42300.0, 0.0])

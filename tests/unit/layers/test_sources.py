@@ -15,8 +15,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.layers import source_reader, sources
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob, derive
-from shmmap.layers.halo import read_halo
+from shmmap.layers.derive import CellJob, derive, read_halo
 from shmmap.layers.source_reader import FILES
 from shmmap.layers.sources import CellSource, read_segment, read_source
 from shmmap.layers.spec import parse_layer

@@ -8,7 +8,7 @@ import pytest
 
 from shmmap.errors import BadRequest
 from shmmap.layers.build import build_layer
-from shmmap.testing.layer_clouds import CORNERS, corner
+from shmmap.testing.layer_conformance import CORNERS, corner
 from tests.support.layer_oracles import voxels_of
 
 

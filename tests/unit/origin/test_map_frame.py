@@ -55,6 +55,8 @@ def test_also_where_the_catalogue_comes_from_the_cache(
         (json.dumps({**REPORT_HEAD, "origin": [1, 2, float("nan")]}), UNKNOWN_FRAME),
         (json.dumps({**REPORT_HEAD, "origin": [1, 2, 3], "unit_m": [0, 1]}), UNKNOWN_FRAME),
         (json.dumps({**REPORT_HEAD, "origin": [1, 2, 3]}), MapFrame((1.0, 2.0, 3.0))),
+        # as earlier versions wrote it
+        (json.dumps({**REPORT_HEAD, "origin": [1, 2, 3], "order": "morton"}), MapFrame((1.0, 2.0, 3.0))),
         (
             json.dumps({**REPORT_HEAD, "origin": [1, 2, 3], "crs": "UTM", "unit_m": [0.3048, 1]}),
             MapFrame((1.0, 2.0, 3.0), "UTM", (0.3048, 1.0)),

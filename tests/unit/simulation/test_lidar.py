@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from shmmap.simulation.lidar import Lidar
+from shmmap.simulation.lidar_drive import Traffic
 from shmmap.simulation.town import Town
-from shmmap.simulation.town_traffic import Traffic
 
 
 def test_a_wall_hides_what_is_behind_it() -> None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points of ``binary`` and ``binary_compressed`` PCD files, as blocks of columns."""
+"""The points of PCD files in each encoding, as blocks of columns."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -13,13 +14,25 @@ from shmmap.formats.causes import refusal
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.header import PcdHeader
 from shmmap.formats.pcd.table import FieldTable, RawBlock
-from shmmap.formats.scratch import borrow_scratch
 from shmmap.formats.source_file import SourceFile
+from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
-__all__ = ["binary_blocks", "check_sizes", "compressed_blocks", "field_arrays", "record_blocks"]
+__all__ = [
+    "ascii_blocks",
+    "binary_blocks",
+    "check_sizes",
+    "compressed_blocks",
+    "field_arrays",
+    "record_blocks",
+]
 
 _BLOCK_BYTES: Final = 1 << 20  # of file data per block, at most
 _BYTE: Final = np.dtype(np.uint8)
+
+_KEPT_BYTES: Final = 16 << 20  # larger sets of buffers are not kept
+_FIRST_BYTES: Final = 4 << 20  # from here on numpy asks for huge pages; only what is touched counts
+_ALIGNMENT_BYTES: Final = 64
+_idle: list[_Scratch] = []
 
 
 def binary_blocks(
@@ -37,7 +50,7 @@ def record_blocks(
         return
     point_bytes = record.itemsize
     rows = _balanced(points, min(block_points, _BLOCK_BYTES // point_bytes))
-    with borrow_scratch() as scratch:
+    with _borrow_scratch() as scratch:
         raw, *columns = scratch.cut(((rows * point_bytes,), _BYTE), *table.block_shapes(rows))
         for start in range(0, points, rows):
             count = min(rows, points - start)
@@ -74,7 +87,7 @@ def compressed_blocks(
     at = header.data_offset
     sound = lzf.reachable(compressed_bytes, output_bytes)
     rows = _balanced(header.points, block_points)
-    with borrow_scratch() as scratch:
+    with _borrow_scratch() as scratch:
         shapes = (((output_bytes,), _BYTE), ((rows, 3), table.xyz_dtype))
         if sound and output_bytes > lzf.TRUST_BYTES:
             packed = source.read(compressed_bytes)
@@ -145,3 +158,89 @@ def field_arrays(data: NDArray[np.uint8], header: PcdHeader, *, padded: bool) ->
         if not field.padding or padded:
             at += nbytes
     return arrays
+
+
+def ascii_blocks(
+    source: SourceFile, header: PcdHeader, table: FieldTable, block_points: int, warnings: list[str]
+) -> Iterator[RawBlock]:
+    """Yield blocks of an ``ascii`` body: one line per point, values separated by white space.
+
+    Raises
+    ------
+    MapDataError
+        ``bad_row`` with the row (counted from 1) and its byte offset, or ``truncated`` when there
+        are fewer rows than points.
+    """
+    parser = RowParser(source.path, table)
+    left = header.points
+    for offset, text in whole_lines(source):
+        ends = line_ends(text)
+        line = at = 0
+        while line < len(ends) and left:
+            line = min(line + min(block_points, left), len(ends))
+            stop = int(ends[line - 1])
+            block = parser.parse(text[at:stop], offset + at)
+            left -= len(block[0])
+            at = stop
+            if len(block[0]):
+                yield block, ()
+        parser.count_surplus(text[at:])
+    if left:
+        points = header.points
+        raise refusal(
+            "truncated",
+            f"{points} points announced, {points - left} rows are there",
+            path=source.path,
+            offset=source.size,
+        )
+    if parser.skipped:
+        warnings.append(f"{parser.skipped} blank or comment lines among the points ignored")
+    if parser.surplus:
+        warnings.append(f"{parser.surplus} lines after the last point ignored")
+
+
+class _Scratch:
+    """One growing buffer, cut into arrays; a cut stays valid until the next `cut`.
+
+    It outlives one file: cells are small and many, and fresh buffers for each would cost more in page faults
+    than the reading itself.
+    """
+
+    def __init__(self) -> None:
+        self._memory: NDArray[np.uint8] = np.empty(0, np.uint8)
+        self._start = 0
+
+    def __enter__(self) -> _Scratch:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if not _idle and self.nbytes <= _KEPT_BYTES:
+            _idle.append(self)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return self._memory.nbytes
+
+    def cut(self, *shapes: tuple[tuple[int, ...], np.dtype[Any]]) -> tuple[NDArray[Any], ...]:
+        """Return one uninitialised C-contiguous array per (shape, dtype)."""
+        sizes = [math.prod(shape) * dtype.itemsize for shape, dtype in shapes]
+        steps = [-(-size // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES for size in sizes]
+        needed = sum(steps) + _ALIGNMENT_BYTES
+        if len(self._memory) < needed:
+            self._memory = np.empty(max(needed, _FIRST_BYTES), np.uint8)
+            self._start = -self._memory.ctypes.data % _ALIGNMENT_BYTES
+        at = self._start
+        arrays: list[NDArray[Any]] = []
+        for (shape, dtype), size, step in zip(shapes, sizes, steps, strict=True):
+            arrays.append(self._memory[at : at + size].view(dtype).reshape(shape))
+            at += step
+        return tuple(arrays)
+
+
+def _borrow_scratch() -> _Scratch:
+    """Return a buffer for the use inside its ``with`` alone; at most one idle one is kept."""
+    try:
+        return _idle.pop()
+    except IndexError:
+        return _Scratch()
