@@ -12,8 +12,8 @@ from itertools import islice
 from typing import Final
 
 from shmmap.doctor.finding import Finding, fail, ok, warn
-from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.doctor.patient import Patient
+from shmmap.doctor.verdicts import outage_so_far
 from shmmap.errors import (
     DaemonUnreachable,
     NoAnswer,

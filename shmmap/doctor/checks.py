@@ -14,11 +14,11 @@ from shmmap.doctor.kernel import check_descriptors, check_pins
 from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
 from shmmap.doctor.live import check_live_disk, check_live_maps, check_live_memory
 from shmmap.doctor.memory import (
-    check_ahead,
     check_cache,
     check_container,
     check_huge_pages,
     check_memory_limit,
+    check_prefetching,
     check_shared_memory,
 )
 from shmmap.doctor.patient import Patient
@@ -42,7 +42,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_cells,
     check_shared_memory,
     check_cache,
-    check_ahead,
+    check_prefetching,
     check_memory_limit,
     check_container,
     check_huge_pages,

@@ -3,30 +3,32 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
 from shmmap.daemon.host.budget import room_in_group
-from shmmap.doctor.cache_size import cache_verdict
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.keeping_ahead import ahead_verdict
 from shmmap.doctor.patient import Machine, Patient
-from shmmap.quantities import format_bytes
+from shmmap.doctor.verdicts import cache_verdict, outage_so_far
+from shmmap.quantities import counted, format_bytes, format_duration
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
 __all__ = [
-    "check_ahead",
     "check_cache",
     "check_container",
     "check_huge_pages",
     "check_memory_limit",
+    "check_prefetching",
     "check_shared_memory",
     "mount_of",
 ]
 
 CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
+MAX_MISS_SHARE: Final = 0.02
+"""Part of the cells asked for that moving clients may wait for: nobody knows where they turn."""
 
 
 class _Mount(NamedTuple):
@@ -96,13 +98,49 @@ def check_cache(patient: Patient) -> Finding:
     return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
 
 
-def check_ahead(patient: Patient) -> Finding:
-    """Are cells in memory before clients come to them?  The verdict of ``status``."""
-    name = "fetching ahead"
+def check_prefetching(patient: Patient) -> Finding:
+    """Do moving clients find their cells in memory?  Judged by the counters of the last ten minutes."""
+    name = "prefetching"
     if not patient.alive or patient.seen is None:
         return skip(name, "no daemon runs")
-    verdict = ahead_verdict(patient.seen.counters)
-    return (ok if verdict.is_good else warn)(name, verdict.text, verdict.hint)
+    count = patient.seen.counters
+    misses = count.get("cells_late_10min", 0)
+    waited = f"moving clients waited for {counted(misses, 'cell') if misses else 'no cell'} in the last 10 min"
+    if not count.get("prefetch_budget_bytes", 0):
+        return ok(name, f"off; {waited}", "raise --prefetch-share" if misses else "")
+    if count.get("origin_out", 0):
+        return warn(
+            name,
+            f"the map's storage is out of reach: no load has succeeded for {outage_so_far(count)}; {waited}",
+            "see to its disk or network; `shmmap tail` says why loads fail",
+        )
+    outage_s = count.get("last_outage_ns", 0) * 1e-9
+    if misses and outage_s > count.get("ride_out_ns", 0) * 1e-9:
+        return warn(
+            name,
+            f"{waited}; the map's storage was out of reach for {format_duration(outage_s)}, longer than"
+            " --ride-out",
+            f"raise --ride-out ({math.ceil(outage_s)})",
+        )
+    asked = count.get("hits_10min", 0) + count.get("misses_10min", 0)
+    if misses <= MAX_MISS_SHARE * asked:
+        return ok(name, waited)
+    smaller = "give the clients a smaller radius or a layer with fewer bytes"
+    short = count.get("prefetch_short", 0)
+    if short == 1:
+        share = format_bytes(count["prefetch_budget_bytes"])
+        fact = f"{waited}; cells fetched ahead take all of their share, {share}"
+        return warn(name, fact, f"raise --prefetch-share or --budget, or {smaller}")
+    if short == 2:
+        budget = format_bytes(count.get("budget_bytes", 0))
+        fact = f"{waited}; the budget of {budget} is full of what is in use or needed sooner"
+        return warn(name, fact, f"raise --budget, or {smaller}")
+    return warn(
+        name,
+        waited,
+        "give the daemon more --workers, and have clients send their route (MapWindow.move_to(route=...)):"
+        " without one nobody knows where they turn",
+    )
 
 
 def check_container(patient: Patient) -> Finding:

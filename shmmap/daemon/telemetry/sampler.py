@@ -8,6 +8,7 @@ cells come and go it beats more often, and lightly: only what has changed is wri
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator, Sized
 from dataclasses import dataclass, field
 from typing import Final
@@ -15,7 +16,6 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.telemetry.keeping_ahead import KeepingAhead
 from shmmap.daemon.telemetry.recent_counts import RecentCounts
 from shmmap.daemon.telemetry.session_rows import SessionRows
 from shmmap.daemon.transport.sessions import Sessions
@@ -59,12 +59,9 @@ class Sampler:
     _beating: Iterator[None] | None = None
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _rows: SessionRows = field(default_factory=SessionRows)
-    _ahead: KeepingAhead = field(init=False)
     _told_s: float = float("-inf")
     _last_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._ahead = KeepingAhead(self.cache, self.scheduler, self.sessions)
+    _outage_since_s: float | None = None
 
     @property
     def next_s(self) -> float:
@@ -127,9 +124,31 @@ class Sampler:
         cache.events.minutes.step(now_s)
         cache.events.late.turn(now_s)
         cache.lost.report(now_s)
+        self._measure_prefetching(now_s)
         if now_s - self._told_s >= EVENT_BEAT_S:
             self._told_s = now_s
             self.event_log.beat()
+
+    def _measure_prefetching(self, now_s: float) -> None:
+        """Show what limits prefetching, and the outages of the map's storage.
+
+        An outage begins when the failed loads were started; its length is shown until the next one.
+        """
+        prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
+        health = prefetcher.prefetch.health
+        statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
+        statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
+        statistics.set("prefetch_short", prefetcher.shortage(now_s))
+        statistics.set("origin_out", int(health.is_out))
+        if health.is_out and self._outage_since_s is None:
+            self._outage_since_s = now_s - health.waited_s
+            statistics.add("origin_outages")
+            statistics.set("origin_out_since_unix_ns", time.time_ns() - int(health.waited_s * 1e9))
+        if self._outage_since_s is not None:
+            statistics.set("last_outage_ns", int((now_s - self._outage_since_s) * 1e9))
+            if not health.is_out:
+                self._outage_since_s = None
+                statistics.set("origin_out_since_unix_ns", 0)
 
     def _show_used(self, now_s: float) -> None:
         """Bring hits and last use of some segments that were handed out up to date.
@@ -160,8 +179,6 @@ class Sampler:
                 yield
                 if not cache.used:
                     break
-            self._ahead.look(now_s)
-            yield
         for _ in range(ROWS_A_BEAT // ROWS_AT_ONCE):
             cache.statistics.write_rows(ROWS_AT_ONCE)
             if not cache.statistics.outdated:

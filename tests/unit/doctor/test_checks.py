@@ -16,17 +16,19 @@ import pytest
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.doctor import access, disk_cache, kernel, lifetime, live, memory, signed_map
-from shmmap.doctor.cache_size import cache_verdict
+from shmmap.doctor.verdicts import cache_verdict
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
 from shmmap.protocol.live import LiveMapRow
 from shmmap.statistics.client_rows import ClientRow
-from shmmap.statistics.counters import REFUSALS
+from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
 from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
 from tests.support.doctor_ward import USER, Ward, snapshot
+
+S = 1_000_000_000
 
 
 @pytest.fixture
@@ -183,6 +185,73 @@ def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
     seen = snapshot(refused_over_budget_10min=3, refused_over_budget_1min=1, budget_bytes=1 << 20)
     assert memory.check_cache(ward.patient(seen)).state == "fail", "clients lack cells now"
     assert memory.check_cache(ward.patient(snapshot(evictions=3))).state == "ok"
+
+
+DRIVING = {"prefetch_budget_bytes": 512 << 20, "budget_bytes": 1 << 30, "ride_out_ns": 10 * S, "hits_10min": 4000}
+SMALLER = "give the clients a smaller radius or a layer with fewer bytes"
+WAITED = "moving clients waited for 150 cells in the last 10 min"
+
+
+@pytest.mark.parametrize(
+    ("counters", "state", "fact", "advice"),
+    [
+        ({}, "ok", "off; moving clients waited for no cell in the last 10 min", ""),
+        (
+            {"cells_late_10min": 2},
+            "ok",
+            "off; moving clients waited for 2 cells in the last 10 min",
+            "raise --prefetch-share",
+        ),
+        (DRIVING, "ok", "moving clients waited for no cell in the last 10 min", ""),
+        (DRIVING | {"last_outage_ns": 60 * S, "prefetch_short": 2}, "ok", "moving clients waited for no cell in", ""),
+        (
+            DRIVING | {"cells_late_10min": 100, "misses_10min": 1000, "prefetch_short": 1},  # two in a hundred
+            "ok",
+            "moving clients waited for 100 cells in the last 10 min",
+            "",
+        ),
+        (
+            DRIVING | {"origin_out": 1, "last_outage_ns": 3 * S, "cells_late_10min": 1},
+            "warn",
+            "the map's storage is out of reach: no load has succeeded for 3.0 s; moving clients waited for 1 cell in",
+            "see to its disk or network; `shmmap tail` says why loads fail",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 1, "last_outage_ns": 13 * S + 1},
+            "warn",
+            "moving clients waited for 1 cell in the last 10 min; the map's storage was out of reach for 13.0 s,"
+            " longer than --ride-out",
+            "raise --ride-out (14)",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 150, "prefetch_short": 1},
+            "warn",
+            f"{WAITED}; cells fetched ahead take all of their share, 512 MiB",
+            f"raise --prefetch-share or --budget, or {SMALLER}",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 150, "prefetch_short": 2},
+            "warn",
+            f"{WAITED}; the budget of 1.0 GiB is full of what is in use or needed sooner",
+            f"raise --budget, or {SMALLER}",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 150, "misses_10min": 1000},
+            "warn",
+            WAITED,
+            "give the daemon more --workers, and have clients send their route (MapWindow.move_to(route=...)):"
+            " without one nobody knows where they turn",
+        ),
+    ],
+)
+def test_whether_prefetching_keeps_up(
+    ward: Ward, counters: dict[str, int], state: str, fact: str, advice: str
+) -> None:
+    assert set(counters) <= set(COUNTER_NAMES)
+    found = memory.check_prefetching(ward.patient(snapshot(**counters)))
+    assert (found.state, found.advice) == (state, advice)
+    assert found.fact.startswith(fact)
+    assert memory.check_prefetching(ward.patient()).skipped, "no daemon runs"
 
 
 def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,19 +3,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
 from shmmap.daemon.telemetry.sampler import BEAT_S, CHANGE_BEAT_S, Sampler
 from shmmap.daemon.telemetry.session_rows import ROWS_AT_ONCE, SessionRows
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.statistics.client_rows import MAX_CLIENTS
 from tests.support import connections
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import Inner
+from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
-PARTS = 9
+S = 1_000_000_000
+PARTS = 8
 
 
 def beat(sampler: Sampler, now_s: float) -> int:
@@ -27,13 +30,17 @@ def beat(sampler: Sampler, now_s: float) -> int:
     return count
 
 
+def sampler_of(one: InnerDaemon, on_beat: Callable[[], None] = lambda: None) -> Sampler:
+    return Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), on_beat)
+
+
 def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_beat(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = inner(small_map.root)
     one.everything()
     whole: list[float] = []
-    sampler = Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), lambda: whole.append(now_s))
+    sampler = sampler_of(one, lambda: whole.append(now_s))
     written: list[str] = []
     write = one.statistics._write_row
 
@@ -63,7 +70,7 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
 def test_a_beat_takes_some_turns_and_goes_on_where_it_was(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     whole: list[float] = []
-    sampler = Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), lambda: whole.append(1.0))
+    sampler = sampler_of(one, lambda: whole.append(1.0))
     assert sampler.next_s <= 0.0
     sampler.turn(1000.0)
     assert (sampler.next_s, whole) == (0.0, [])
@@ -71,6 +78,48 @@ def test_a_beat_takes_some_turns_and_goes_on_where_it_was(inner: Inner, small_ma
     assert beat(sampler, 1000.001) == PARTS - 1
     assert (whole, one.statistics._sequence) == ([1.0], beats + 1)
     assert sampler.next_s == 1000.0 + BEAT_S
+
+
+def test_outages_of_the_storage(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    health = one.scheduler.prefetcher.prefetch.health
+    sampler, values = sampler_of(one), one.statistics.values
+
+    def measured(now_s: float) -> tuple[int, int, int, bool]:
+        beat(sampler, now_s)
+        is_dated = values["origin_out_since_unix_ns"] > 0
+        return values["origin_out"], values["origin_outages"], values["last_outage_ns"], is_dated
+
+    assert measured(100.0) == (0, 0, 0, False)
+    health.failed_in_a_row = IN_A_ROW
+    assert measured(101.0) == (1, 1, 0, True)
+    assert measured(105.0) == (1, 1, 4 * S, True)
+    health.ended(0.1, failed=False)
+    assert measured(106.0) == (0, 1, 5 * S, False)
+    assert measured(200.0) == (0, 1, 5 * S, False)
+    for _ in range(IN_A_ROW):
+        health.ended(3.0, failed=True)
+    assert measured(300.0) == (1, 2, 3 * S, True), "it was away when what has failed was begun"
+
+
+def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root, prefetch_share=0.5, ride_out_s=2.4)
+    sampler, values = sampler_of(one), one.statistics.values
+
+    def short(now_s: float) -> int:
+        beat(sampler, now_s)
+        return values["prefetch_short"]
+
+    assert short(1000.0) == 0
+    assert (values["prefetch_budget_bytes"], values["ride_out_ns"]) == (32 << 20, 2_400_000_000)
+    one.ledger.prefetched_bytes = 32 << 20
+    assert short(1001.0) == 1
+    one.ledger.prefetched_bytes = 0
+    one.scheduler.prefetcher.full(1002.0)
+    assert short(1002.0) == 2
+    off = inner(small_map.root, name="off")
+    beat(sampler_of(off), 1000.0)
+    assert (off.statistics.values["prefetch_budget_bytes"], off.statistics.values["prefetch_short"]) == (0, 0)
 
 
 def test_rows_of_many_clients_are_made_anew_a_few_at_a_time() -> None:
