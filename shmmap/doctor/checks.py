@@ -7,18 +7,22 @@ from collections.abc import Callable
 from typing import Final
 
 from shmmap.doctor.access import check_group, check_map_access, check_socket
-from shmmap.doctor.cells import check_cells
-from shmmap.doctor.disk_cache import check_disk_cache
+from shmmap.doctor.cells import check_cache, check_cells, check_prefetching
+from shmmap.doctor.daemon import (
+    check_daemon,
+    check_descriptors,
+    check_leftovers,
+    check_logind,
+    check_pins,
+    check_reload,
+)
 from shmmap.doctor.finding import Finding
-from shmmap.doctor.kernel import check_descriptors, check_pins
-from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
 from shmmap.doctor.live import check_live_disk, check_live_maps, check_live_memory
 from shmmap.doctor.memory import (
-    check_cache,
     check_container,
+    check_disk_cache,
     check_huge_pages,
     check_memory_limit,
-    check_prefetching,
     check_shared_memory,
 )
 from shmmap.doctor.patient import Patient

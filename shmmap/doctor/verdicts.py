@@ -74,6 +74,6 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
 
 
 def outage_so_far(counters: Mapping[str, int]) -> str:
-    """Return how long the map's storage is out of reach, for a reader: ``"less than a second"``, ``"5.0 s"``."""
+    """Return how long the map's storage is out of reach: ``"less than a second"``, ``"5.0 s"``."""
     outage_s = counters.get("last_outage_ns", 0) * 1e-9
     return "less than a second" if outage_s < 1.0 else format_duration(outage_s)

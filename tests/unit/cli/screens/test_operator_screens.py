@@ -115,7 +115,8 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
 
 
 DRIVING = FULL | counters(
-    prefetch_budget_bytes=50 * MIB, ride_out_ns=10**10, last_outage_ns=2 * 10**9, prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, cells_late=7, cells_late_1min=2,
+    prefetch_budget_bytes=50 * MIB, ride_out_ns=10**10, last_outage_ns=2 * 10**9,
+    prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, cells_late=7, cells_late_1min=2,
     bytes_loaded=105, bytes_used=100, budget_bytes=100 * MIB,
 )  # fmt: skip
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Beats while cells come and go write what has changed, and nothing else."""
+"""What the daemon measures at its beats, and what it writes of that."""
 
 from __future__ import annotations
 
@@ -7,10 +7,18 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
-from shmmap.daemon.telemetry.sampler import BEAT_S, CHANGE_BEAT_S, Sampler
-from shmmap.daemon.telemetry.session_rows import ROWS_AT_ONCE, SessionRows
+from shmmap.daemon.telemetry.sampler import (
+    BEAT_S,
+    CHANGE_BEAT_S,
+    CLIENT_ROWS_PER_BEAT,
+    RecentCounts,
+    Sampler,
+    SessionRows,
+)
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.statistics.client_rows import MAX_CLIENTS
 from tests.support import connections
@@ -125,18 +133,20 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
 def test_rows_of_many_clients_are_made_anew_a_few_at_a_time() -> None:
     """The oldest ones first, and only of those that changed."""
     sessions, rows = Sessions(), SessionRows()
-    clients = [sessions.open(connections.of(), f"{number}", 0.0) for number in range(2 * ROWS_AT_ONCE + 8)]
+    clients = [
+        sessions.open(connections.of(), f"{number}", 0.0) for number in range(2 * CLIENT_ROWS_PER_BEAT + 8)
+    ]
     shown = [len(rows.of(sessions)) for _ in range(4)]
-    assert shown == [ROWS_AT_ONCE, 2 * ROWS_AT_ONCE, len(clients), len(clients)]
+    assert shown == [CLIENT_ROWS_PER_BEAT, 2 * CLIENT_ROWS_PER_BEAT, len(clients), len(clients)]
     before = rows.of(sessions)
     clients[-1].requests = 7
     assert [new is old for new, old in zip(rows.of(sessions), before, strict=True)].count(False) == 1
     for client in clients:
         client.requests += 1
     requests = [(row.requests, one.requests) for row, one in zip(rows.of(sessions), clients, strict=True)]
-    assert [told == now for told, now in requests].count(True) == ROWS_AT_ONCE
+    assert [told == now for told, now in requests].count(True) == CLIENT_ROWS_PER_BEAT
     for _ in range(2):
-        for client in clients[:ROWS_AT_ONCE]:
+        for client in clients[:CLIENT_ROWS_PER_BEAT]:
             client.requests += 1  # these ask all the time
         rows.of(sessions)
     assert all(row.requests for row in rows.of(sessions)), "the others have their turn"
@@ -149,3 +159,28 @@ def test_more_clients_than_there_are_rows() -> None:
     for _ in range(MAX_CLIENTS + 5):
         sessions.open(connections.of(), "", 0.0)
     assert [len(rows.of(sessions)) for _ in range(5)] == [64, 128, 192, MAX_CLIENTS, MAX_CLIENTS]
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 30.0), st.integers(0, 5)), max_size=200))
+def test_growth_over_a_span_is_right_to_a_second(steps: list[tuple[float, int]]) -> None:
+    recent = RecentCounts(("hits",), (10.0, 60.0))
+    now_s, total = 100.0, 3
+    history = [(now_s, total)]
+    recent.look({"hits": total}, now_s)
+    for wait_s, more in steps:
+        now_s, total = now_s + wait_s, total + more
+        history.append((now_s, total))
+        recent.look({"hits": total}, now_s)
+        for span, (growth,) in zip((10.0, 60.0), recent.growth({"hits": total}, now_s), strict=True):
+            inside = total - max((v for t, v in history if t <= now_s - span), default=3)
+            early = [t for t, _ in history if t <= now_s - span]
+            # a look less than a second after the one before is not remembered
+            outer = total - max((v for t, v in history if t <= (early[-1] if early else 0) - 1.0), default=3)
+            assert inside <= growth <= outer
+
+
+def test_the_longest_span_is_remembered() -> None:
+    recent = RecentCounts(("hits",), (600.0,))
+    for second in range(2000):
+        recent.look({"hits": second}, float(second))
+    assert recent.growth({"hits": 1999}, 1999.0) == [(600,)]

@@ -403,7 +403,9 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
         one.cache.rows.show(resident, "resident")
     assert shown_ahead(one) == loaded | {"0_0.pcd": False}
     assert [count(one, name) for name in ("prefetch_started", "prefetch_used", "cells_late")] == [6, 1, 0]
-    assert count(one, "bytes_loaded") == 8 * count(one, "bytes_used") // 3, "of eight of one size three are used"
+    assert count(one, "bytes_loaded") == 8 * count(one, "bytes_used") // 3, (
+        "of eight of one size three are used"
+    )
     unused = next(r for r in one.ledger.residents() if r.key.cell_id.endswith("/20_0.pcd"))
     one.reclaimer.retire(unused, one.now_s(), "request")
     one.reclaimer.sweep(one.now_s())
