@@ -77,7 +77,6 @@ class _RowTable(Generic[_Row]):
         Has memory at a place, for so many bytes; False if there is none.
     allocated
         Rows for which there is memory from the start.
-
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class _RowTable(Generic[_Row]):
         *,
         allocated: int = 0,
     ) -> None:
-        self.used = 0
+        self.used = 0  # rows to look at
         self._place = place
         self._row_bytes = row_bytes
         self._most = most
