@@ -260,7 +260,9 @@ def test_whether_prefetching_keeps_up(
     ward: Ward, counters: dict[str, int], state: str, fact: str, advice: str
 ) -> None:
     assert set(counters) <= set(COUNTER_NAMES)
-    found = cells.check_prefetching(ward.patient(snapshot(**counters)))
+    seen = snapshot()
+    seen.counters.update(counters)
+    found = cells.check_prefetching(ward.patient(seen))
     assert (found.state, found.advice) == (state, advice)
     assert found.fact.startswith(fact)
     assert cells.check_prefetching(ward.patient()).skipped, "no daemon runs"
