@@ -19,9 +19,7 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
 from shmmap.daemon.events.publisher import EventPublisher, events_path
 from shmmap.daemon.host.defects import Defects
-from shmmap.daemon.host.instance_lock import InstanceLock
-from shmmap.daemon.host.instance_names import take_away
-from shmmap.daemon.host.runtime_dir import make_runtime_dir
+from shmmap.daemon.host.instance import InstanceLock, make_runtime_dir, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
     KEEP_SIGNAL,
@@ -44,8 +42,7 @@ from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.requests.paging import Paging
-from shmmap.daemon.service_manager.socket_activation import ActivatedSocket
-from shmmap.daemon.service_manager.status import ServiceManager, status_line
+from shmmap.daemon.service_manager import ActivatedSocket, ServiceManager, status_line
 from shmmap.daemon.serving_loop import Chore, ServingLoop
 from shmmap.daemon.telemetry.published_gauges import PublishedGauges, VersionInService
 from shmmap.daemon.telemetry.sampler import Sampler

@@ -39,10 +39,8 @@ from shmmap.daemon.config import DaemonConfig, option_of
 from shmmap.daemon.config_live import state_directory
 from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.publisher import events_path
-from shmmap.daemon.host.instance_lock import InstanceLock
-from shmmap.daemon.host.instance_names import lock_path, stopped_early
+from shmmap.daemon.host.instance import InstanceLock, lock_path, make_runtime_dir, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
-from shmmap.daemon.host.runtime_dir import make_runtime_dir
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
 from shmmap.daemon.live.place import place_live_maps
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
@@ -59,9 +57,13 @@ from shmmap.daemon.prerequisites import (
     raise_descriptor_limit,
 )
 from shmmap.daemon.requests.operators.authorization import Authorization
-from shmmap.daemon.service_manager.more_time import MoreTime
-from shmmap.daemon.service_manager.socket_activation import ActivatedSocket, take_activated_socket
-from shmmap.daemon.service_manager.status import ServiceManager, notify
+from shmmap.daemon.service_manager import (
+    ActivatedSocket,
+    MoreTime,
+    ServiceManager,
+    notify,
+    take_activated_socket,
+)
 from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError

@@ -18,8 +18,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.host.budget import choose_budget, loader_bytes
-from shmmap.daemon.host.cgroup_memory import memory_limit_bytes
+from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes
 from shmmap.daemon.live.place import bytes_beside_cells
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.prepared_parent import Early, PreparedParent

@@ -11,9 +11,10 @@ import time
 from itertools import islice
 from typing import Final
 
+from shmmap.daemon.host.groups import account_name
 from shmmap.doctor.finding import Finding, fail, ok, warn
-from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.doctor.patient import Patient
+from shmmap.doctor.verdicts import outage_so_far
 from shmmap.errors import (
     DaemonUnreachable,
     NoAnswer,
@@ -27,7 +28,6 @@ from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.quantities import counted
 
 __all__ = [
-    "account_name",
     "check_group",
     "check_map_access",
     "check_socket",
@@ -40,14 +40,6 @@ ANSWER_S: Final = 2.0
 LOOKED_AT: Final = 256
 """Files of a map whose permissions are looked at: those of one map are rarely different."""
 _UNITS: Final = "/etc/systemd/system"
-
-
-def account_name(uid: int) -> str:
-    """Return what an account is called."""
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return str(uid)
 
 
 def group_name(gid: int) -> str:

@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells of the map cannot be loaded."""
+"""Cells: which cannot be loaded, is there memory for them, are they there before moving clients need them."""
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Final
 
-from shmmap.doctor.finding import Finding, ok, skip, warn
+from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Patient
+from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.errors import ShmmapError
-from shmmap.quantities import counted
+from shmmap.quantities import counted, format_bytes, format_duration
 
-__all__ = ["check_cells"]
+__all__ = ["check_cache", "check_cells", "check_prefetching"]
 
 ANSWER_S: Final = 2.0
 SHORT: Final = ("out of memory", "of memory that a loader may use")
 """What loads say that failed for lack of memory."""
 NAMED: Final = 3
 """Cells that are named, with their causes."""
+MAX_MISS_SHARE: Final = 0.02
+"""Part of the cells asked for that moving clients may wait for: where they turn is not known."""
 
 
 def check_cells(patient: Patient) -> Finding:
@@ -86,3 +90,61 @@ def _failing(patient: Patient) -> dict[tuple[str, str], str]:
             elif isinstance(event, Changed) and event.how == "removed":
                 failing = {key: text for key, text in failing.items() if key[0] != event.id}
     return failing
+
+
+def check_cache(patient: Patient) -> Finding:
+    """Is the budget enough for what clients ask for?  The verdict of ``status``."""
+    name = "cache size"
+    if not patient.alive or patient.seen is None:
+        return skip(name, "no daemon runs")
+    verdict = cache_verdict(patient.seen.counters)
+    if patient.seen.counters.get("refused_over_budget_1min", 0):
+        return fail(name, verdict.text, verdict.hint)
+    return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
+
+
+def check_prefetching(patient: Patient) -> Finding:
+    """Do moving clients find their cells in memory?  Judged by the counters of the last ten minutes."""
+    name = "prefetching"
+    if not patient.alive or patient.seen is None:
+        return skip(name, "no daemon runs")
+    count = patient.seen.counters
+    misses = count.get("cells_late_10min", 0)
+    waited = (
+        f"moving clients waited for {counted(misses, 'cell') if misses else 'no cell'} in the last 10 min"
+    )
+    if not count.get("prefetch_budget_bytes", 0):
+        return ok(name, f"off; {waited}", "raise --prefetch-share" if misses else "")
+    if count.get("origin_out", 0):
+        return warn(
+            name,
+            f"the map's storage is out of reach: no load has succeeded for {outage_so_far(count)}; {waited}",
+            "see to its disk or network; `shmmap tail` says why loads fail",
+        )
+    outage_s = count.get("last_outage_ns", 0) * 1e-9
+    if misses and outage_s > count.get("ride_out_ns", 0) * 1e-9:
+        return warn(
+            name,
+            f"{waited}; the map's storage was out of reach for {format_duration(outage_s)}, longer than"
+            " --ride-out",
+            f"raise --ride-out ({math.ceil(outage_s)})",
+        )
+    asked = count.get("hits_10min", 0) + count.get("misses_10min", 0)
+    if misses <= MAX_MISS_SHARE * asked:
+        return ok(name, waited)
+    smaller = "give the clients a smaller radius or a layer with fewer bytes"
+    short = count.get("prefetch_short", 0)
+    if short == 1:
+        share = format_bytes(count["prefetch_budget_bytes"])
+        fact = f"{waited}; cells fetched ahead take all of their share, {share}"
+        return warn(name, fact, f"raise --prefetch-share or --budget, or {smaller}")
+    if short == 2:
+        budget = format_bytes(count.get("budget_bytes", 0))
+        fact = f"{waited}; the budget of {budget} is full of what is in use or needed sooner"
+        return warn(name, fact, f"raise --budget, or {smaller}")
+    return warn(
+        name,
+        waited,
+        "give the daemon more --workers, and have clients send their route (MapWindow.move_to(route=...)):"
+        " without one the daemon cannot know where they turn",
+    )

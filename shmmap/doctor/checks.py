@@ -7,16 +7,20 @@ from collections.abc import Callable
 from typing import Final
 
 from shmmap.doctor.access import check_group, check_map_access, check_socket
-from shmmap.doctor.cells import check_cells
-from shmmap.doctor.disk_cache import check_disk_cache
+from shmmap.doctor.cells import check_cache, check_cells, check_prefetching
+from shmmap.doctor.daemon import (
+    check_daemon,
+    check_descriptors,
+    check_leftovers,
+    check_logind,
+    check_pins,
+    check_reload,
+)
 from shmmap.doctor.finding import Finding
-from shmmap.doctor.kernel import check_descriptors, check_pins
-from shmmap.doctor.lifetime import check_daemon, check_leftovers, check_logind, check_reload
 from shmmap.doctor.live import check_live_disk, check_live_maps, check_live_memory
 from shmmap.doctor.memory import (
-    check_ahead,
-    check_cache,
     check_container,
+    check_disk_cache,
     check_huge_pages,
     check_memory_limit,
     check_shared_memory,
@@ -42,7 +46,7 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
     check_cells,
     check_shared_memory,
     check_cache,
-    check_ahead,
+    check_prefetching,
     check_memory_limit,
     check_container,
     check_huge_pages,

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
-from shmmap.doctor.access import account_name, drop_ins, group_name, groups_of
+from shmmap.daemon.host.groups import account_name
+from shmmap.doctor.access import drop_ins, group_name, groups_of
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.memory import mount_of
 from shmmap.doctor.patient import Patient

@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared memory: is there enough, is it a tmpfs, what else limits it, how large are its pages."""
+"""Shared memory (is there enough, what limits it, how large are its pages), and the disk cache."""
 
 from __future__ import annotations
 
 import os
 import re
+import stat
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
-from shmmap.daemon.host.budget import room_in_group
-from shmmap.doctor.cache_size import cache_verdict
+from shmmap.daemon.host.groups import account_name
+from shmmap.daemon.host.memory import room_in_group
+from shmmap.disk_budget import OBJECTS, DiskBudget, why_not_private
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.keeping_ahead import ahead_verdict
 from shmmap.doctor.patient import Machine, Patient
+from shmmap.origin.sidecar import default_cache_directory
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 
 __all__ = [
-    "check_ahead",
-    "check_cache",
     "check_container",
+    "check_disk_cache",
     "check_huge_pages",
     "check_memory_limit",
     "check_shared_memory",
@@ -83,26 +84,6 @@ def check_shared_memory(patient: Patient) -> Finding:
 
 def _enough(budget: int) -> str:
     return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
-
-
-def check_cache(patient: Patient) -> Finding:
-    """Is the budget enough for what clients ask for?  The verdict of ``status``."""
-    name = "cache size"
-    if not patient.alive or patient.seen is None:
-        return skip(name, "no daemon runs")
-    verdict = cache_verdict(patient.seen.counters)
-    if patient.seen.counters.get("refused_over_budget_1min", 0):
-        return fail(name, verdict.text, verdict.hint)
-    return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
-
-
-def check_ahead(patient: Patient) -> Finding:
-    """Are cells in memory before clients come to them?  The verdict of ``status``."""
-    name = "fetching ahead"
-    if not patient.alive or patient.seen is None:
-        return skip(name, "no daemon runs")
-    verdict = ahead_verdict(patient.seen.counters)
-    return (ok if verdict.is_good else warn)(name, verdict.text, verdict.hint)
 
 
 def check_container(patient: Patient) -> Finding:
@@ -206,3 +187,58 @@ def check_huge_pages(patient: Patient) -> Finding:
             f" `{better}`",
         )
     return ok(name, f"off for {mount.point}; {linux} would have them for cells well above 2 MiB alone")
+
+
+_SERVICE_CACHE: Final = "/var/cache/shmmap"
+
+
+def check_disk_cache(patient: Patient) -> Finding:
+    """Is the cache directory the daemon's, and can more be kept in it?"""
+    name, uid = "disk cache", patient.runs_as
+    if not patient.config.cache_bytes:
+        return skip(name, "nothing is kept: cache_bytes is 0")
+    place = patient.config.cache_dir or (_SERVICE_CACHE if patient.is_service else default_cache_directory())
+    place = os.path.abspath(place)
+    directory = patient.machine.path(place)
+    try:
+        status = os.stat(directory)
+    except FileNotFoundError:
+        return skip(name, f"{place} is not there yet")
+    except OSError as error:
+        return warn(name, f"{place}: {error.strerror}", "run it with sudo, or name another cache_dir")
+    if not stat.S_ISDIR(status.st_mode):
+        return warn(name, f"{place} is no directory", "remove it, or name another cache_dir")
+    account = account_name(uid)
+    if why := _why_not_used(patient, place, status.st_uid):
+        return warn(
+            name,
+            f"{why}: objects of published maps are not kept there: without a connection there is no map",
+            f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS}, or name another cache_dir",
+        )
+    budget = DiskBudget(str(directory), patient.config.cache_bytes, owner=uid)
+    space = os.statvfs(directory)
+    free = f"{format_bytes(space.f_bavail * space.f_frsize)} free"
+    used, limit = budget.used_bytes(), format_bytes(budget.limit_bytes)
+    if patient.uid not in (0, uid):
+        fact = f"{place} of {account}: up to {limit}, {free}"
+    else:
+        fact = f"{place}: {format_bytes(used)} of {limit} used, {free}"
+    if used < budget.limit_bytes and not budget.has_room(1):
+        return warn(
+            name,
+            f"{fact}: nothing more is kept, because 5 % of the disk stay free",
+            "free some space, or name a cache_dir on another disk",
+        )
+    return ok(name, fact)
+
+
+def _why_not_used(patient: Patient, place: str, owner: int) -> str:
+    uid = patient.runs_as
+    if owner not in (0, uid):
+        return f"{place} belongs to {account_name(owner)}, the daemon runs as {account_name(uid)}"
+    objects = f"{place}/{OBJECTS}"
+    try:
+        why = why_not_private(os.lstat(patient.machine.path(objects)), uid)
+    except OSError:
+        return ""  # not there yet, or not to be looked at
+    return f"{objects} {why}" if why else ""

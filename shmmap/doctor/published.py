@@ -8,12 +8,12 @@ import time
 from collections.abc import Mapping
 from typing import Final
 
-from shmmap.doctor.access import account_name
+from shmmap.daemon.host.groups import account_name
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.keeping_ahead import outage_so_far
 from shmmap.doctor.patient import Patient
 from shmmap.doctor.signed_map import refused_offer
 from shmmap.doctor.store_probe import ASKED_S
+from shmmap.doctor.verdicts import outage_so_far
 from shmmap.origin.remote.store import is_published, is_url
 from shmmap.quantities import format_duration
 

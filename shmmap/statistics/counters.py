@@ -173,29 +173,6 @@ COUNTERS: Final = (
     Counter(
         "ride_out_ns", "gauge", "ns", "For so long the map's files may be out of reach unnoticed (setting)"
     ),
-    Counter("look_ahead_ns", "gauge", "ns", "How far ahead cells are fetched"),
-    Counter(
-        "ahead_ns",
-        "gauge",
-        "ns",
-        "All that moving clients will need for so long is in memory, of the least one",
-    ),
-    Counter("moving_clients", "gauge", "", "Clients that move, and will need other cells"),
-    Counter("routed_clients", "gauge", "", "Those of them that are on a route that they told"),
-    Counter("fastest_mm_per_s", "gauge", "mm/s", "Speed of the fastest of them"),
-    Counter(
-        "needed_per_1000s",
-        "gauge",
-        "",
-        "Loads in 1000 s that the clients' motion needs, as far ahead as cells are fetched",
-    ),
-    Counter(
-        "loadable_per_1000s",
-        "gauge",
-        "",
-        "Loads in 1000 s that loaders can do, as long as the last ones took",
-    ),
-    Counter("most_workers", "gauge", "", "Most loader processes that there may be"),
     Counter("origin_out", "gauge", "", "1 while no load succeeds: the map's files are out of reach"),
     Counter("origin_outages", "counter", "", "Times that no load succeeded"),
     Counter("last_outage_ns", "gauge", "ns", "How long the last time lasted, or the present one does"),

@@ -15,7 +15,7 @@ import struct
 import time
 from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
@@ -30,6 +30,7 @@ from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
     CHANGES,
+    PAGE_BYTES,
     TABLE,
     State,
     pack_header,
@@ -38,9 +39,10 @@ from shmmap.statistics.layout import (
     plan,
 )
 from shmmap.statistics.live_rows import LIVE_ROW_BYTES, MAX_LIVE, LiveRow, pack_live
-from shmmap.statistics.row_table import RowTable
 
 __all__ = ["StatisticsWriter"]
+
+_Row = TypeVar("_Row")
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
 _CLIENTS_A_PAGE = 16
@@ -56,6 +58,67 @@ def _always(nbytes: int) -> bool:
 _FREE_ROW = pack_cell(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
 
 _LONGEST: Final = {kind: f"longest_turn_{kind}_ns" for kind in TURN_KINDS}
+
+
+class _RowTable(Generic[_Row]):
+    """A small table of the segment: rows of equal length, of which only what changed is written.
+
+    Memory for them is allocated a page at a time, as they come.
+
+    Parameters
+    ----------
+    place, row_bytes, most
+        Where the table is, how long a row is, and how many there can be.
+    pack
+        Makes of a row its bytes.
+    write
+        Writes bytes at a place; False if that cannot be done.
+    allocate
+        Has memory at a place, for so many bytes; False if there is none.
+    allocated
+        Rows for which there is memory from the start.
+    """
+
+    def __init__(
+        self,
+        place: int,
+        row_bytes: int,
+        most: int,
+        pack: Callable[[_Row], bytes],
+        write: Callable[[bytes, int], bool],
+        allocate: Callable[[int, int], bool],
+        *,
+        allocated: int = 0,
+    ) -> None:
+        self.used = 0  # rows to look at
+        self._place = place
+        self._row_bytes = row_bytes
+        self._most = most
+        self._pack = pack
+        self._write = write
+        self._allocate = allocate
+        self._allocated = allocated
+        self._rows: list[_Row | None] = []
+
+    def show(self, rows: Sequence[_Row]) -> None:
+        """Have these rows in the table, the first of them if there is no room for all."""
+        count = min(len(rows), self._room_for(min(len(rows), self._most)))
+        self._rows += [None] * (count - len(self._rows))
+        self.used = 0
+        for index, row in enumerate(rows[:count]):
+            place = self._place + index * self._row_bytes
+            if self._rows[index] != row and not self._write(self._pack(row), place):
+                break
+            self._rows[index] = row
+            self.used += 1
+
+    def _room_for(self, wanted: int) -> int:
+        while self._allocated < wanted:
+            start = self._place + self._allocated * self._row_bytes
+            if not self._allocate(start, PAGE_BYTES):
+                break
+            self._allocated += PAGE_BYTES // self._row_bytes
+        return self._allocated
 
 
 class StatisticsWriter:
@@ -119,11 +182,11 @@ class StatisticsWriter:
         self._free: list[int] = []
         self._used = 0
         self._allocated = 0
-        self._clients: RowTable[ClientRow] = RowTable(
+        self._clients: _RowTable[ClientRow] = _RowTable(
             self._layout.clients_offset, CLIENT_ROW_BYTES, MAX_CLIENTS, pack_client, self._write,
             self._allocate, allocated=_CLIENTS_A_PAGE,
         )  # fmt: skip
-        self._live: RowTable[LiveRow] = RowTable(
+        self._live: _RowTable[LiveRow] = _RowTable(
             self._layout.live_offset, LIVE_ROW_BYTES, MAX_LIVE, pack_live, self._write, self._allocate
         )
         self._changed: dict[Hashable, CellRow] = {}
@@ -291,9 +354,10 @@ class StatisticsWriter:
             if not self._told:
                 self._told = True
                 log.warning(
-                        "statistics not written", error=error.strerror,
-                        effect="cells are served as before, `shmmap top` and `health` show an older state",
-                    )  # fmt: skip
+                    "statistics not written",
+                    error=error.strerror,
+                    effect="cells are served as before, `shmmap top` and `health` show an older state",
+                )
             return False
         if self._successor >= 0:
             try:

@@ -28,7 +28,7 @@ def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) ->
         "map",
         "shared memory",
         "cache size",
-        "fetching ahead",
+        "prefetching",
         "leases",
         "open files",
         "leftovers",

@@ -25,6 +25,7 @@ from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
+from shmmap.protocol.events import Evicted, Loaded
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import stop
@@ -219,24 +220,38 @@ def test_a_map_that_is_long_in_coming_is_waited_for(drive: TownDrive, daemon: Da
         assert (found.voxels > 0, waited) == (True, True)
 
 
-def test_the_daemon_is_told_the_way_ahead(drive: TownDrive, daemon: DaemonFactory) -> None:
-    """Also when the map is only looked after: what is said then is as true as what was said before."""
+@pytest.mark.parametrize(("route", "ahead_m"), [(((25.0, 125.0), (215.0, 125.0)), 105.0), ((), 45.0)])
+def test_the_daemon_fetches_what_lies_ahead(
+    drive: TownDrive, daemon: DaemonFactory, route: tuple[tuple[float, float], ...], ahead_m: float
+) -> None:
+    """Far along a route, a little way without one; also while the vehicle's map is only kept current."""
     one = daemon(drive.map_dir)
     rules = MapRules(update_distance=10.0, map_radius=30.0, lidar_radius=15.0)
-    x, y = drive.poses[0, :2]
-    waiting = Patience()
+    x, y = 25.0, 125.0
     with (
+        shmmap.connect(one.endpoint) as client,
+        shmmap.EventStream(one.endpoint) as stream,
         StatisticsReader(one.instance, one.shm_dir) as statistics,
-        MapUpdater(one.endpoint, rules, route=drive.poses[:, :2]) as maps,
+        MapUpdater(one.endpoint, rules, route=route) as maps,
     ):
-        maps.map_at(x, y, vx=3.0, vy=4.0)
-        before = statistics.snapshot(tables=False)
-        while waiting((now := statistics.snapshot(tables=False)).counters["routed_clients"] < 1):
+        (cell,) = client.metadata(shmmap.Circle(x + ahead_m, y, 1.0))
+
+        def until(kind: type[Loaded] | type[Evicted]) -> None:
+            """Wait until that happens to the cell."""
+            while True:
+                event = stream.next(60.0)
+                assert event is not None
+                if isinstance(event, kind) and Path(event.id).name == Path(cell.id).name:
+                    return
+
+        maps.map_at(x, y, vx=5.0)
+        until(Loaded)
+        before, waiting = statistics.snapshot(tables=False).counters["requests"], Patience()
+        while waiting(statistics.snapshot(tables=False).counters["requests"] < before + 4):  # one a second
             pass
-        while waiting(now.counters["requests"] < before.counters["requests"] + 4):  # one a second
-            now = statistics.snapshot(tables=False)
-        told = now.counters["moving_clients"], now.counters["fastest_mm_per_s"]
-        assert told == (1, 5000)
+        client.evict(cell.id)
+        until(Evicted)
+        until(Loaded)
 
 
 @pytest.mark.parametrize(("name", "code"), [("none.csv", 66), ("empty.csv", 65)])

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.doctor.keeping_ahead import ahead_verdict
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
@@ -46,16 +45,13 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
         yield one
 
 
-def until_ahead(one: DaemonProcess, seconds: float) -> None:
-    """Wait until all that is needed for ``seconds`` is in memory."""
-    waiting = Patience()
-    while waiting(counters(one)["ahead_ns"] < seconds * 1e9):
-        time.sleep(0.02)
+def in_memory(one: DaemonProcess) -> set[str]:
+    return {row.id for row in read_statistics(one.instance, one.shm_dir).cells}
 
 
 def until_in_memory(one: DaemonProcess, *names: str) -> None:
     waiting = Patience()
-    while waiting(not set(names) <= {row.id for row in read_statistics(one.instance, one.shm_dir).cells}):
+    while waiting(not set(names) <= in_memory(one)):
         time.sleep(0.02)
 
 
@@ -82,7 +78,7 @@ def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, we
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
         assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S).complete
-        until_ahead(one, 0.9 * RIDE_OUT_S)
+        until_in_memory(one, *(f"{x}_0.pcd" for x in range(0, DRIVEN_M + SIZE, SIZE)))
         web.refuse()
         until_out(one)
         drive(one, window)
@@ -98,13 +94,11 @@ def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: 
         cells = Path(one.cache_dir)
         while waiting(sum(path.is_file() for path in cells.rglob("objects/cells/*/*")) < wanted):
             time.sleep(0.05)
-        said = "the rest of --ride-out (30.0 s) is on the disk"
-        while waiting(said not in (verdict := ahead_verdict(counters(one))).why):
+        while waiting(not (counts := counters(one))["disk_ahead"]):
             window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE)
             time.sleep(0.02)
-        assert verdict.state == "enough"
-        counts = counters(one)
-        assert counts["ahead_ns"] < 0.5 * RIDE_OUT_S * 1e9, "memory has no room for all of it"
+        far = {f"{x}_0.pcd" for x in range(DRIVEN_M // 2, ROAD_M, SIZE)}
+        assert not far & in_memory(one), "memory has no room for all of it"
         assert counts["objects_fetched"] >= wanted
         web.refuse()
         until_out(one)

@@ -74,7 +74,7 @@ PARTS = {
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
         "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
-        "daemon.pins.probe", "daemon.service_manager", "daemon.host.budget",
+        "daemon.pins.probe", "daemon.service_manager", "daemon.host.groups", "daemon.host.memory",
     },
     "simulation": BASE | {"dividing", "formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},

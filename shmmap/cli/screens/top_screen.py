@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from shmmap.cli.screens.live_maps import STATE_STYLES, live_problems
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
+from shmmap.cli.screens.prefetching import prefetch_words
 from shmmap.cli.screens.published_map import published_words
-from shmmap.doctor.cache_size import cache_verdict
-from shmmap.doctor.keeping_ahead import ahead_verdict, over_fetch
+from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
@@ -108,10 +108,12 @@ def screen(
     lines += _flowing("cache", words, width, gap=1)
     if verdict.hint:
         lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
-    lines += _ahead(counters, width)
-    if pieces := published_words(counters):
-        units: list[Line] = [[(text, "red" if trouble else "")] for text, trouble in pieces]
-        lines += _flowing("published", units, width)
+    if counters.get("origin_out", 0):
+        lines += _flowing("origin", [[(f"out of reach for {outage_so_far(counters)}", "bold red")]], width)
+    for label, pieces in (("prefetch", prefetch_words(counters)), ("published", published_words(counters))):
+        if pieces:
+            units: list[Line] = [[(text, "red" if trouble else "")] for text, trouble in pieces]
+            lines += _flowing(label, units, width)
     lines += _latencies(found, earlier)
     lines += _flowing("loop", _longest_turns(counters), width)
     lines += _flowing("queue", _loads(counters), width)
@@ -202,29 +204,6 @@ def _hits(counters: dict[str, int]) -> list[Line]:
     total = counters["hits"] + counters["misses"]
     pieces.append([(f"({counted(total, 'cell')} asked for since the start)", "bright_black")])
     return pieces
-
-
-def _ahead(counters: dict[str, int], width: int) -> list[Line]:
-    """Whether cells are in memory before clients come to them, and what was done for that."""
-    verdict, ratio = ahead_verdict(counters), over_fetch(counters)
-    first, *rest = verdict.text.split(": ", 1)
-    state = (first + ":" * bool(rest), "green" if verdict.is_good else "bold red")
-    words: list[Line] = [[state], *([(word, "")] for word in "".join(rest).split())]
-    lines = _flowing("ahead", words, width, gap=1)
-    if verdict.hint:
-        lines += _flowing("", [[(word, "")] for word in verdict.hint.split()], width, gap=1)
-    late, lately = counters.get("cells_late", 0), counters.get("cells_late_1min", 0)
-    if counters.get("prefetch_started") or late:
-        done: list[Line] = [
-            [(f"fetched ahead {counters['prefetch_started']:,}", "")],
-            [(f"then asked for {counters['prefetch_used']:,}", "")],
-            [(f"in vain {counters['prefetch_in_vain']:,}", "")],
-            [(f"late {late:,} ({lately:,} in 1 min)", "red" if lately else "")],
-        ]
-        if ratio is not None:
-            done.append([(f"loaded {ratio:.2f} times what was used", "")])
-        lines += _flowing("", done, width)
-    return lines
 
 
 def _latencies(found: Snapshot, earlier: Snapshot | None) -> list[Line]:

@@ -15,7 +15,7 @@ from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import counted, format_bytes, print_hanging, print_line, wants_style
 from shmmap.cli.screens.published_map import published_words
-from shmmap.doctor.keeping_ahead import outage_so_far
+from shmmap.doctor.verdicts import outage_so_far
 from shmmap.errors import DaemonUnreachable
 from shmmap.lacking import area_text, extent_text
 

@@ -198,7 +198,7 @@ def run(args: argparse.Namespace) -> int:
 def _serve(args: argparse.Namespace) -> int:
     from shmmap.daemon.config import load_config
     from shmmap.daemon.main import run as serve
-    from shmmap.daemon.service_manager.status import ServiceManager
+    from shmmap.daemon.service_manager import ServiceManager
     from shmmap.errors import ShmmapError
 
     settings = {name: value for name, value in vars(args).items() if name not in ("run", "config")}

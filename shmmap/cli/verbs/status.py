@@ -18,9 +18,9 @@ from shmmap.cli.screens.output import (
     print_json,
     print_pairs,
 )
+from shmmap.cli.screens.prefetching import prefetch_as_json, prefetch_words
 from shmmap.cli.screens.published_map import published_as_json, published_lines, since
-from shmmap.doctor.cache_size import cache_verdict
-from shmmap.doctor.keeping_ahead import ahead_as_json, ahead_verdict, outage_so_far, over_fetch
+from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
@@ -35,13 +35,9 @@ _JSON = """\
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
-   "ahead": {"state": "off" | "standing": no client moves | "enough" | "filling" | "out": the map's files are
-                      out of reach | "slow": loaders | "full": memory | "late": cells come late all the same,
-             "why", "hint": text, may be empty,
-             "ahead_s": so long all that moving clients need is in memory, or null, "ride_out_s", "speed_mps",
-             "needed_per_s", "loadable_per_s": loads, the latter may be null, "origin_out": bool,
-             "last_outage_s", "moving_clients", "routed_clients", "cells_late", "prefetch_started",
-             "prefetch_used", "prefetch_in_vain", "prefetch_overtaken", "bytes_prefetched",
+   "ahead": {"ride_out_s": setting, "origin_out": bool: no load succeeds, "last_outage_s", "cells_late": that
+             moving clients waited for, "prefetch_started", "prefetch_used", "prefetch_in_vain",
+             "prefetch_overtaken", "bytes_prefetched",
              "over_fetch": bytes loaded by bytes handed out at least once, or null},
    "published": null where the map is files, or
             {"version": number, "refused": number of a version that is offered and refused, or null,
@@ -63,9 +59,9 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="state of the daemon: memory, clients, requests, cache size",
         description="Show the state of the daemon: memory, clients, requests, loads, live maps, whether the "
-        "cache is large enough, and whether cells are in memory before moving clients come to them.  Reads "
-        "its statistics in shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs; "
-        "not after `shmmap stop`.",
+        "cache is large enough, and what was fetched ahead for moving clients.  Reads its statistics in "
+        "shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
+        "`shmmap stop`.",
         json=_JSON,
     )
     add_statistics_options(parser)
@@ -93,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
                 "frame_id": identity.frame_id,
                 "shm_dir": identity.shm_dir,
                 "counters": found.counters,
-                "ahead": ahead_as_json(found.counters),
+                "ahead": prefetch_as_json(found.counters),
                 "published": published_as_json(found.counters),
                 "live": [row._asdict() for row in found.live],
             }
@@ -175,26 +171,11 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
     lines.append(("cache", verdict.text))
     if verdict.hint:
         lines.append(("", verdict.hint))
-    lines += _ahead(count)
+    if words := prefetch_words(count):
+        lines.append(("prefetch", ", ".join(text for text, _trouble in words)))
     if count["refused_quota"]:
         over = (
             f"{count['refused_quota']:,} cells refused since the start: a client asked for more than its part"
         )
         lines.append(("quota", f"{over} (--session-quota)"))
-    return lines
-
-
-def _ahead(count: dict[str, int]) -> list[tuple[str, str]]:
-    """Whether fetching ahead keeps up, and what it has done."""
-    verdict, ratio = ahead_verdict(count), over_fetch(count)
-    lines = [("ahead", verdict.text)]
-    if verdict.hint:
-        lines.append(("", verdict.hint))
-    if count.get("prefetch_started") or count.get("cells_late"):
-        loaded = f", {ratio:.2f} times the bytes used were loaded" if ratio is not None else ""
-        done = (
-            f"{count['prefetch_started']:,} fetched ahead, {count['prefetch_used']:,} then asked for,"
-            f" {count['prefetch_in_vain']:,} in vain, {count['cells_late']:,} late{loaded}"
-        )
-        lines.append(("", done))
     return lines

@@ -68,8 +68,8 @@ def add_parser(subparsers: Subparsers) -> None:
         "Requests: the daemon's own time for one.  Load waits: how long clients waited for loads.  "
         "Load time: of one cell, from when a loader was given it; below it the loaders' own time for points "
         "out of the map's files, for layers computed, and for layers out of the disk cache.\n"
-        "Ahead: whether cells are in memory before moving clients come to them.  Late: cells that a moving "
-        "client had to wait for.\n"
+        "Prefetch: cells loaded before a client asked for them.  Prefetch misses: cells that a moving client "
+        "had to wait for.\n"
         "GIVEN: memory of the cells a client was given and has not returned.",
         json=_JSON,
     )
@@ -178,10 +178,10 @@ def _styled(line: Line) -> Any:
 
 
 def _as_json(found: Snapshot) -> dict[str, object]:
+    from shmmap.cli.screens.prefetching import prefetch_as_json
     from shmmap.cli.screens.published_map import published_as_json
     from shmmap.cli.screens.top_screen import budget_parts
-    from shmmap.doctor.cache_size import cache_verdict
-    from shmmap.doctor.keeping_ahead import ahead_as_json
+    from shmmap.doctor.verdicts import cache_verdict
     from shmmap.statistics.counters import SPANS
 
     count = found.counters
@@ -198,7 +198,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
         "cache_too_small": verdict.too_small,
         "cache": verdict.why,
         "hint": verdict.hint,
-        "ahead": ahead_as_json(count),
+        "ahead": prefetch_as_json(count),
         "published": published_as_json(count),
         "latency_s": {
             name: {"p50": h.quantile_s(0.5), "p99": h.quantile_s(0.99), "count": h.total}

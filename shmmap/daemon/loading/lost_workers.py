@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.host.cgroup_memory import memory_limit_bytes, out_of_memory_kills
+from shmmap.daemon.host.memory import memory_limit_bytes, out_of_memory_kills
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.prepared_parent import RESTART
 from shmmap.daemon.loading.room import Room

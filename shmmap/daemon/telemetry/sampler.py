@@ -1,42 +1,140 @@
 # SPDX-License-Identifier: Apache-2.0
 """The daemon's pulse: a few times a second what it keeps is measured and written to the statistics.
 
-It beats from the serving loop itself, so that whoever is hung does not beat; a beat takes some turns.  While
-cells come and go it beats more often, and lightly: only what has changed is written then.
+It beats from the serving loop itself, so that a daemon that hangs does not beat; a beat takes some turns.
+While cells come and go it beats more often, and lightly: only what has changed is written then.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sized
+import time
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass, field
-from typing import Final
+from itertools import islice
+from typing import Final, NamedTuple
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.telemetry.keeping_ahead import KeepingAhead
-from shmmap.daemon.telemetry.recent_counts import RecentCounts
-from shmmap.daemon.telemetry.session_rows import SessionRows
-from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.geometry import Area, Box, Circle
+from shmmap.statistics.client_rows import MAX_CLIENTS, ClientRow, Window
 from shmmap.statistics.counters import SPANS, WINDOWED
 
-__all__ = ["BEAT_S", "Sampler"]
+__all__ = ["BEAT_S", "RecentCounts", "Sampler", "SessionRows"]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
 EVENT_BEAT_S: Final = 1.0
-"""How often listeners are told the last event's number, so that a missed one does not stay unnoticed."""
-ROWS_A_BEAT: Final = 128
-USED_ROWS_A_BEAT: Final = 64
-ROWS_AT_ONCE: Final = 16
-"""Rows of the statistics that are written, or whose hits are brought up to date, at a time: a tenth of a
-millisecond; and how many of them at a beat."""
+"""How often the last event's number is published, so that a missed event does not stay unnoticed."""
+ROWS_PER_BEAT: Final = 128
+USED_ROWS_PER_BEAT: Final = 64
+ROWS_PER_TURN: Final = 16
+"""Rows of cells that are written, or whose hits are brought up to date, at one beat, and in one of its turns,
+which takes a tenth of a millisecond."""
+CLIENT_ROWS_PER_BEAT: Final = 64
+"""Rows of clients that are brought up to date at one beat: half a millisecond."""
+SAMPLE_S: Final = 1.0
+"""How often the counters of the last minutes are remembered."""
+
+
+class RecentCounts:
+    """The values of some counters, remembered once a second: how much they grew of late.
+
+    Parameters
+    ----------
+    names
+        Which counters.
+    spans_s
+        Spans over which their growth is wanted, longest last.
+    """
+
+    def __init__(self, names: Iterable[str], spans_s: Iterable[float]) -> None:
+        self._names = tuple(names)
+        self._spans_s = tuple(spans_s)
+        length = int(max(self._spans_s) / SAMPLE_S) + 2
+        self._samples: deque[tuple[float, tuple[int, ...]]] = deque(maxlen=length)
+
+    def look(self, values: Mapping[str, int], now_s: float) -> None:
+        """Take a sample if the last one is old enough."""
+        if not self._samples or now_s - self._samples[-1][0] >= SAMPLE_S:
+            self._samples.append((now_s, tuple(values[name] for name in self._names)))
+
+    def growth(self, values: Mapping[str, int], now_s: float) -> list[tuple[int, ...]]:
+        """Return for each span how much each counter grew over it, to a sample's precision.
+
+        For a span longer than anything is remembered, it is the growth since the beginning.
+        """
+        return [
+            tuple(values[name] - old for name, old in zip(self._names, self._at(now_s - span), strict=True))
+            for span in self._spans_s
+        ]
+
+    def _at(self, time_s: float) -> tuple[int, ...]:
+        """Return the newest sample that is not younger than ``time_s``, or the oldest one."""
+        found = bisect_right(self._samples, time_s, key=lambda sample: sample[0])
+        return self._samples[max(0, found - 1)][1]
+
+
+class _Shown(NamedTuple):
+    state: tuple[object, ...]
+    number: int
+    row: ClientRow
+
+
+class SessionRows:
+    """Rows of sessions as operators see them; a bounded number is brought up to date at a time."""
+
+    def __init__(self) -> None:
+        self._shown: dict[Session, _Shown] = {}
+        self._number = 0
+
+    def of(self, sessions: Iterable[Session]) -> list[ClientRow]:
+        """Return the rows of the first `MAX_CLIENTS` sessions.
+
+        Of those that changed, the oldest rows are replaced first; a new session has none until its turn.
+        """
+        first = list(islice(sessions, MAX_CLIENTS))
+        shown = {session: self._shown[session] for session in first if session in self._shown}
+        outdated = [one for one in first if one not in shown or shown[one].state != _state(one)]
+        outdated.sort(key=lambda session: shown[session].number if session in shown else 0)
+        for session in outdated[:CLIENT_ROWS_PER_BEAT]:
+            self._number += 1
+            shown[session] = _Shown(_state(session), self._number, client_row(session))
+        self._shown = shown
+        return [shown[session].row for session in first if session in shown]
+
+
+def _state(session: Session) -> tuple[object, ...]:
+    """Return what differs whenever the session's row would differ."""
+    return session.requests, session.connection, session.intent, len(session.held), session.held_bytes
+
+
+def client_row(session: Session) -> ClientRow:
+    """Return what operators see of a client."""
+    intent, peer = session.intent, session.peer
+    return ClientRow(
+        session.slot, peer.pid, peer.uid, len(session.held), session.held_bytes, session.requests,
+        int(session.last_request_s * 1e9), session.client, session.command,
+        (float(intent.x), float(intent.y)) if intent is not None else None,
+        None if intent is None or intent.heading is None else float(intent.heading),
+        _window(session.area) if session.area is not None else None,
+    )  # fmt: skip
+
+
+def _window(area: Area) -> Window:
+    if isinstance(area, Box):
+        half = (0.5 * (area.max_x - area.min_x), 0.5 * (area.max_y - area.min_y))
+        return Window("box", *area.center, *half)
+    return Window("circle" if isinstance(area, Circle) else "square", *area.center, area.radius, area.radius)
 
 
 @dataclass(eq=False, slots=True)
 class Sampler:
-    """Measures and beats.
+    """The beats, a few times a second: measures, and writes the statistics.
 
     Parameters
     ----------
@@ -59,20 +157,17 @@ class Sampler:
     _beating: Iterator[None] | None = None
     _recent: RecentCounts = field(default_factory=lambda: RecentCounts(WINDOWED, SPANS.values()))
     _rows: SessionRows = field(default_factory=SessionRows)
-    _ahead: KeepingAhead = field(init=False)
-    _told_s: float = float("-inf")
+    _event_beat_s: float = float("-inf")
     _last_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._ahead = KeepingAhead(self.cache, self.scheduler, self.sessions)
+    _outage_since_s: float | None = None
 
     @property
     def next_s(self) -> float:
-        """When it is time to beat, or to go on with it: soon after cells came, went or changed."""
+        """Return when the next beat or part of one is due: soon after cells came, went or changed."""
         if self._beating is not None:
             return 0.0
         if self.cache.statistics.outdated:
-            # whoever asks right after a change sees it, yet a stream of changes costs little
+            # a reader right after a change sees it, yet a stream of changes costs little
             return min(self._next_s, self._last_s + CHANGE_BEAT_S)
         return self._next_s
 
@@ -90,7 +185,7 @@ class Sampler:
             self._beating = beating
 
     def measure(self) -> None:
-        """Bring the gauges up to date."""
+        """Bring the gauges of memory, loads and the map up to date."""
         cache, ledger, set_value = self.cache, self.cache.ledger, self.cache.statistics.set
         set_value("sessions", len(self.sessions))
         set_value("waiting_requests", len(self.waiting))
@@ -117,7 +212,7 @@ class Sampler:
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
-        """What need not be done at each of many beats while cells load."""
+        """Do what need not be done at each of many beats while cells load."""
         cache, values = self.cache, self.cache.statistics.values
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
@@ -125,11 +220,33 @@ class Sampler:
                 values[f"{name}_{span}"] = count
         cache.events.pressure.step(now_s)
         cache.events.minutes.step(now_s)
-        cache.events.late.turn(now_s)
+        cache.events.prefetch_misses.turn(now_s)
         cache.lost.report(now_s)
-        if now_s - self._told_s >= EVENT_BEAT_S:
-            self._told_s = now_s
+        self._measure_prefetching(now_s)
+        if now_s - self._event_beat_s >= EVENT_BEAT_S:
+            self._event_beat_s = now_s
             self.event_log.beat()
+
+    def _measure_prefetching(self, now_s: float) -> None:
+        """Show what limits prefetching, and the outages of the map's storage.
+
+        An outage begins when the failed loads were started; its length is shown until the next one.
+        """
+        prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
+        health = prefetcher.prefetch.health
+        statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
+        statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
+        statistics.set("prefetch_short", prefetcher.shortage(now_s))
+        statistics.set("origin_out", int(health.is_out))
+        if health.is_out and self._outage_since_s is None:
+            self._outage_since_s = now_s - health.waited_s
+            statistics.add("origin_outages")
+            statistics.set("origin_out_since_unix_ns", time.time_ns() - int(health.waited_s * 1e9))
+        if self._outage_since_s is not None:
+            statistics.set("last_outage_ns", int((now_s - self._outage_since_s) * 1e9))
+            if not health.is_out:
+                self._outage_since_s = None
+                statistics.set("origin_out_since_unix_ns", 0)
 
     def _show_used(self, now_s: float) -> None:
         """Bring hits and last use of some segments that were handed out up to date.
@@ -137,7 +254,7 @@ class Sampler:
         One that others cut short is retired: its cell has failed at the client's, and is loaded again.
         """
         cache = self.cache
-        for _ in range(min(ROWS_AT_ONCE, len(cache.used))):
+        for _ in range(min(ROWS_PER_TURN, len(cache.used))):
             resident = cache.used.pop()
             if cache.ledger.resident_named(resident.name) is resident:
                 if cache.retire_if_lost(resident, now_s):
@@ -155,15 +272,13 @@ class Sampler:
             yield
             cache.statistics.show_clients(self._rows.of(self.sessions))
             yield
-            for _ in range(USED_ROWS_A_BEAT // ROWS_AT_ONCE):
+            for _ in range(USED_ROWS_PER_BEAT // ROWS_PER_TURN):
                 self._show_used(now_s)
                 yield
                 if not cache.used:
                     break
-            self._ahead.look(now_s)
-            yield
-        for _ in range(ROWS_A_BEAT // ROWS_AT_ONCE):
-            cache.statistics.write_rows(ROWS_AT_ONCE)
+        for _ in range(ROWS_PER_BEAT // ROWS_PER_TURN):
+            cache.statistics.write_rows(ROWS_PER_TURN)
             if not cache.statistics.outdated:
                 break
             yield

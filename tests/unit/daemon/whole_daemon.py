@@ -22,7 +22,7 @@ from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.service_manager.status import ServiceManager
+from shmmap.daemon.service_manager import ServiceManager
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import decode_reply, encode

@@ -15,18 +15,20 @@ import pytest
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.doctor import access, disk_cache, kernel, lifetime, live, memory, signed_map
-from shmmap.doctor.cache_size import cache_verdict
+from shmmap.doctor import access, cells, daemon, live, memory, signed_map
 from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
+from shmmap.doctor.verdicts import cache_verdict
 from shmmap.protocol.live import LiveMapRow
 from shmmap.statistics.client_rows import ClientRow
-from shmmap.statistics.counters import REFUSALS
+from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
 from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
 from tests.support.doctor_ward import USER, Ward, snapshot
+
+S = 1_000_000_000
 
 
 @pytest.fixture
@@ -55,22 +57,22 @@ def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
 
 def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     uid = os.geteuid()
-    assert disk_cache.check_disk_cache(ward.patient(cache_bytes=0)).skipped
-    assert disk_cache.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town")).skipped
+    assert memory.check_disk_cache(ward.patient(cache_bytes=0)).skipped
+    assert memory.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town")).skipped
     ward.file("/var/town/layers/ab/1.layer", "x" * 5000)
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x" * 5000)
-    found = disk_cache.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town", cache_bytes=1 << 20))
+    found = memory.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town", cache_bytes=1 << 20))
     assert (found.state, found.advice) == ("ok", "")
     assert found.fact.startswith("/var/town: 9.8 KiB of 1.0 MiB used, ")
     monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
-    assert disk_cache.check_disk_cache(ward.patient(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+    assert memory.check_disk_cache(ward.patient(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o1777])
 def test_a_disk_cache_that_others_may_write(ward: Ward, mode: int) -> None:
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x")
     ward.root.joinpath("var/town/objects").chmod(mode)
-    found = disk_cache.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
     assert found.state == "warn"
     assert f"/var/town/objects may be written by other users (mode {mode:04o})" in found.fact
     assert "chmod go-w /var/town/objects" in found.advice
@@ -81,17 +83,17 @@ def test_a_disk_cache_that_others_may_write(ward: Ward, mode: int) -> None:
 def test_a_disk_cache_of_another_user(ward: Ward, which: str) -> None:
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x")
     os.chown(ward.root / which, USER, -1)
-    found = disk_cache.check_disk_cache(ward.patient(uid=0, cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.patient(uid=0, cache_dir="/var/town"))
     assert found.state == "warn"
     assert f"belongs to user {USER}" in found.fact or f"belongs to {USER}" in found.fact
     for name in ("var/town", "var/town/objects"):
         os.chown(ward.root / name, USER, -1)
-    assert disk_cache.check_disk_cache(ward.patient(uid=USER, cache_dir="/var/town")).state == "ok"
+    assert memory.check_disk_cache(ward.patient(uid=USER, cache_dir="/var/town")).state == "ok"
 
 
 def test_a_disk_cache_that_is_none(ward: Ward) -> None:
     ward.file("/var/town", "a file")
-    found = disk_cache.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
     assert (found.state, found.fact) == ("warn", "/var/town is no directory")
 
 
@@ -100,7 +102,7 @@ def test_a_disk_cache_without_room(ward: Ward, monkeypatch: pytest.MonkeyPatch) 
     here = os.statvfs(ward.root)
     full = os.statvfs_result((*here[:4], here.f_blocks // 25, *here[5:]))  # f_bavail
     monkeypatch.setattr(os, "statvfs", lambda _: full)
-    found = disk_cache.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
     assert found.state == "warn"
     assert "nothing more is kept" in found.fact
 
@@ -174,15 +176,96 @@ def test_what_the_processes_use_beside_the_segments(ward: Ward) -> None:
 
 
 def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
-    assert memory.check_cache(ward.patient()).state == "ok"
+    assert cells.check_cache(ward.patient()).state == "ok"
     seen = snapshot(refused_over_budget_10min=3, budget_bytes=1 << 20)
-    found = memory.check_cache(ward.patient(seen))
+    found = cells.check_cache(ward.patient(seen))
     verdict = cache_verdict(seen.counters)
     assert (found.state, found.fact, found.advice) == ("warn", verdict.text, verdict.hint)
     assert found.fact.startswith("TOO SMALL")
     seen = snapshot(refused_over_budget_10min=3, refused_over_budget_1min=1, budget_bytes=1 << 20)
-    assert memory.check_cache(ward.patient(seen)).state == "fail", "clients lack cells now"
-    assert memory.check_cache(ward.patient(snapshot(evictions=3))).state == "ok"
+    assert cells.check_cache(ward.patient(seen)).state == "fail", "clients lack cells now"
+    assert cells.check_cache(ward.patient(snapshot(evictions=3))).state == "ok"
+
+
+DRIVING = {
+    "prefetch_budget_bytes": 512 << 20,
+    "budget_bytes": 1 << 30,
+    "ride_out_ns": 10 * S,
+    "hits_10min": 4000,
+}
+SMALLER = "give the clients a smaller radius or a layer with fewer bytes"
+ROUTES = (
+    "give the daemon more --workers, and have clients send their route (MapWindow.move_to(route=...)):"
+    " without one the daemon cannot know where they turn"
+)
+WAITED = "moving clients waited for 150 cells in the last 10 min"
+
+
+@pytest.mark.parametrize(
+    ("counters", "state", "fact", "advice"),
+    [
+        ({}, "ok", "off; moving clients waited for no cell in the last 10 min", ""),
+        (
+            {"cells_late_10min": 2},
+            "ok",
+            "off; moving clients waited for 2 cells in the last 10 min",
+            "raise --prefetch-share",
+        ),
+        (DRIVING, "ok", "moving clients waited for no cell in the last 10 min", ""),
+        (
+            DRIVING | {"last_outage_ns": 60 * S, "prefetch_short": 2},
+            "ok",
+            "moving clients waited for no cell in",
+            "",
+        ),
+        (  # two in a hundred
+            DRIVING | {"cells_late_10min": 100, "misses_10min": 1000, "prefetch_short": 1},
+            "ok",
+            "moving clients waited for 100 cells in the last 10 min",
+            "",
+        ),
+        (
+            DRIVING | {"origin_out": 1, "last_outage_ns": 3 * S, "cells_late_10min": 1},
+            "warn",
+            "the map's storage is out of reach: no load has succeeded for 3.0 s; moving clients waited for 1",
+            "see to its disk or network; `shmmap tail` says why loads fail",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 1, "last_outage_ns": 13 * S + 1},
+            "warn",
+            "moving clients waited for 1 cell in the last 10 min; the map's storage was out of reach for 13",
+            "raise --ride-out (14)",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 150, "prefetch_short": 1},
+            "warn",
+            f"{WAITED}; cells fetched ahead take all of their share, 512 MiB",
+            f"raise --prefetch-share or --budget, or {SMALLER}",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 150, "prefetch_short": 2},
+            "warn",
+            f"{WAITED}; the budget of 1.0 GiB is full of what is in use or needed sooner",
+            f"raise --budget, or {SMALLER}",
+        ),
+        (
+            DRIVING | {"cells_late_10min": 150, "misses_10min": 1000},
+            "warn",
+            WAITED,
+            ROUTES,
+        ),
+    ],
+)
+def test_whether_prefetching_keeps_up(
+    ward: Ward, counters: dict[str, int], state: str, fact: str, advice: str
+) -> None:
+    assert set(counters) <= set(COUNTER_NAMES)
+    seen = snapshot()
+    seen.counters.update(counters)
+    found = cells.check_prefetching(ward.patient(seen))
+    assert (found.state, found.advice) == (state, advice)
+    assert found.fact.startswith(fact)
+    assert cells.check_prefetching(ward.patient()).skipped, "no daemon runs"
 
 
 def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -402,9 +485,9 @@ def test_readers_whose_requests_take_much_time_are_named(ward: Ward, monkeypatch
 def test_chunks_of_a_daemon_that_does_not_run_are_no_rubbish(ward: Ward) -> None:
     ward.file("/dev/shm/shmmap-live.default.lidar.-1_0_0.8", "x")
     ward.file("/dev/shm/shmmap-live.default.lidar.undo", "x")
-    found = lifetime.check_leftovers(ward.patient())
+    found = daemon.check_leftovers(ward.patient())
     assert (found.state, "default: 1 segment" in found.fact, " rm " in found.advice) == ("warn", True, False)
-    assert lifetime.check_leftovers(ward.patient(snapshot())).state == "ok"
+    assert daemon.check_leftovers(ward.patient(snapshot())).state == "ok"
 
 
 def test_a_daemon_that_keeps_live_maps_alone_needs_no_map(ward: Ward) -> None:
@@ -416,12 +499,12 @@ def test_a_daemon_that_keeps_live_maps_alone_needs_no_map(ward: Ward) -> None:
 
 def test_pins_on_a_real_tmpfs(monkeypatch: pytest.MonkeyPatch) -> None:
     patient = Patient(Machine(), DaemonConfig(), "", "", snapshot("absent"))
-    assert kernel.check_pins(patient).state == "ok"
+    assert daemon.check_pins(patient).state == "ok"
     monkeypatch.setenv("SHMMAP_TEST_PINS", "locks")
-    found = kernel.check_pins(patient)
+    found = daemon.check_pins(patient)
     assert (found.state, "locks of clients" in found.fact) == ("warn", True)
     missing = Patient(Machine(), DaemonConfig(shm_dir="/no/such/directory"), "", "", snapshot("absent"))
-    assert kernel.check_pins(missing).state == "fail"
+    assert daemon.check_pins(missing).state == "fail"
 
 
 @pytest.mark.parametrize(("hard", "state"), [("1024", "warn"), ("65536", "ok"), ("unlimited", "ok")])
@@ -429,7 +512,7 @@ def test_descriptors_of_the_daemon(ward: Ward, hard: str, state: str) -> None:
     ward.file(
         "/proc/4242/limits", f"Limit  Soft Limit  Hard Limit\nMax open files   1024    {hard}    files\n"
     )
-    found = kernel.check_descriptors(ward.patient(snapshot()))
+    found = daemon.check_descriptors(ward.patient(snapshot()))
     assert found.state == state
     assert "pid 4242" in found.fact
 
@@ -475,7 +558,7 @@ def test_a_socket_that_waits_for_the_first_client(tmp_path: Path) -> None:
         listener.setblocking(False)
         assert (bound_alone, patient.awaits_first_client) == (False, True)
         assert not dataclasses.replace(patient, seen=snapshot()).awaits_first_client
-        assert access.check_socket(patient).state == lifetime.check_daemon(patient).state == "ok"
+        assert access.check_socket(patient).state == daemon.check_daemon(patient).state == "ok"
         with pytest.raises(BlockingIOError):
             listener.accept()
 
@@ -514,7 +597,7 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
     assert access.check_map_access(patient).state == "fail"
 
 
-# --- lifetime ---
+# --- daemon ---
 
 
 @pytest.mark.parametrize(
@@ -529,23 +612,23 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
     ],
 )
 def test_the_daemon(ward: Ward, seen: Snapshot, state: str) -> None:
-    assert lifetime.check_daemon(ward.patient(seen)).state == state
+    assert daemon.check_daemon(ward.patient(seen)).state == state
 
 
 def test_statistics_of_others(ward: Ward) -> None:
     patient = dataclasses.replace(ward.patient(), seen=None, unreadable="no")
-    assert lifetime.check_daemon(patient).state == "warn"
+    assert daemon.check_daemon(patient).state == "warn"
 
 
 def test_leftovers(ward: Ward) -> None:
-    assert lifetime.check_leftovers(ward.patient()).fact == "none"
+    assert daemon.check_leftovers(ward.patient()).fact == "none"
     ward.file("/dev/shm/shmmap.default.0123456789abcdef", "x" * 5000)
     ward.file("/dev/shm/shmmap.default.statistics", "x")
-    found = lifetime.check_leftovers(ward.patient())
+    found = daemon.check_leftovers(ward.patient())
     assert (found.state, "default: 1 segment, 8.0 KiB" in found.fact) == ("warn", True)
-    assert lifetime.check_leftovers(ward.patient(snapshot())).state == "ok"
+    assert daemon.check_leftovers(ward.patient(snapshot())).state == "ok"
     ward.file("/dev/shm/shmmap.no-such-instance.0123456789abcdef.zombie", "x")
-    found = lifetime.check_leftovers(ward.patient(snapshot()))
+    found = daemon.check_leftovers(ward.patient(snapshot()))
     assert (found.state, "no-such-instance" in found.fact) == ("warn", True)
 
 
@@ -577,21 +660,21 @@ def test_logind(ward: Ward, files: dict[str, str], state: str) -> None:
     (ward.root / "run/systemd/system").mkdir(parents=True)
     for name, text in files.items():
         ward.file(name, text)
-    assert lifetime.check_logind(ward.patient()).state == state
-    assert lifetime.check_logind(ward.patient(uid=995)).state == "ok"
+    assert daemon.check_logind(ward.patient()).state == state
+    assert daemon.check_logind(ward.patient(uid=995)).state == "ok"
 
 
 def test_logind_without_systemd(ward: Ward) -> None:
-    assert lifetime.check_logind(ward.patient()).state == "ok"
+    assert daemon.check_logind(ward.patient()).state == "ok"
 
 
 def test_reloads(ward: Ward) -> None:
-    assert lifetime.check_reload(ward.patient()).state == "ok"
-    once = lifetime.check_reload(ward.patient(snapshot(reloads=0)))
+    assert daemon.check_reload(ward.patient()).state == "ok"
+    once = daemon.check_reload(ward.patient(snapshot(reloads=0)))
     assert once.fact == "the map was read once, at the start"
-    again = lifetime.check_reload(ward.patient(snapshot(reloads=3)))
+    again = daemon.check_reload(ward.patient(snapshot(reloads=3)))
     assert again.fact == "the map was read at the start and 3 times again"
-    found = lifetime.check_reload(ward.patient(snapshot(last_reload_failed=1, last_reload_unix_ns=1)))
+    found = daemon.check_reload(ward.patient(snapshot(last_reload_failed=1, last_reload_unix_ns=1)))
     assert (found.state, "shmmap reload" in found.advice) == ("fail", True)
 
 

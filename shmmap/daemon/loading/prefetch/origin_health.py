@@ -30,15 +30,14 @@ class OriginHealth:
         The longest that one of these took, seconds: about how long nothing has answered.
     unreachable
         It is known otherwise that it does not answer.
-    slow_s, mean_s
-        Time that few of the last loads exceeded (5 %), and their mean time; 0 before the first.
+    slow_s
+        Time that few of the last loads exceeded (5 %); 0 before the first.
     """
 
     failed_in_a_row: int = 0
     waited_s: float = 0.0
     unreachable: bool = False
     slow_s: float = 0.0
-    mean_s: float = 0.0
     _took_s: deque[float] = field(default_factory=lambda: deque(maxlen=LOADS))
     _tried_s: float = -math.inf
 
@@ -68,5 +67,4 @@ class OriginHealth:
         self._took_s.append(took_s)
         ordered = sorted(self._took_s)
         self.slow_s = ordered[(len(ordered) * 19) // 20]
-        self.mean_s = sum(ordered) / len(ordered)
         return again

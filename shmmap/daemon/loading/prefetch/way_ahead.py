@@ -66,8 +66,6 @@ class WayAhead:
         How far ahead the pass has come.
     over
         Whether it has come to the end of what is looked at.
-    needed_per_m
-        How many cells come into the area for each metre that the client moves.
     """
 
     motion: Motion
@@ -76,12 +74,10 @@ class WayAhead:
     ahead_m: float = 0.0
     over: bool = True
     began_s: float = -math.inf
-    needed_per_m: float = 0.0
     _inside: NDArray[np.intp] | None = None
     _travelled_m: float = 0.0
     _jumps: int = -1
     _found: deque[tuple[float, int]] = field(default_factory=deque)
-    _entered: tuple[float, int] = (0.0, 0)
 
     def asks(self, area: Area, layers: tuple[str, ...]) -> None:
         """The client asked for this."""
@@ -104,9 +100,6 @@ class WayAhead:
         self._inside = None
         self._found.clear()
         self._travelled_m, self._jumps = self.motion.travelled_m, self.motion.jumps
-        if self._entered[0]:
-            self.needed_per_m = self._entered[1] / self._entered[0]
-        self._entered = (0.0, 0)
 
     def first(self) -> tuple[float, int] | None:
         """What is needed next of what was found: in how many seconds, and its index; None if all is taken."""
@@ -145,8 +138,6 @@ class WayAhead:
         new = np.setdiff1d(inside, self._inside, assume_unique=True)
         needed_m = motion.travelled_m + here_m
         self._found.extend((needed_m, index) for index in new.tolist())
-        metres, cells = self._entered
-        self._entered = metres + self.ahead_m - here_m, cells + len(new)
         self._inside = inside
 
     def _known(self, catalogue: CatalogueView, area: Area, needed_in_s: float) -> NDArray[np.intp]:

@@ -13,6 +13,7 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.cli.screens.live_maps import status_lines
 from shmmap.cli.screens.live_scene import chunk_squares
 from shmmap.cli.screens.map_scene import GLYPHS, Scene, html_page, svg, terminal_rows
+from shmmap.cli.screens.prefetching import prefetch_as_json
 from shmmap.cli.screens.top_screen import budget_parts, screen
 from shmmap.client.live.chunk_reader import ChunkInfo
 from shmmap.statistics.cell_rows import CellRow
@@ -114,29 +115,37 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
 
 
 DRIVING = FULL | counters(
-    prefetch_budget_bytes=50 * MIB, moving_clients=1, routed_clients=1, fastest_mm_per_s=12_000,
-    ahead_ns=4 * 10**9, ride_out_ns=10**10, needed_per_1000s=14_100, loadable_per_1000s=17_500,
-    most_workers=8,
+    prefetch_budget_bytes=50 * MIB, ride_out_ns=10**10, last_outage_ns=2 * 10**9,
     prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, cells_late=7, cells_late_1min=2,
     bytes_loaded=105, bytes_used=100, budget_bytes=100 * MIB,
 )  # fmt: skip
 
 
 @pytest.mark.parametrize("width", [60, 100])
-def test_whether_cells_are_there_before_clients_come_to_them(width: int) -> None:
+def test_what_was_prefetched_and_what_of_it_was_used(width: int) -> None:
     found = snapshot(FULL | {name: value for name, value in DRIVING.items() if value}, [])
     shown = text(found, width=width)
     assert max(map(len, shown.splitlines())) <= width
-    for piece in (
-        "ahead NOT ENOUGH: clients need 14 loads/s at 12.0 m/s, loaders can do 18 loads/s",
-        "give the daemon more --workers (9), or the clients a smaller radius or a layer with fewer bytes",
-        "fetched ahead 120 then asked for 100 in vain 3 late 7 (2 in 1 min) loaded 1.05 times what was used",
-    ):
-        assert piece in " ".join(shown.split()), piece
-    quiet = " ".join(text(snapshot(FULL, []), width=width).split())
-    assert "ahead off load" not in quiet
-    assert "ahead off requests" in quiet
-    assert "fetched ahead" not in quiet
+    words = (
+        "prefetch 120 fetched ahead 100 then asked for 3 in vain prefetch misses 7 (2 in 1 min)"
+        " loaded 1.05 times what was used"
+    )
+    assert words in " ".join(shown.split())
+    quiet = text(snapshot(FULL, []), width=width)
+    assert "prefetch" not in quiet
+    assert "origin" not in quiet
+    away = text(snapshot(FULL | {"origin_out": 1, "last_outage_ns": 10**9 - 1}, []), width=width)
+    assert "origin out of reach for less than a second" in " ".join(away.split())
+
+
+def test_what_programs_are_told_of_prefetching() -> None:
+    assert prefetch_as_json(DRIVING) == {
+        "ride_out_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "cells_late": 7,
+        "prefetch_started": 120, "prefetch_used": 100, "prefetch_in_vain": 3, "prefetch_overtaken": 0,
+        "bytes_prefetched": 0, "over_fetch": 1.05,
+    }  # fmt: skip
+    of_an_earlier_version = prefetch_as_json({"hits": 3})
+    assert (of_an_earlier_version["cells_late"], of_an_earlier_version["over_fetch"]) == (0, None)
 
 
 def test_load_times_by_what_was_loaded() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.host.budget import choose_budget
+from shmmap.daemon.host.memory import choose_budget
 from shmmap.daemon.host.mounts import Mount
 from shmmap.daemon.live import place
 from shmmap.daemon.live.messages import Begin

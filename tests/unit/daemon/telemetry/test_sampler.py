@@ -1,21 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Beats while cells come and go write what has changed, and nothing else."""
+"""What the daemon measures at its beats, and what it writes of that."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from shmmap.daemon.telemetry.sampler import BEAT_S, CHANGE_BEAT_S, Sampler
-from shmmap.daemon.telemetry.session_rows import ROWS_AT_ONCE, SessionRows
+from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
+from shmmap.daemon.telemetry.sampler import (
+    BEAT_S,
+    CHANGE_BEAT_S,
+    CLIENT_ROWS_PER_BEAT,
+    RecentCounts,
+    Sampler,
+    SessionRows,
+)
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.statistics.client_rows import MAX_CLIENTS
 from tests.support import connections
 from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import Inner
+from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
-PARTS = 9
+S = 1_000_000_000
+PARTS = 8
 
 
 def beat(sampler: Sampler, now_s: float) -> int:
@@ -27,13 +38,17 @@ def beat(sampler: Sampler, now_s: float) -> int:
     return count
 
 
+def sampler_of(one: InnerDaemon, on_beat: Callable[[], None] = lambda: None) -> Sampler:
+    return Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), on_beat)
+
+
 def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_beat(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = inner(small_map.root)
     one.everything()
     whole: list[float] = []
-    sampler = Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), lambda: whole.append(now_s))
+    sampler = sampler_of(one, lambda: whole.append(now_s))
     written: list[str] = []
     write = one.statistics._write_row
 
@@ -63,7 +78,7 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
 def test_a_beat_takes_some_turns_and_goes_on_where_it_was(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     whole: list[float] = []
-    sampler = Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), lambda: whole.append(1.0))
+    sampler = sampler_of(one, lambda: whole.append(1.0))
     assert sampler.next_s <= 0.0
     sampler.turn(1000.0)
     assert (sampler.next_s, whole) == (0.0, [])
@@ -73,21 +88,65 @@ def test_a_beat_takes_some_turns_and_goes_on_where_it_was(inner: Inner, small_ma
     assert sampler.next_s == 1000.0 + BEAT_S
 
 
+def test_outages_of_the_storage(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    health = one.scheduler.prefetcher.prefetch.health
+    sampler, values = sampler_of(one), one.statistics.values
+
+    def measured(now_s: float) -> tuple[int, int, int, bool]:
+        beat(sampler, now_s)
+        is_dated = values["origin_out_since_unix_ns"] > 0
+        return values["origin_out"], values["origin_outages"], values["last_outage_ns"], is_dated
+
+    assert measured(100.0) == (0, 0, 0, False)
+    health.failed_in_a_row = IN_A_ROW
+    assert measured(101.0) == (1, 1, 0, True)
+    assert measured(105.0) == (1, 1, 4 * S, True)
+    health.ended(0.1, failed=False)
+    assert measured(106.0) == (0, 1, 5 * S, False)
+    assert measured(200.0) == (0, 1, 5 * S, False)
+    for _ in range(IN_A_ROW):
+        health.ended(3.0, failed=True)
+    assert measured(300.0) == (1, 2, 3 * S, True), "it was away when what has failed was begun"
+
+
+def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root, prefetch_share=0.5, ride_out_s=2.4)
+    sampler, values = sampler_of(one), one.statistics.values
+
+    def short(now_s: float) -> int:
+        beat(sampler, now_s)
+        return values["prefetch_short"]
+
+    assert short(1000.0) == 0
+    assert (values["prefetch_budget_bytes"], values["ride_out_ns"]) == (32 << 20, 2_400_000_000)
+    one.ledger.prefetched_bytes = 32 << 20
+    assert short(1001.0) == 1
+    one.ledger.prefetched_bytes = 0
+    one.scheduler.prefetcher.full(1002.0)
+    assert short(1002.0) == 2
+    off = inner(small_map.root, name="off")
+    beat(sampler_of(off), 1000.0)
+    assert (off.statistics.values["prefetch_budget_bytes"], off.statistics.values["prefetch_short"]) == (0, 0)
+
+
 def test_rows_of_many_clients_are_made_anew_a_few_at_a_time() -> None:
     """The oldest ones first, and only of those that changed."""
     sessions, rows = Sessions(), SessionRows()
-    clients = [sessions.open(connections.of(), f"{number}", 0.0) for number in range(2 * ROWS_AT_ONCE + 8)]
+    clients = [
+        sessions.open(connections.of(), f"{number}", 0.0) for number in range(2 * CLIENT_ROWS_PER_BEAT + 8)
+    ]
     shown = [len(rows.of(sessions)) for _ in range(4)]
-    assert shown == [ROWS_AT_ONCE, 2 * ROWS_AT_ONCE, len(clients), len(clients)]
+    assert shown == [CLIENT_ROWS_PER_BEAT, 2 * CLIENT_ROWS_PER_BEAT, len(clients), len(clients)]
     before = rows.of(sessions)
     clients[-1].requests = 7
     assert [new is old for new, old in zip(rows.of(sessions), before, strict=True)].count(False) == 1
     for client in clients:
         client.requests += 1
     requests = [(row.requests, one.requests) for row, one in zip(rows.of(sessions), clients, strict=True)]
-    assert [told == now for told, now in requests].count(True) == ROWS_AT_ONCE
+    assert [told == now for told, now in requests].count(True) == CLIENT_ROWS_PER_BEAT
     for _ in range(2):
-        for client in clients[:ROWS_AT_ONCE]:
+        for client in clients[:CLIENT_ROWS_PER_BEAT]:
             client.requests += 1  # these ask all the time
         rows.of(sessions)
     assert all(row.requests for row in rows.of(sessions)), "the others have their turn"
@@ -100,3 +159,28 @@ def test_more_clients_than_there_are_rows() -> None:
     for _ in range(MAX_CLIENTS + 5):
         sessions.open(connections.of(), "", 0.0)
     assert [len(rows.of(sessions)) for _ in range(5)] == [64, 128, 192, MAX_CLIENTS, MAX_CLIENTS]
+
+
+@given(st.lists(st.tuples(st.floats(0.01, 30.0), st.integers(0, 5)), max_size=200))
+def test_growth_over_a_span_is_right_to_a_second(steps: list[tuple[float, int]]) -> None:
+    recent = RecentCounts(("hits",), (10.0, 60.0))
+    now_s, total = 100.0, 3
+    history = [(now_s, total)]
+    recent.look({"hits": total}, now_s)
+    for wait_s, more in steps:
+        now_s, total = now_s + wait_s, total + more
+        history.append((now_s, total))
+        recent.look({"hits": total}, now_s)
+        for span, (growth,) in zip((10.0, 60.0), recent.growth({"hits": total}, now_s), strict=True):
+            inside = total - max((v for t, v in history if t <= now_s - span), default=3)
+            early = [t for t, _ in history if t <= now_s - span]
+            # a look less than a second after the one before is not remembered
+            outer = total - max((v for t, v in history if t <= (early[-1] if early else 0) - 1.0), default=3)
+            assert inside <= growth <= outer
+
+
+def test_the_longest_span_is_remembered() -> None:
+    recent = RecentCounts(("hits",), (600.0,))
+    for second in range(2000):
+        recent.look({"hits": second}, float(second))
+    assert recent.growth({"hits": 1999}, 1999.0) == [(600,)]

@@ -17,6 +17,7 @@ from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
 from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, KEPT, MOST_WAYS
 from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
+from shmmap.protocol.events import Loaded, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
 from tests.support.daemon_process import stop
 from tests.support.divided_map import DividedMap, make_map
@@ -372,3 +373,40 @@ def test_a_cell_that_can_never_fit_keeps_no_other_one_out(
     there = {Path(resident.key.cell_id).name for resident in one.ledger.residents()}
     assert "-300_0.pcd" not in there
     assert {"-300_-20.pcd", "-280_0.pcd"} <= there
+
+
+def shown_ahead(one: InnerDaemon) -> dict[str, bool]:
+    """Return of each cell that the statistics show whether it was fetched ahead."""
+    rows = {**one.statistics._missing, **one.statistics._changed}
+    return {row.id: row.ahead for row in rows.values()}
+
+
+def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
+    inner: Inner, small_map: DividedMap
+) -> None:
+    one: InnerDaemon = inner(small_map.root, prefetch_share=0.5, ride_out_s=2.4, workers=2)
+    session = one.session()
+    route = ((-40.0, 0.0), (40.0, 0.0))
+    says(session, Intent(-30.0, 0.0, 5.0, 0.0, None, route), one.now_s())
+    one.ask(session, Area(1, CircleMessage(-30.0, 0.0, 6.0), wait=30.0))
+    assert len(one.cells_of(1).cells) == 2
+    one.run_until(lambda: count(one, "loads_finished") >= 8)
+    events = [decode_event(raw) for _, raw in one.event_log._kept]
+    loaded = {event.id: event.ahead for event in events if isinstance(event, Loaded)}
+    asked_for = {"-40_-20.pcd", "-40_0.pcd"}
+    wished = {"-20_-20.pcd", "-20_0.pcd", "0_-20.pcd", "0_0.pcd", "20_-20.pcd", "20_0.pcd"}
+    assert loaded == dict.fromkeys(asked_for, False) | dict.fromkeys(wished, True)
+    assert shown_ahead(one) == loaded
+    one.ask(one.session(), Selected(2, ("0_0.pcd",), wait=30.0))
+    assert len(one.cells_of(2).cells) == 1
+    for resident in one.cache.used:
+        one.cache.rows.show(resident, "resident")
+    assert shown_ahead(one) == loaded | {"0_0.pcd": False}
+    assert [count(one, name) for name in ("prefetch_started", "prefetch_used", "cells_late")] == [6, 1, 0]
+    assert count(one, "bytes_loaded") == 8 * count(one, "bytes_used") // 3, (
+        "of eight of one size three are used"
+    )
+    unused = next(r for r in one.ledger.residents() if r.key.cell_id.endswith("/20_0.pcd"))
+    one.reclaimer.retire(unused, one.now_s(), "request")
+    one.reclaimer.sweep(one.now_s())
+    assert count(one, "prefetch_in_vain") == 1

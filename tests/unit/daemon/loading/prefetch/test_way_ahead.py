@@ -239,14 +239,6 @@ def test_of_an_area_with_very_many_cells_nothing() -> None:
     assert looked(way, catalogue=huge) == []
 
 
-def test_how_many_cells_are_needed_for_a_metre() -> None:
-    """2 r + c for c squared of a dense map, as one expects."""
-    way = way_of(driving(10.0, (-10.0, 0.0), (1500.0, 0.0)), Circle(0.0, 0.0, 200.0))
-    looked(way, AHEAD._replace(way_s=80.0))
-    way.begin(1.0)
-    assert way.needed_per_m == pytest.approx((400.0 + 20.0) / 20.0**2, rel=0.1)
-
-
 hostile = st.floats(allow_nan=False, allow_infinity=False)
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One daemon per instance: whoever binds takes a live socket's place, so a lock comes first."""
+"""An instance's places: the directory of its sockets, its lock, and the removal of its names.
+
+One daemon per instance: binding takes the place of a live socket, so a lock comes first.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,52 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from shmmap.errors import InstanceBusy, ShmmapError
+from shmmap.daemon.host.signals import StartSignals
+from shmmap.errors import CannotStart, InstanceBusy, ShmmapError
+from shmmap.logfmt import log
+from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
+from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.names import segment_prefix, statistics_name
 from shmmap.segment.taken_name import name_taken
+from shmmap.statistics.exclusive_name import has_writer
 
-__all__ = ["InstanceLock"]
+__all__ = ["InstanceLock", "lock_path", "make_runtime_dir", "stopped_early", "take_away"]
+
+
+def make_runtime_dir(path: Path, gid: int) -> None:
+    """Make the directory of the socket, for the owner and, where there is one, the group.
+
+    Raises
+    ------
+    CannotStart
+        It cannot be made, or in /tmp another account has made it.
+    """
+    if str(path) == fallback_runtime_dir():
+        _make_private(path)
+        return
+    if path.is_dir():
+        return
+    try:
+        path.mkdir(mode=0o750 if gid >= 0 else 0o700, parents=True, exist_ok=True)
+        if gid >= 0:
+            os.chown(path, -1, gid)
+    except OSError as error:
+        raise CannotStart(
+            f"runtime directory {path}: {error.strerror}", hint="make it, or give another --runtime-dir"
+        ) from error
+
+
+def _make_private(path: Path) -> None:
+    """Make the directory in /tmp that is used without ``XDG_RUNTIME_DIR``, for the owner alone."""
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    if why := why_not_private(str(path)):
+        raise CannotStart(
+            f"runtime directory {path}: {why}",
+            hint="see whose it is and remove it, or set XDG_RUNTIME_DIR, or give --runtime-dir",
+        )
+    log.info("runtime directory", path=path, reason="XDG_RUNTIME_DIR is not set")
+
 
 _OTHERWISE: Final = "choose another --instance or --runtime-dir"
 
@@ -25,14 +70,14 @@ class InstanceLock:
     Parameters
     ----------
     path
-        It says the process id, for the message to whoever comes second.
+        It says the process id, for the message to a second daemon.
     check
         Raises what else hinders the daemon, once the lock is held and before the file is changed.
 
     Raises
     ------
     InstanceBusy
-        Somebody holds it; the message names the process.
+        Another process holds it; the message names that.
     CannotStart
         The file cannot be made, or is another user's or another program's.
     """
@@ -89,9 +134,36 @@ class InstanceLock:
     def release(self) -> None:
         """Remove the file and let the next daemon in.
 
-        If somebody removed it meanwhile, the file of this name is another daemon's and stays.
+        If another program removed it meanwhile, the file of this name is another daemon's and stays.
         """
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.stat(self.path), os.fstat(self._fd)):
                 os.unlink(self.path)
         os.close(self._fd)
+
+
+def lock_path(socket_path: str) -> str:
+    """Return the path of the lock that says whose the request socket is."""
+    return socket_path.removesuffix(".sock") + ".lock"
+
+
+def take_away(directory: ShmDirectory, instance: str) -> None:
+    """Remove the instance's names."""
+    for name in directory.names(segment_prefix(instance)):
+        with contextlib.suppress(OSError):
+            os.unlink(directory.path + name)
+
+
+def stopped_early(
+    signals: StartSignals,
+    directory: ShmDirectory,
+    instance: str,
+    kind: type[BaseException] | None,
+    *_: object,
+) -> None:
+    """Remove the names at a stop that came before there was anything but what the previous run left.
+
+    They stay if a daemon with another runtime directory has begun to serve from them meanwhile.
+    """
+    if kind is SystemExit and not signals.keep and not has_writer(directory, statistics_name(instance)):
+        take_away(directory, instance)

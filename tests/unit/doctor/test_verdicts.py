@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from shmmap.doctor.cache_size import cache_verdict
+from shmmap.doctor.verdicts import cache_verdict
 from shmmap.statistics.counters import COUNTERS
 
 MIB = 1 << 20

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the cache too small?  One sentence, which ``status``, ``top`` and ``doctor`` all say."""
+"""What the counters alone say: whether the cache is too small, how long the storage is out of reach.
+
+``status``, ``top`` and ``doctor`` say it in the same words.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from shmmap.quantities import format_bytes
+from shmmap.quantities import format_bytes, format_duration
 
-__all__ = ["Verdict", "cache_verdict"]
+__all__ = ["Verdict", "cache_verdict", "outage_so_far"]
 
 AGAIN_SHARE: Final = 0.05
 AGAIN_COUNT: Final = 10
@@ -68,3 +71,9 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
             False, f"nothing evicted for room or refused in the last 10 min ({before} since the start)"
         )
     return Verdict(False, "nothing evicted for room, nothing refused")
+
+
+def outage_so_far(counters: Mapping[str, int]) -> str:
+    """Return how long the map's storage is out of reach: ``"less than a second"``, ``"5.0 s"``."""
+    outage_s = counters.get("last_outage_ns", 0) * 1e-9
+    return "less than a second" if outage_s < 1.0 else format_duration(outage_s)

@@ -1,24 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What outlives a daemon or does not: leftovers, the session manager, reloads, upgrades."""
+"""The daemon: does it run, could it read the map, what outlives it, does the kernel give what it needs."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import pwd
 import re
+import resource
 import time
 from typing import Final
 
 import shmmap
+from shmmap.daemon.host.groups import account_name
+from shmmap.daemon.pins.probe import probe_pins
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient, answering_at
-from shmmap.errors import ShmmapError
+from shmmap.errors import CannotStart, ShmmapError
 from shmmap.quantities import counted, format_bytes
+from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
 
-__all__ = ["check_daemon", "check_leftovers", "check_logind", "check_reload"]
+__all__ = [
+    "check_daemon",
+    "check_descriptors",
+    "check_leftovers",
+    "check_logind",
+    "check_pins",
+    "check_reload",
+]
 
 SYSTEM_UIDS: Final = 999
 """logind spares the accounts below (SYS_UID_MAX, as Debian, Ubuntu, Fedora and systemd itself have it)."""
@@ -165,10 +175,7 @@ def check_logind(patient: Patient) -> Finding:
         return ok(name, "no systemd here: nothing is deleted at logout")
     if _logind_setting(machine, "RemoveIPC").lower() in ("no", "0", "false", "off"):
         return ok(name, "logind has RemoveIPC=no: segments outlive sessions")
-    try:
-        account = pwd.getpwuid(uid).pw_name
-    except KeyError:
-        account = str(uid)
+    account = account_name(uid)
     if machine.path(f"/var/lib/systemd/linger/{account}").exists():
         return ok(name, f"{account} lingers: segments outlive sessions")
     return warn(
@@ -199,3 +206,49 @@ def check_reload(patient: Patient) -> Finding:
             "`shmmap reload` says why",
         )
     return ok(name, fact)
+
+
+FEW_DESCRIPTORS: Final = 4096
+_LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
+
+
+def check_pins(patient: Patient) -> Finding:
+    """Can the kernel tell which processes map a segment?"""
+    name = "leases"
+    try:
+        directory = ShmDirectory(patient.shm_dir)
+    except CannotStart as error:
+        if patient.alive:
+            return ok(name, "tried by the daemon when it started: see `shmmap status`")
+        return fail(name, error.message, error.hint)
+    try:
+        found = probe_pins(directory)
+    finally:
+        directory.close()
+    if not found.leases:
+        return warn(
+            name,
+            f"{patient.shm_dir} grants none: memory in use is known from {found.source.value} only",
+            "name a directory on a tmpfs with shm_dir",
+        )
+    parts = {"locks": found.locks, "inotify": found.close_events}
+    if lacking := ", ".join(f"no {part}" for part, works in parts.items() if not works):
+        return warn(
+            name,
+            f"they work, but not all of what goes with them: {lacking}",
+            "clients may stay unnamed, or memory be freed late: use a newer kernel",
+        )
+    return ok(name, "leases and locks work: the kernel tells which processes map a segment")
+
+
+def check_descriptors(patient: Patient) -> Finding:
+    """How many clients does the limit of open files allow?"""
+    limits = _LIMIT.search(patient.machine.text(f"/proc/{patient.pid}/limits")) if patient.pid else None
+    hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+    whose = f"of the daemon (pid {patient.pid})" if limits else "here"
+    if not hard.isdigit() or int(hard) < 0:
+        return ok("open files", f"no limit {whose}")
+    fact = f"limit {whose}: {hard}, enough for {int(hard) // 2} clients"
+    if int(hard) < FEW_DESCRIPTORS:
+        return warn("open files", fact, "raise it: LimitNOFILE=65536 in the unit, or `ulimit -Hn`")
+    return ok("open files", fact)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One daemon per instance, whatever becomes of the lock's file."""
+"""One daemon per instance, whatever becomes of the lock's file; what a stop before serving takes away."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.host.instance_lock import InstanceLock
+from shmmap.daemon.host.instance import InstanceLock, stopped_early
+from shmmap.daemon.host.signals import StartSignals
 from shmmap.errors import CannotStart, InstanceBusy
+from shmmap.segment.directory import ShmDirectory
+from shmmap.statistics.exclusive_name import hold, take_name
 
 HOLDER = """
 import sys
-from shmmap.daemon.host.instance_lock import InstanceLock
+from shmmap.daemon.host.instance import InstanceLock
 lock = InstanceLock(sys.argv[1])
 print("locked", flush=True)
 sys.stdin.readline()
@@ -169,3 +173,48 @@ def test_another_user_s_file_is_no_daemon(tmp_path: Path, held: bool) -> None:
     assert failure.value.message == f"the lock file cannot be {path}: there is a file of uid 12345"
     assert failure.value.hint.startswith(f"see whose it is and remove it: `sudo rm {path}`; or ")
     assert path.read_text() == "1\n"
+
+
+LEFT = "shmmap.unit.0123456789abcdef"
+
+
+@pytest.fixture
+def signals() -> StartSignals:
+    """Return signals of a daemon that starts; this process keeps its own handlers."""
+    one = StartSignals.__new__(StartSignals)
+    one.keep = False
+    return one
+
+
+@pytest.fixture
+def shm(tmp_path: Path) -> Iterator[ShmDirectory]:
+    directory = ShmDirectory(str(tmp_path))
+    yield directory
+    directory.close()
+
+
+def test_what_an_earlier_life_left(shm: ShmDirectory, signals: StartSignals) -> None:
+    for name in (LEFT, "shmmap.unit.statistics", "shmmap.another.0123456789abcdef"):
+        Path(shm.path, name).touch()
+    stopped_early(signals, shm, "unit", None)
+    stopped_early(signals, shm, "unit", RuntimeError)
+    assert len(os.listdir(shm.path)) == 3
+    signals.keep = True
+    stopped_early(signals, shm, "unit", SystemExit)
+    assert len(os.listdir(shm.path)) == 3
+    signals.keep = False
+    stopped_early(signals, shm, "unit", SystemExit)
+    assert os.listdir(shm.path) == ["shmmap.another.0123456789abcdef"]
+
+
+def test_the_names_of_a_daemon_that_serves_stay(shm: ShmDirectory, signals: StartSignals) -> None:
+    """Both found them free, and the other one was quicker."""
+    Path(shm.path, LEFT).touch()
+    fd = shm.create()
+    hold(fd)
+    take_name(shm, "unit", fd)
+    stopped_early(signals, shm, "unit", SystemExit)
+    assert sorted(os.listdir(shm.path)) == [LEFT, "shmmap.unit.statistics"]
+    os.close(fd)
+    stopped_early(signals, shm, "unit", SystemExit)
+    assert os.listdir(shm.path) == []

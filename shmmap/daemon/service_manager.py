@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The service manager (systemd): what the daemon reports to it, and the socket that it hands over.
+
+The watchdog is fed from the serving loop and from nowhere else, so that a loop that hangs is noticed.  While
+a reload runs the service is "reloading": systemd wants RELOADING=1 together with MONOTONIC_USEC (newer
+versions fail the reload without it) and READY=1 when it is over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping, MutableMapping
+from types import TracebackType
+from typing import Final, NamedTuple
+
+from shmmap.errors import ConfigError
+
+__all__ = [
+    "FIRST_FD",
+    "ActivatedSocket",
+    "MoreTime",
+    "ServiceManager",
+    "notify",
+    "status_line",
+    "take_activated_socket",
+    "watchdog_interval_s",
+]
+
+STATUS_EVERY_S: Final = 2.0
+"""Each status line wakes those who listen to the service manager: not at every beat."""
+
+
+def notify(*lines: str) -> None:
+    """Send ``KEY=value`` lines to ``NOTIFY_SOCKET`` (sd_notify(3)), if there is one.
+
+    A line break inside a value (a path may have one) becomes a blank: it would start another line.
+    """
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
+    ):
+        text = "\n".join(line.replace("\n", " ") for line in lines)
+        channel.sendto(text.encode(errors="replace"), re.sub("^@", "\0", address))
+
+
+def watchdog_interval_s(environ: Mapping[str, str]) -> float:
+    """Return the seconds between two signs of life; infinite where the service manager wants none.
+
+    A third of ``WATCHDOG_USEC``: sd_watchdog_enabled(3) recommends half of it at most, and one may
+    be late.
+    """
+    text, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
+    if not text.isdigit() or int(text) <= 0 or (pid and pid != str(os.getpid())):
+        return math.inf
+    return int(text) * 1e-6 / 3
+
+
+def status_line(
+    *, resident: int, cells: int, used_bytes: int, budget_bytes: int, clients: int, failed: int
+) -> str:
+    """Return what ``systemctl status`` shows: ``"212 of 4096 cells, 3.1 of 6.0 GiB, 5 clients"``."""
+    unit, name = (1 << 30, "GiB") if budget_bytes >= 1 << 30 else (1 << 20, "MiB")
+    line = (
+        f"{resident} of {cells} cells, {used_bytes / unit:.1f} of {budget_bytes / unit:.1f} {name},"
+        f" {clients} client{'' if clients == 1 else 's'}"
+    )
+    return f"{line}, {failed} failed load{'' if failed == 1 else 's'}" if failed else line
+
+
+class ServiceManager:
+    """Speaks to the service manager; says nothing where there is none.
+
+    Parameters
+    ----------
+    environ
+        Of this process: ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` count.
+    tell
+        Sends lines ``KEY=value``.
+    """
+
+    def __init__(self, environ: Mapping[str, str] = os.environ, tell: Callable[..., None] = notify) -> None:
+        self._tell = tell
+        self._feed_every_s = watchdog_interval_s(environ)
+        self._feed_at_s = 0.0 if math.isfinite(self._feed_every_s) else math.inf
+        self._status = ""
+        self._status_s = -math.inf
+        self._reloads = 0
+
+    def ready(self, status: str) -> None:
+        """Report that serving starts."""
+        self._tell("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
+
+    def beat(self, now_s: float, status: Callable[[], str]) -> None:
+        """Feed the watchdog and send a new status line; the serving loop calls it a few times a second."""
+        if now_s >= self._feed_at_s:
+            self._feed_at_s = now_s + self._feed_every_s
+            self._tell("WATCHDOG=1")
+        if not self._reloads and now_s - self._status_s >= STATUS_EVERY_S:
+            self._status_s = now_s
+            line = status()
+            if line != self._status:
+                self._status = line
+                self._tell(f"STATUS={line}")
+
+    def reloading(self) -> None:
+        """Report that the map is being read again; each call is followed by one of `reloaded`."""
+        self._reloads += 1
+        now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+        self._tell("RELOADING=1", f"MONOTONIC_USEC={now_us}", "STATUS=reading the map again")
+
+    def reloaded(self, outcome: str) -> None:
+        """Report that the map was read again, or could not be; ready once no other reload runs."""
+        self._reloads -= 1
+        self._status = ""
+        if not self._reloads:
+            self._tell("READY=1", f"STATUS={outcome}")
+
+    def stopping(self, why: str) -> None:
+        """Report that serving ends."""
+        self._tell("STOPPING=1", f"STATUS={why}")
+
+    def failed(self, message: str) -> None:
+        """Report that serving cannot start; the message stays visible in ``systemctl status``."""
+        self._tell(f"STATUS={message}")
+
+
+EXTEND_EVERY_S: Final = 20.0
+EXTEND_S: Final = 60.0
+MAX_START_S: Final = 3600.0
+"""A start that takes longer hangs; starting again may help."""
+
+
+class MoreTime:
+    """While its ``with`` block runs, a thread asks the service manager for more time.
+
+    systemd ends a service that is not ready after ``TimeoutStartSec``, and starts it again: one that looks at
+    the files of ten million cells, for minutes, would never be ready.  ``EXTEND_TIMEOUT_USEC`` (sd_notify(3))
+    asks for more.
+
+    Parameters
+    ----------
+    tell
+        Sends lines ``KEY=value``.
+    what
+        What takes so long, for the status line.
+    every_s
+        How often.
+    """
+
+    def __init__(self, tell: Callable[..., None], what: str, every_s: float = EXTEND_EVERY_S) -> None:
+        self._tell = tell
+        self._what = what
+        self._every_s = every_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._ask, name="more time", daemon=True)
+
+    def __enter__(self) -> MoreTime:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+        try:
+            self._thread.start()  # signals are for who reads the map: a stop must interrupt that
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _ask(self) -> None:
+        end_s = time.monotonic() + MAX_START_S
+        while not self._over.wait(self._every_s) and time.monotonic() < end_s:
+            self._tell(f"STATUS={self._what}", f"EXTEND_TIMEOUT_USEC={int(EXTEND_S * 1e6)}")
+
+
+FIRST_FD: Final = 3  # SD_LISTEN_FDS_START
+
+
+class ActivatedSocket(NamedTuple):
+    """A listening socket and where it listens."""
+
+    fd: int
+    path: str
+
+
+def take_activated_socket(
+    environ: MutableMapping[str, str] = os.environ, *, first_fd: int = FIRST_FD
+) -> ActivatedSocket | None:
+    """Take over the socket that the service manager passed (sd_listen_fds(3)); None when it passed none.
+
+    The socket outlives the daemon, so that clients that connect while it starts or restarts only wait; its
+    file, owner and mode are the service manager's, and so the daemon never removes it.
+    The variables are removed: loaders must not believe that the socket is theirs.
+
+    Parameters
+    ----------
+    environ
+        ``LISTEN_PID`` and ``LISTEN_FDS`` count.
+    first_fd
+        Where passed descriptors start.
+
+    Raises
+    ------
+    ConfigError
+        More than one socket was passed, or one that is no listening unix stream socket.
+    """
+    pid, count = environ.pop("LISTEN_PID", ""), environ.pop("LISTEN_FDS", "")
+    environ.pop("LISTEN_FDNAMES", None)
+    if pid != str(os.getpid()) or not count.isdigit() or int(count) == 0:
+        return None
+    for fd in range(first_fd, first_fd + int(count)):
+        os.set_inheritable(fd, False)
+    if int(count) != 1:
+        raise _unusable(f"{count} sockets were passed, one is needed")
+    try:
+        with socket.socket(fileno=os.dup(first_fd)) as view:
+            listens = view.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+            kind, family, path = view.type, view.family, view.getsockname()
+    except OSError as error:
+        raise _unusable(f"descriptor {first_fd} is no socket: {error.strerror}") from error
+    if family != socket.AF_UNIX or kind != socket.SOCK_STREAM or not listens:
+        raise _unusable("the socket that was passed is no listening unix stream socket")
+    if not isinstance(path, str) or not path.startswith("/"):
+        raise _unusable(f"the socket that was passed has no path, but {path!r}")
+    os.set_blocking(first_fd, False)  # a client may give up between the poll and the accept
+    return ActivatedSocket(first_fd, path)
+
+
+def _unusable(what: str) -> ConfigError:
+    return ConfigError(
+        f"socket activation: {what}",
+        key="endpoint",
+        hint="the .socket unit needs exactly one ListenStream= with a path",
+    )
