@@ -67,7 +67,7 @@ def at_least(lowest: int) -> Callable[[str], int]:
 
 def size_bytes(text: str) -> int:
     """Read a size such as ``512M``, bytes."""
-    from shmmap.daemon.config import parse_bytes
+    from shmmap.daemon.config_table import parse_bytes
 
     try:
         return parse_bytes(text)

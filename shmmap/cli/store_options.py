@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "URL_HELP",
-    "add_access_options",
     "add_sign_option",
     "add_store_options",
     "add_trust_option",
@@ -27,21 +26,15 @@ URL_HELP = "where the map is published: s3://, gs://, az://, https://, file://, 
 
 def add_store_options(parser: argparse.ArgumentParser) -> None:
     """Add how a store is reached, besides its URL."""
-    add_access_options(parser.add_argument_group("the store"), default=False)
-
-
-def add_access_options(group: argparse._ArgumentGroup, *, default: bool | None) -> None:
-    """Add ``--insecure-http`` and ``--instance-credentials``, with this default."""
+    group = parser.add_argument_group("the store")
     group.add_argument(
         "--insecure-http",
         action="store_true",
-        default=default,
         help="accept plain http:// from other machines, although it can be read and changed in transit",
     )
     group.add_argument(
         "--instance-credentials",
         action="store_true",
-        default=default,
         help="ask the cloud's metadata address for credentials if none are given",
     )
 

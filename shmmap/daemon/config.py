@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
-import difflib
-import math
 import os
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from shmmap.daemon.config_file import KINDS, Setting, read_settings_file
-from shmmap.daemon.config_live import LiveSettings, live_settings
+from shmmap.daemon.config_file import Setting, read_settings_file
+from shmmap.daemon.config_table import (
+    LARGEST_BYTES,
+    Allowed,
+    at_least,
+    near_hint,
+    one_of,
+    parse_bytes,
+    rows_of,
+    setting,
+    within,
+)
 from shmmap.errors import BadRequest, ConfigError
 from shmmap.formats.coordinate_system import UNITS
 from shmmap.protocol.endpoint import (
@@ -23,157 +30,233 @@ from shmmap.protocol.endpoint import (
     fallback_runtime_dir,
     socket_path,
 )
-from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.names import check_instance
+from shmmap.segment.names import DEFAULT_SHM_DIR, check_instance
 
-__all__ = ["FILE_NAMES", "DaemonConfig", "load_config", "option_of", "parse_bytes", "trace_settings"]
+if TYPE_CHECKING:
+    from shmmap.daemon.config_live import LiveSettings
 
-_SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
-LARGEST_BYTES: Final = 1 << 62
+__all__ = [
+    "DROPPED",
+    "ROWS",
+    "SECTIONS",
+    "DaemonConfig",
+    "example_file",
+    "load_config",
+    "option_of",
+    "trace_settings",
+]
+
 _ENVIRONMENT: Final = "SHMMAP_"
-_TRUTHS: Final = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
-_RANGES: Final[dict[str, tuple[Callable[[Any], bool], str]]] = {
-    "session_quota": (
-        lambda value: 0 < value <= 1 or 1 << 20 <= value <= LARGEST_BYTES,
-        "a part of the budget, up to 1, or at least 1M",
-    ),
-    "workers": (lambda value: 0 <= value <= 64, "0 to 64; 0: one less than there are processors"),
-    "load_timeout_s": (lambda value: 0 < value <= 86400, "seconds, more than 0 and at most a day"),
-    "budget_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
-    "cache_bytes": (lambda value: 0 <= value <= LARGEST_BYTES, ""),
-    "live_budget_bytes": (lambda value: value == 0 or 1 << 22 <= value <= LARGEST_BYTES, "at least 4M"),
-    "catalogue_budget_bytes": (lambda value: 1 << 16 <= value <= LARGEST_BYTES, "at least 64K"),
-    "poll_s": (lambda value: value == 0 or 1 <= value <= 86400, "seconds, 1 to 86400; 0: never"),
-    "accept_version": (lambda value: 0 <= value < 1 << 63, "the number that `shmmap versions URL` shows"),
-    "log_level": (lambda value: value in ("debug", "info", "warning"), "debug, info or warning"),
-    "unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
-    "vertical_unit": (lambda value: value in ("", *UNITS), f"one of {', '.join(UNITS)}"),
-    "eviction": (lambda value: value in ("time", "distance", "lru"), "time, distance or lru"),
-    "ride_out_s": (lambda value: 0 <= value <= 3600, "seconds, 0 to 3600"),
-    "prefetch_share": (
-        lambda value: 0 <= value <= 1,
-        "a part of the budget, 0 to 1; 0: nothing is fetched ahead",
-    ),
-}
-"""Which values a setting may have, and the hint for who gives another."""
 COMMAND_LINE: Final = "command line"
 _NOT_SETTINGS: Final = "SHMMAP_TEST_"
-FILE_NAMES: Final = {
-    "budget_bytes": "budget", "cache_bytes": "cache_size", "live_budget_bytes": "live_budget",
-    "catalogue_budget_bytes": "catalogue_budget",
-}  # fmt: skip
-"""What files, variables and options call a setting, where that is not the attribute's name."""
+SECTIONS: Final = {
+    "map_path": "the map",
+    "poll_s": "a published map",
+    "budget_bytes": "memory",
+    "workers": "loading and logging",
+    "instance": "how clients find the daemon",
+    "live_budget_bytes": "live maps",
+}
+"""Headings in the help and in the example file, by the first setting below each."""
+DROPPED: Final = {"eviction": "what clients will need last is always evicted first"}
+"""Settings that there were, and what holds instead."""
+
+
+def _quota(text: str) -> float:
+    """Read a part of the budget, or a size."""
+    return float(text) if text.replace(".", "").isdigit() else float(parse_bytes(text))
 
 
 @dataclass(frozen=True, slots=True)
 class DaemonConfig:
-    """Every setting of the daemon.
+    """Every setting of the daemon; an empty text and 0 stand for what `Row.unset` says."""
 
-    Attributes
-    ----------
-    map_path
-        Directory of a divided map, one PCD file, or the URL or directory of a published map.
-    metadata
-        Metadata YAML, where it lies neither beside nor in the map; empty: look there.
-    instance
-        Name of this daemon among several on one machine.
-    runtime_dir, endpoint
-        Directory of socket and lock, or the socket itself; empty: the user's or the system's.
-    shm_dir
-        Where segments live.
-    group
-        Group that may connect and read; empty: only the daemon's own user.
-    admin_group
-        Group whose members may reload, evict, pin and shut down, besides root and the daemon's own
-        user; they must be able to connect, too.
-    budget_bytes
-        Most shared memory the daemon uses; 0: a quarter of what is available, at most 4 GiB.
-    session_quota
-        What one client may keep for itself alone: a part of the budget (up to 1), or bytes (above 1).
-    workers
-        Most loader processes at a time; 0: one less than there are processors, from 1 to 4, so that
-        one is left for who is being served while cells load.  While all of them compute layers there is one
-        more, for points alone.
-    load_timeout_s
-        How long loading one cell may take.
-    unit, vertical_unit
-        Of a cloud's coordinates, in the plane and in height: ``auto``, ``m``, ``ft`` or ``us-ft``; empty:
-        metres, and a cloud that says otherwise is refused.
-    strict
-        Accept only what Autoware's own loader accepts.
-    watch
-        Read the map again when its files change (inotify: not on NFS).
-    cache_dir
-        Where the prepared catalogue and computed layers are kept; empty: the service's or the user's
-        cache directory.
-    cache_bytes
-        Most disk space of computed and prepared layers; 0: none are kept.
-    poll_s
-        How often it is asked whether a published map has another version; 0: only when a reload is asked for.
-    catalogue_budget_bytes
-        What the list of cells of a large published map may take of memory; beyond, what was needed least
-        recently is fetched again when it is needed.
-    trust
-        Root of trust, ``ROOT.json``: only versions of a published map that are signed under it are taken;
-        empty: any version that the origin names.
-    accept_version
-        A version of a published map that is taken although a later one was taken before; 0: none.
-    insecure_http
-        Take a published map from plain ``http://`` beyond this machine.
-    instance_credentials
-        Ask the cloud's metadata address for credentials if none are given.
-    eviction
-        ``time``: what will be needed last goes first; ``distance`` or ``lru``.
-    ride_out_s
-        For so long the map's files may be out of reach without a moving client's noticing: it decides how far
-        ahead cells are fetched.
-    prefetch_share
-        Part of the budget that may be taken by what was fetched ahead and not asked for yet; 0: nothing is.
-    live
-        The live maps that are kept.
-    live_budget_bytes
-        Most shared memory of live maps; 0: an eighth of what is available, at most 1 GiB.
-    live_shm_dir
-        Where their chunks are: a tmpfs without huge pages; empty: /dev/shm where ``shm_dir`` has huge pages,
-        else ``shm_dir``.
-    live_group
-        Group whose members may map, besides root and the daemon's own user.
-    log_level
-        The least that is logged: ``debug``, ``info`` or ``warning``.
-    """
+    map_path: str = setting(
+        "",
+        "the map: a directory in Autoware's divided format (PCD files and pointcloud_map_metadata.yaml), one "
+        "cloud of any format that is read, or the URL or directory of a published map, such as s3://maps/town",
+        metavar="MAP",
+    )
+    metadata: str = setting("", "the map's YAML", metavar="FILE", unset="beside or inside the map")
+    unit: str = setting(
+        "",
+        "unit of a cloud's coordinates, converted to metres; auto takes what the file says",
+        allowed=one_of(*UNITS),
+        unset="metres, and a file that says feet is refused",
+    )
+    vertical_unit: str = setting(
+        "",
+        "unit of a cloud's heights, where it differs from that of its coordinates",
+        allowed=one_of(*UNITS),
+        unset="that of its coordinates, or what the file says",
+    )
+    strict: bool = setting(False, "accept only what Autoware's own loader accepts")
+    watch: bool = setting(
+        False,
+        "read the map again when its files change on this machine; NFS and the like do not report changes "
+        "made elsewhere: there, use `shmmap reload`",
+    )
 
-    map_path: str = ""
-    metadata: str = ""
-    instance: str = DEFAULT_INSTANCE
-    runtime_dir: str = ""
-    endpoint: str = ""
-    shm_dir: str = DEFAULT_SHM_DIR
-    group: str = ""
-    admin_group: str = ""
-    budget_bytes: int = 0
-    session_quota: float = 0.9
-    workers: int = 0
-    load_timeout_s: float = 60.0
-    unit: str = ""
-    vertical_unit: str = ""
-    strict: bool = False
-    watch: bool = False
-    cache_dir: str = ""
-    cache_bytes: int = 8 << 30
-    poll_s: float = 60.0
-    catalogue_budget_bytes: int = 256 << 20
-    trust: str = ""
-    accept_version: int = 0
-    insecure_http: bool = False
-    instance_credentials: bool = False
-    eviction: str = "time"
-    ride_out_s: float = 10.0
-    prefetch_share: float = 0.5
+    poll_s: float = setting(
+        60.0,
+        "how often, in seconds, to look for another version (`shmmap versions`)",
+        metavar="SECONDS",
+        allowed=within(1, 86400, "seconds"),
+        unset="only on `shmmap reload`",
+    )
+    catalogue_budget_bytes: int = setting(
+        256 << 20,
+        "most memory for the list of cells, a million of them in 256M; beyond, what was needed least "
+        "recently is fetched again when it is needed",
+        metavar="BYTES",
+        allowed=at_least("64K"),
+        size="catalogue_budget",
+    )
+    trust: str = setting(
+        "",
+        "root of trust: take only versions that are signed under it, and none older than one taken before",
+        metavar="ROOT.json",
+        unset="the version that the map's origin names is taken unverified",
+    )
+    accept_version: int = setting(
+        0,
+        "number of a version that is taken although a later one was taken before",
+        metavar="N",
+        allowed=Allowed(lambda value: 0 <= value < 1 << 63, "the number that `shmmap versions URL` shows"),
+        unset="none",
+    )
+    insecure_http: bool = setting(
+        False, "accept plain http:// from other machines, although it can be read and changed in transit"
+    )
+    instance_credentials: bool = setting(
+        False, "ask the cloud's metadata address for credentials if none are given"
+    )
+
+    budget_bytes: int = setting(
+        0,
+        "most shared memory for cells, bytes or a size such as 512M or 2G (powers of 1024); one that does "
+        "not fit is refused",
+        metavar="BYTES",
+        allowed=at_least("0"),
+        size="budget",
+        unset="a quarter of the memory available at start, at most 4 GiB",
+    )
+    session_quota: float = setting(
+        0.9,
+        "what one client may keep for itself alone: a part of the budget, up to 1, or a size such as 1G",
+        metavar="PART",
+        allowed=Allowed(
+            lambda value: 0 < value <= 1 or 1 << 20 <= value <= LARGEST_BYTES,
+            "a part of the budget, up to 1, or at least 1M",
+        ),
+        parse=_quota,
+    )
+    ride_out_s: float = setting(
+        10.0,
+        "how long, in seconds, the map's files may be out of reach without a moving client's noticing: cells "
+        "are fetched that far ahead, of a published map onto the disk where memory has no room",
+        metavar="SECONDS",
+        allowed=within(0, 3600, "seconds"),
+    )
+    prefetch_share: float = setting(
+        0.5,
+        "part of the budget that cells fetched ahead may take until a client asks for them",
+        metavar="PART",
+        allowed=within(0, 1, "as a part of the budget"),
+        unset="nothing is fetched ahead",
+    )
+    shm_dir: str = setting(
+        DEFAULT_SHM_DIR,
+        "directory of the segments, on a tmpfs; clients learn it from the daemon",
+        metavar="DIR",
+    )
+
+    workers: int = setting(
+        0,
+        "most loader processes at a time; one more loads points while all of them compute layers",
+        metavar="N",
+        allowed=within(0, 64),
+        unset="one less than there are processors, from 1 to 4",
+    )
+    load_timeout_s: float = setting(
+        60.0,
+        "most time for loading one cell, in seconds; then its loader is killed, and the cell reported failed",
+        metavar="SECONDS",
+        allowed=Allowed(lambda value: 0 < value <= 86400, "seconds, more than 0 and at most a day"),
+    )
+    cache_dir: str = setting(
+        "",
+        "where the map's index, divided clouds and computed layers are kept between starts",
+        metavar="DIR",
+        unset="the service's or the user's cache directory",
+    )
+    cache_bytes: int = setting(
+        8 << 30,
+        "most disk space for computed and prepared layers",
+        metavar="SIZE",
+        allowed=at_least("0"),
+        size="cache_size",
+        unset="none are kept",
+    )
+    log_level: str = setting(
+        "info",
+        "the least that is logged: debug (each eviction, each client that left), info or warning",
+        metavar="LEVEL",
+        allowed=one_of("debug", "info", "warning"),
+    )
+
+    instance: str = setting(
+        DEFAULT_INSTANCE,
+        "name of this daemon among several on one machine; shmmapd@NAME sets it",
+        metavar="NAME",
+        parse=check_instance,
+    )
+    endpoint: str = setting(
+        "",
+        "request socket, a path or an ipc:// URL",
+        metavar="PATH",
+        unset="INSTANCE.sock in the runtime directory",
+    )
+    runtime_dir: str = setting(
+        "",
+        "directory of the request socket and its lock",
+        metavar="DIR",
+        unset="/run/shmmap; for a user's daemon $XDG_RUNTIME_DIR/shmmap, else /tmp/shmmap-UID",
+    )
+    group: str = setting(
+        "",
+        "group whose members may connect and read the map",
+        metavar="GROUP",
+        unset="only the daemon's own user may",
+    )
+    admin_group: str = setting(
+        "",
+        "group whose members may also reload, evict, pin and stop; they must be able to connect, too",
+        metavar="GROUP",
+        unset="only root and the daemon's own user may",
+    )
+
+    live_budget_bytes: int = setting(
+        0,
+        "most memory of all live maps together, beside the budget of cells",
+        metavar="BYTES",
+        allowed=at_least("4M"),
+        size="live_budget",
+        unset="an eighth of what is free, at most 1 GiB",
+    )
+    live_shm_dir: str = setting(
+        "",
+        "directory of live maps' chunks, a tmpfs without huge pages",
+        metavar="DIR",
+        unset="that of the segments; /dev/shm where that has huge pages",
+    )
+    live_group: str = setting(
+        "",
+        "group whose members may change live maps; they must be able to connect, too",
+        metavar="GROUP",
+        unset="only root and the daemon's own user may",
+    )
     live: tuple[LiveSettings, ...] = ()
-    live_budget_bytes: int = 0
-    live_shm_dir: str = ""
-    live_group: str = ""
-    log_level: str = "info"
 
     def socket(self) -> str:
         """Path of the request socket."""
@@ -188,6 +271,10 @@ class DaemonConfig:
         return self.workers or min(4, max(1, len(os.sched_getaffinity(0)) - 1))
 
 
+ROWS: Final = rows_of(DaemonConfig)
+"""What is known of each setting, by its attribute; `DaemonConfig.live` has tables of its own."""
+
+
 def _events_longer(endpoint: str) -> int:
     """How much longer the path of the socket of events is."""
     return EVENTS_LONGER + (0 if endpoint.endswith(".sock") else len(".sock"))
@@ -200,66 +287,12 @@ def _default_runtime_dir() -> str:
     return SYSTEM_RUNTIME_DIR if os.geteuid() == 0 else fallback_runtime_dir()
 
 
-def parse_bytes(text: str) -> int:
-    """Read a size such as ``512M``, ``2GiB`` or ``1000000`` (powers of 1024), at most 2^62 bytes.
-
-    Raises
-    ------
-    ConfigError
-        It is no size, or a larger one.
-    """
-    match = _SIZE.fullmatch(text)
-    nbytes = float(match[1]) * 1024.0 ** " kmgt".index(match[2].lower() or " ") if match else math.inf
-    if not nbytes <= LARGEST_BYTES:
-        raise ConfigError(f"{text!r} is no size", hint="write for example 512M or 2G")
-    return int(nbytes)
-
-
 def option_of(name: str) -> str:
-    """Return what the command line calls a setting."""
+    """Return what the command line calls a setting, by its attribute."""
     if name == "map_path":
         return "MAP"
-    return "--" + FILE_NAMES.get(name, name).removesuffix("_s").replace("_", "-")
-
-
-def _convert(name: str, value: Any, origin: str) -> Any:
-    """Check one setting's type and range."""
-    kind = type(getattr(DaemonConfig(), name))
-    called = option_of(name) if origin == COMMAND_LINE else FILE_NAMES.get(name, name)
-    is_possible, hint = _RANGES.get(name, (lambda _value: True, ""))
-    try:
-        if name in FILE_NAMES:  # those are sizes
-            value = parse_bytes(value) if isinstance(value, str) else value
-        if name == "session_quota" and isinstance(value, str) and not value.replace(".", "").isdigit():
-            value = float(parse_bytes(value))
-        if name == "instance" and isinstance(value, str):
-            check_instance(value)
-        if kind is bool and isinstance(value, str):
-            value = _TRUTHS[value.lower()]
-        elif kind in (int, float) and isinstance(value, str):
-            value = kind(value)
-        elif kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-            raise ValueError
-    except ConfigError as error:
-        raise ConfigError(
-            f"{origin}: {called}: {error.message}", key=name, origin=origin, hint=error.hint
-        ) from None
-    except (KeyError, ValueError, OverflowError):
-        raise ConfigError(
-            f"{origin}: {called} must be {KINDS[kind]}, not {value!r}", key=name, origin=origin, hint=hint
-        ) from None
-    if not is_possible(value):
-        raise ConfigError(f"{origin}: {called} cannot be {value!r}", key=name, origin=origin, hint=hint)
-    return value
-
-
-def _unknown(name: str, origin: str) -> ConfigError:
-    names = [FILE_NAMES.get(field.name, field.name) for field in fields(DaemonConfig)]
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"settings are: {', '.join(names)}"
-    return ConfigError(f"{origin}: unknown setting {name!r}", key=name, origin=origin, hint=hint)
+    called = ROWS[name].called if name in ROWS else name
+    return "--" + called.removesuffix("_s").replace("_", "-")
 
 
 def load_config(
@@ -284,17 +317,17 @@ def load_config(
         An unknown key (with a suggestion), a wrong type or an impossible value, and where it is set.
     """
     found = trace_settings(flags, file=file, environ=environ)
-    return DaemonConfig(**{name: setting.value for name, setting in found.items()})
+    return DaemonConfig(**{name: one.value for name, one in found.items()})
 
 
 def trace_settings(
     flags: Mapping[str, Any], *, file: str = "", environ: Mapping[str, str] = os.environ
 ) -> dict[str, Setting]:
     """Return every setting with its origin; parameters and errors are those of `load_config`."""
-    given: list[tuple[str, Any, str]] = []  # later ones override earlier ones
-    if file:
-        given += [(name, value, origin) for name, (value, origin) in read_settings_file(file).items()]
+    in_file = read_settings_file(file) if file else {}
+    live_tables, live_flags = in_file.pop("live", Setting({}, "")), list[Setting]()
     elsewhere = any(flags.get(name) is not None for name in ("instance", "runtime_dir"))
+    given = [(name, *one) for name, one in in_file.items()]  # later ones override earlier ones
     given += [
         (name.removeprefix(_ENVIRONMENT).lower(), value, name)
         for name, value in environ.items()
@@ -304,19 +337,18 @@ def trace_settings(
     ]
     given += [(name, value, COMMAND_LINE) for name, value in flags.items() if value is not None]
     settings = {field.name: Setting(field.default, "default") for field in fields(DaemonConfig)}
-    attributes = {called: name for name, called in FILE_NAMES.items()}
-    live: dict[str, list[tuple[Any, str]]] = {"tables": [], "flags": []}
+    attributes = {row.called: name for name, row in ROWS.items()}
     for word, value, origin in given:
         if word == "live":
-            live[
-                "tables" if isinstance(value, Mapping) or origin.startswith(file or "\0") else "flags"
-            ].append((value, origin))
+            live_flags.append(Setting(value, origin))
             continue
-        name = attributes.get(word, word)
-        if name not in settings or (word in FILE_NAMES and origin != COMMAND_LINE):
-            raise _unknown(word, origin)
-        settings[name] = Setting(_convert(name, value, origin), origin)
-    settings["live"] = _live(live["tables"], live["flags"])
+        name = attributes.get(word, word if origin == COMMAND_LINE else "")
+        if name not in ROWS:
+            raise _no_setting(word, origin)
+        called = option_of(name) if origin == COMMAND_LINE else word
+        value = ROWS[name].checked(value, f"{origin}: {called}", key=name, origin=origin)
+        settings[name] = Setting(value, origin)
+    settings["live"] = _live(live_tables, live_flags)
     endpoint = settings["endpoint"]
     if endpoint.value and settings["instance"].origin == "default":
         # clients that know the socket alone look for the segments of the instance it is named after
@@ -324,17 +356,31 @@ def trace_settings(
     return settings
 
 
-def _live(tables: list[tuple[Any, str]], flags: list[tuple[Any, str]]) -> Setting:
+def _no_setting(word: str, origin: str) -> ConfigError:
+    """Refuse a name that is no setting, or no longer one."""
+    if word in DROPPED:
+        called, hint = word, "delete this line"
+        if origin == COMMAND_LINE:
+            called, hint = option_of(word), "leave it out"
+        elif origin.startswith(_ENVIRONMENT):
+            hint = f"unset {origin}"
+        return ConfigError(f"{origin}: {called} is gone: {DROPPED[word]}", key=word, origin=origin, hint=hint)
+    hint = near_hint(word, [*(row.called for row in ROWS.values()), "live"])
+    return ConfigError(f"{origin}: unknown setting {word!r}", key=word, origin=origin, hint=hint)
+
+
+def _live(tables: Setting, flags: Sequence[Setting]) -> Setting:
     """Put the settings of live maps together: of those that variables or the command line name, too."""
-    origins = [origin for _, origin in (*tables, *flags)]
+    from shmmap.daemon.config_live import live_settings
+
+    origins = [one.origin for one in (tables, *flags) if one.origin]
     names = [
         name.strip()
         for value, _ in flags
         for name in (value.split(",") if isinstance(value, str) else value)
         if name.strip()
     ]
-    table, table_origin = tables[-1] if tables else ({}, "")
-    return Setting(live_settings(names, table, table_origin), " and ".join(origins) or "default")
+    return Setting(live_settings(names, *tables), " and ".join(origins) or "default")
 
 
 def _instance_of(endpoint: str) -> str:
@@ -343,3 +389,43 @@ def _instance_of(endpoint: str) -> str:
         return check_instance(os.path.basename(endpoint_path(endpoint)).removesuffix(".sock"))
     except (BadRequest, ConfigError):
         return DEFAULT_INSTANCE
+
+
+_HEAD: Final = """\
+# SPDX-License-Identifier: Apache-2.0
+# Settings of shmmapd.  Every setting is here; those that are commented out show their default.
+# SHMMAP_* variables (SHMMAP_BUDGET=2G) override this file, options of `shmmap serve` override both.
+# `shmmap config check FILE` looks for mistakes, `shmmap config show --origin FILE` says what counts.
+"""
+_LIVE_HEAD: Final = """
+# Each live map has a table of its own, which stands behind all other settings:
+#[live.lidar]
+"""
+
+
+def example_file(given: Mapping[str, Any]) -> str:
+    """Return a configuration file that explains every setting.
+
+    Parameters
+    ----------
+    given
+        Values to set, by attribute; all other settings are commented out, with their defaults.
+    """
+    import textwrap
+
+    from shmmap.daemon.config_live import LIVE_ROWS
+
+    def comment(words: str, indent: str) -> str:
+        return textwrap.fill(words, 110, initial_indent=indent, subsequent_indent=indent)
+
+    text = _HEAD
+    for name, row in ROWS.items():
+        if name in SECTIONS:
+            text += f"\n# --- {SECTIONS[name]} ---\n"
+        words, line = row.example(given.get(name))
+        text += f"\n{comment(words, '# ')}\n{'' if name in given else '#'}{line}\n"
+    text += _LIVE_HEAD
+    for row in LIVE_ROWS.values():
+        words, line = row.example()
+        text += f"{comment(words, '#  ')}\n#  {line}\n"
+    return text

@@ -18,10 +18,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["KINDS", "SYSTEM_CONFIG_FILE", "Setting", "installed_config_file", "read_settings_file"]
+__all__ = ["SYSTEM_CONFIG_FILE", "Setting", "installed_config_file", "read_settings_file"]
 
-KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-"""What a value of a type is called."""
 SYSTEM_CONFIG_FILE: Final = "/etc/shmmap/shmmap.toml"
 MAX_BYTES: Final = 1 << 20
 _KEY: Final = re.compile(r"""\s*(?:"([^"]+)"|'([^']+)'|([A-Za-z0-9_-]+))\s*[.=]|\s*\[+\s*([A-Za-z0-9_-]+)""")

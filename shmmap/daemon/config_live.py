@@ -3,21 +3,26 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
-
-import msgspec
 
 from shmmap.chunks.layout import MOST_FRAME_BYTES
 from shmmap.chunks.occupancy import Occupancy
-from shmmap.daemon.config_file import KINDS
+from shmmap.daemon.config_table import Allowed, near_hint, rows_of, setting, within
 from shmmap.errors import ConfigError
 
-__all__ = ["SERVICE_STATE", "LiveSettings", "live_directory", "live_settings", "state_directory"]
+__all__ = [
+    "LIVE_ROWS",
+    "SERVICE_STATE",
+    "LiveSettings",
+    "live_directory",
+    "live_settings",
+    "state_directory",
+]
 
 SERVICE_STATE: Final = "/var/lib/shmmap/state"
 """Where each instance of the installed service has its state directory (StateDirectory= of the units)."""
@@ -25,49 +30,68 @@ SERVICE_STATE: Final = "/var/lib/shmmap/state"
 REAL_S: Final = 0.5
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_RANGES: Final = {
-    "resolution": (1e-4, 1e3, "metres"),
-    "radius": (0, 16, "chunks"),
-    "hysteresis": (0.0, 1.0, "a part of a chunk, up to 1"),
-    "linger_s": (0.0, 3600.0, "seconds"),
-    "checkpoint_s": (0.1, 3600.0, "seconds"),
-    "most_active": (0, 1 << 40, "voxels; 0: as many as fit"),
-}
-_LARGEST: Final = 1 << 53
-"""Beyond any limit; a whole number may be too large for a float."""
 
 
-class LiveSettings(msgspec.Struct, frozen=True):
-    """Settings of one live map.
+@dataclass(frozen=True, slots=True)
+class LiveSettings:
+    """Settings of one live map, which clients call ``name``.
 
-    Attributes
-    ----------
-    name
-        What clients call it.
-    path
-        Its directory; empty: the state directory's ``live/NAME``.
-    resolution, frame_id, hit, miss, clamp_min, clamp_max, occupied_above, free_below
-        Fixed when the map is made, see `shmmap.chunks.occupancy.Occupancy`.
-    radius, hysteresis, linger_s, checkpoint_s, most_active
-        What stays in memory, and for how long changes are there alone, see
-        `shmmap.daemon.live.paging.records.Limits`.
+    Those of voxels are fixed when the map is made, see `shmmap.chunks.occupancy.Occupancy`.  What stays in
+    memory, and for how long changes are there alone: see `shmmap.daemon.live.paging.records.Limits`.
     """
 
     name: str
-    path: str = ""
-    resolution: float = 0.05
-    frame_id: str = "map"
-    hit: float = 0.7
-    miss: float = 0.4
-    clamp_min: float = 0.12
-    clamp_max: float = 0.97
-    occupied_above: float = 0.5
-    free_below: float = 0.5
-    radius: int = 1
-    hysteresis: float = 0.2
-    linger_s: float = 2.0
-    checkpoint_s: float = 10.0
-    most_active: int = 0
+    path: str = setting(
+        "",
+        "directory of its files",
+        allowed=Allowed(os.path.isabs, "write the whole path, from / on"),
+        unset="live/NAME in the service's or the user's state directory",
+    )
+    resolution: float = setting(
+        0.05,
+        "edge of a voxel, metres; this, the frame and the probabilities are fixed when the map is made",
+        allowed=within(1e-4, 1e3, "metres"),
+    )
+    frame_id: str = setting(
+        "map",
+        "name of the map's frame",
+        allowed=Allowed(
+            lambda frame: 0 < len(frame.encode()) <= MOST_FRAME_BYTES,
+            f"1 to {MOST_FRAME_BYTES} bytes of UTF-8",
+        ),
+    )
+    hit: float = setting(0.7, "what one hit says, a probability above a half")
+    miss: float = setting(0.4, "what one miss says, a probability below a half")
+    clamp_min: float = setting(0.12, "no voxel is surer to be free than this probability says")
+    clamp_max: float = setting(0.97, "no voxel is surer to be occupied than this probability says")
+    occupied_above: float = setting(0.5, "voxels above this probability count as occupied")
+    free_below: float = setting(0.5, "voxels below this probability count as free")
+    radius: int = setting(
+        1,
+        "chunks (64 voxels a side) around each client that stay in memory, along each axis",
+        allowed=within(0, 16, "chunks"),
+    )
+    hysteresis: float = setting(
+        0.2,
+        "how far a client has to be in another chunk until its window follows, as a part of a chunk",
+        allowed=within(0.0, 1.0, "as a part of a chunk"),
+    )
+    linger_s: float = setting(
+        2.0,
+        "how many seconds after its last change a chunk outside of all windows counts as near",
+        allowed=within(0.0, 3600.0, "seconds"),
+    )
+    checkpoint_s: float = setting(
+        10.0,
+        "how many seconds, at most, a change is in memory alone: a power cut can take that much",
+        allowed=within(0.1, 3600.0, "seconds"),
+    )
+    most_active: int = setting(
+        0,
+        "most known voxels of all chunks in memory",
+        allowed=within(0, 1 << 40, "voxels"),
+        unset="as many as fit",
+    )
 
     @property
     def occupancy(self) -> Occupancy:
@@ -75,6 +99,10 @@ class LiveSettings(msgspec.Struct, frozen=True):
         return Occupancy(
             self.hit, self.miss, self.clamp_min, self.clamp_max, self.occupied_above, self.free_below
         )
+
+
+LIVE_ROWS: Final = rows_of(LiveSettings)
+"""What is known of each setting of a live map, by its name in the table."""
 
 
 def live_settings(
@@ -105,7 +133,7 @@ def live_settings(
     for flag in flags:
         name, _, path = flag.partition("=")
         base = found.get(name) or LiveSettings(_checked_name(name, "command line"))
-        found[name] = msgspec.structs.replace(base, path=os.path.abspath(path) if path else base.path)
+        found[name] = replace(base, path=os.path.abspath(path) if path else base.path)
     paths: dict[str, str] = {}
     for one in found.values():
         if one.path and (other := paths.setdefault(_real(one.path), one.name)) != one.name:
@@ -139,13 +167,15 @@ def _from_table(name: str, table: Mapping[str, Any], origin: str) -> LiveSetting
     values: dict[str, Any] = {}
     for key, value in table.items():
         where = f"{origin}: live.{name}.{key}"
-        if key == "name" or key not in known.__struct_fields__:
-            names = [field for field in known.__struct_fields__ if field != "name"]
-            near = difflib.get_close_matches(key, names, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"settings are: {', '.join(names)}"
-            raise ConfigError(f"{where}: unknown setting", key=f"live.{name}.{key}", origin=origin, hint=hint)
-        values[key] = _checked(key, value, getattr(known, key), where, origin)
-    made = msgspec.structs.replace(known, **values)
+        if key not in LIVE_ROWS:
+            raise ConfigError(
+                f"{where}: unknown setting",
+                key=f"live.{name}.{key}",
+                origin=origin,
+                hint=near_hint(key, LIVE_ROWS),
+            )
+        values[key] = LIVE_ROWS[key].checked(value, where, key=key, origin=origin, as_text=False)
+    made = replace(known, **values)
     try:
         _ = made.occupancy
     except ConfigError as error:
@@ -154,33 +184,6 @@ def _from_table(name: str, table: Mapping[str, Any], origin: str) -> LiveSetting
             hint=error.hint,
         ) from None  # fmt: skip
     return made
-
-
-def _checked(key: str, value: Any, default: Any, where: str, origin: str) -> Any:
-    kind = type(default)
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(max(-_LARGEST, min(value, _LARGEST)))
-    if not isinstance(value, kind) or isinstance(value, bool):
-        raise ConfigError(
-            f"{where} must be {KINDS[kind]}, not {value!r}", key=key, origin=origin,
-            hint=f"its default is {default!r}" if default != "" else "write it in quotes",
-        )  # fmt: skip
-    if key == "frame_id" and not 0 < len(value.encode()) <= MOST_FRAME_BYTES:
-        raise ConfigError(
-            f"{where} cannot be {value!r}", key=key, origin=origin,
-            hint=f"1 to {MOST_FRAME_BYTES} bytes of UTF-8",
-        )  # fmt: skip
-    if key == "path" and value and not os.path.isabs(value):
-        raise ConfigError(
-            f"{where} cannot be {value!r}", key=key, origin=origin, hint="write the whole path, from / on"
-        )
-    if key in _RANGES:
-        least, most, what = _RANGES[key]
-        if not least <= value <= most:
-            raise ConfigError(
-                f"{where} cannot be {value!r}", key=key, origin=origin, hint=f"{least} to {most} {what}"
-            )
-    return value
 
 
 def live_directory(instance: str, name: str, environ: Mapping[str, str] = os.environ) -> str:

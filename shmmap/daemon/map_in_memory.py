@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
-from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -117,7 +116,7 @@ class MapInMemory:
             self.event_log = EventLog(epoch)
             self.sessions = Sessions()
             reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
-            evictor = Evictor(reclaimer, POLICIES[config.eviction])
+            evictor = Evictor(reclaimer)
             self.cache = CellCache(
                 catalogue, evictor, self.statistics, self.event_log,
                 instance=config.instance, mode=mode, gid=gid,

@@ -36,7 +36,7 @@ class Resident:
     their checksums: until then nobody is handed it.  ``prefetched`` is true for one that was fetched before
     anybody asked for it, until somebody does.  ``handle`` and ``stale_handle`` are encoded once, for all
     replies; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
-    among all segments of its size; ``aside_s`` how long it was left alone when it was last found in use.
+    among all segments of its size; ``deferred_s`` how long it was deferred when it was last found in use.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Resident:
     prefetched: bool = False
     sessions: set[int] = field(default_factory=set)
     place: int = -1
-    aside_s: float = 0.0
+    deferred_s: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

@@ -15,11 +15,10 @@ from collections.abc import Iterator
 
 from shmmap.errors import CannotStart
 from shmmap.failpoints import step
+from shmmap.segment.names import DEFAULT_SHM_DIR
 from shmmap.segment.publish_block import PublishBlock, pack_publish_block
 
 __all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
-
-DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108  where shm_open puts segments on Linux
 
 
 def measured_bytes(fd: int) -> int:

@@ -16,6 +16,7 @@ from typing import Final
 from shmmap.errors import ConfigError
 
 __all__ = [
+    "DEFAULT_SHM_DIR",
     "HUGE_PAGES_DIR",
     "another_name",
     "check_instance",
@@ -27,6 +28,8 @@ __all__ = [
     "usual_directory",
 ]
 
+DEFAULT_SHM_DIR: Final = "/dev/shm"  # noqa: S108
+"""Where ``shm_open`` puts segments on Linux."""
 HUGE_PAGES_DIR: Final = "/run/shmmap_huge"
 """Where ``shmmap unit install --huge-pages`` mounts a tmpfs."""
 
@@ -55,7 +58,7 @@ def statistics_name(instance: str) -> str:
     return f"/shmmap.{instance}.statistics"
 
 
-def usual_directory(instance: str, places: tuple[str, str] = ("/dev/shm", HUGE_PAGES_DIR)) -> str:  # noqa: S108
+def usual_directory(instance: str, places: tuple[str, str] = (DEFAULT_SHM_DIR, HUGE_PAGES_DIR)) -> str:
     """Return where the instance's names are, for those who were not told: /dev/shm, or on huge pages."""
     plain, huge = places
     if os.path.exists(plain + statistics_name(instance)) or not os.path.ismount(huge):

@@ -7,15 +7,14 @@ Units are replaced (an operator's changes belong in drop-ins), a configuration t
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import re
 import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from shmmap.daemon.config import example_file
 from shmmap.errors import CannotWrite, MapMissing
 from shmmap.origin.remote.store import is_url, read_url
 from shmmap.service.file_system import FileSystem
@@ -25,6 +24,7 @@ from shmmap.service.shipped_files import shipped_names, shipped_text
 
 __all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_text", "write"]
 
+EXAMPLE_MAP = "/var/lib/shmmap/maps"
 SHIPPED_PROGRAM = "/usr/bin/shmmapd"
 SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
 PUBLISHED_MAP = "drop-ins/published-map.conf"
@@ -83,13 +83,8 @@ def unit_text(name: str, program: Program | None = None) -> str:
 
 def configuration(map_path: str = "", *, group: bool = True, trust: str = "") -> str:
     """Return the example configuration with this map and root of trust, and with or without a group."""
-    text = shipped_text("shmmap.toml")
-    if map_path:
-        # what JSON quotes is quoted the same way in TOML
-        text = re.sub(r"^map_path = .*$", lambda _: f"map_path = {json.dumps(map_path)}", text, flags=re.M)
-    if trust:
-        text = re.sub(r"^#trust = .*$", lambda _: f"trust = {json.dumps(trust)}", text, flags=re.M)
-    return text if group else re.sub(r"^group = .*$", '#group = ""', text, flags=re.M)
+    given = {"map_path": map_path or EXAMPLE_MAP, "trust": trust, "group": "shmmap" if group else ""}
+    return example_file({name: value for name, value in given.items() if value})
 
 
 def _map_path(given: str, file_system: FileSystem) -> tuple[str, bool]:

@@ -12,7 +12,7 @@ import time
 from types import TracebackType
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
-from shmmap.segment.names import statistics_name
+from shmmap.segment.names import DEFAULT_SHM_DIR, statistics_name
 from shmmap.statistics.identity import DaemonIdentity, WriterProcess
 from shmmap.statistics.layout import (
     IDENTITY,
@@ -30,7 +30,6 @@ __all__ = ["StatisticsReader", "read_statistics"]
 _ATTEMPTS = 100
 _TABLE_ATTEMPTS = 16
 _HEADER_BYTES = 16384
-_DEFAULT_SHM_DIR = "/dev/shm"  # noqa: S108  as shmmap.segment.directory, which would load numpy
 
 
 class StatisticsReader:
@@ -43,7 +42,7 @@ class StatisticsReader:
         when it is there, and anew when another daemon replaced it.
     """
 
-    def __init__(self, instance: str = "default", shm_dir: str = _DEFAULT_SHM_DIR) -> None:
+    def __init__(self, instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -> None:
         self._path = f"{shm_dir.rstrip('/')}{statistics_name(instance)}"
         self._fd = -1
         self._header: Header | None = None
@@ -137,7 +136,7 @@ class StatisticsReader:
         return self._identity, self._process
 
 
-def read_statistics(instance: str = "default", shm_dir: str = _DEFAULT_SHM_DIR) -> Snapshot:
+def read_statistics(instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -> Snapshot:
     """Read once what the instance's daemon tells.
 
     Parameters

@@ -27,8 +27,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
-from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import TICK_S, Reclaimer
 from shmmap.daemon.pins.probe import PinSource
@@ -90,7 +89,7 @@ def percentiles(times: Sequence[float]) -> str:
     return f"p50 {p50:8.3f}  p99 {p99:8.3f}  longest {max(times):8.3f}"
 
 
-def steps(count: int, policy: str) -> None:
+def steps(count: int) -> None:
     """Make room 2000 times with ``count`` segments in memory, and print how long a step takes."""
     nothing = SimpleNamespace(
         rename=lambda *_: True, unlink=lambda *_: True, keep=lambda *_: True, keeps=lambda *_: False,
@@ -101,7 +100,7 @@ def steps(count: int, policy: str) -> None:
     reclaimer = Reclaimer(ledger, cast("Any", nothing), sessions, cast("Any", nothing))
     reclaimer.on_retired = lambda *_: None
     reclaimer.on_gone = lambda *_: None
-    evictor = Evictor(reclaimer, POLICIES[policy])
+    evictor = Evictor(reclaimer)
     side = math.isqrt(count - 1) + 1
 
     def appear(number: int, now_s: float) -> None:
@@ -135,8 +134,8 @@ def steps(count: int, policy: str) -> None:
         reclaimer.sweep(now_s + TICK_S)
         number += 1
         appear(number, now_s)
-    print(f"{policy:8} {count:8} segments: one step of making room {percentiles(made)} ms")
-    print(f"{'':27} some scores brought up to date {percentiles(refreshed)} ms", flush=True)
+    print(f"{count:8} segments: one step of making room {percentiles(made)} ms")
+    print(f"{'':18} some scores brought up to date {percentiles(refreshed)} ms", flush=True)
     reclaimer.closer.end()
 
 
@@ -220,10 +219,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=4000, help="cold cells to load")
     parser.add_argument("--steps", type=int, default=1_000_000, help="segments for the parts alone, at most")
     arguments = parser.parse_args()
-    for policy in POLICIES:
-        for count in (1000, 100_000, 1_000_000):
-            if count <= arguments.steps:
-                steps(count, policy)
+    for count in (1000, 100_000, 1_000_000):
+        if count <= arguments.steps:
+            steps(count)
     side = 10 * math.ceil(math.sqrt(arguments.many + arguments.cells + 20_000) / 10)
     with tempfile.TemporaryDirectory() as directory:
         root = Path(directory) / "map"

@@ -21,8 +21,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
-from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, Reclaimer
 from shmmap.daemon.loading.loads import Loads
@@ -72,8 +71,8 @@ class Wanted:
 class Machine(RuleBasedStateMachine):
     """One life of ledger and loads; it hears of the reclaimer what leaves and what is freed."""
 
-    @initialize(policy=st.sampled_from(sorted(POLICIES)), elsewhere=st.booleans())
-    def begin(self, policy: str, elsewhere: bool) -> None:
+    @initialize(elsewhere=st.booleans())
+    def begin(self, elsewhere: bool) -> None:
         """With ``elsewhere`` all memory is freed in the other thread, not only of large segments."""
         prepare_process()
         self.path = tempfile.mkdtemp(prefix="shmmap-model-", dir="/dev/shm")
@@ -86,7 +85,7 @@ class Machine(RuleBasedStateMachine):
         self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory))
         if elsewhere:
             self.reclaimer.closer.small_bytes = 0
-        self.evictor = Evictor(self.reclaimer, POLICIES[policy])
+        self.evictor = Evictor(self.reclaimer)
         self.names_retired: list[str] = []
         self.names_freed: list[str] = []
         self.reclaimer.on_retired = lambda resident, _why: self.names_retired.append(resident.name)

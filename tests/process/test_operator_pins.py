@@ -57,7 +57,7 @@ def test_pins_survive_pressure_that_evicts_everything_else(
     daemon: DaemonFactory, connect: Connect, tmp_path: Path
 ) -> None:
     heavy_map = make_map(tmp_path / "heavy", points=4000)
-    one = daemon(heavy_map.root, "--budget", "1M", "--eviction", "lru")
+    one = daemon(heavy_map.root, "--budget", "1M")
     client = connect(one)
     client.ask("pin", ["0_0.pcd"])
     wait_for_pins(client, {"0_0.pcd": "resident"})

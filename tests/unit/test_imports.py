@@ -70,7 +70,7 @@ PARTS = {
     },
     "prepare": BASE | {"formats", "layers", "origin", "segment"},
     "publishing": BASE | {"dividing", "formats", "layers", "origin", "prepare", "segment"},
-    "service": BASE | {"origin"},
+    "service": BASE | {"origin", "daemon.config"},
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
         "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
@@ -85,7 +85,7 @@ PARTS = {
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
         "publishing", "segment", "service", "statistics", "daemon.config", "daemon.config_file",
-        "daemon.config_live", "daemon.live.disk",
+        "daemon.config_live", "daemon.config_table", "daemon.live.disk",
         "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip
@@ -93,7 +93,8 @@ PARTS = {
 ROOMS = [
     {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
     {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel"},
-    {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"}, {"config_file", "records"},
+    {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"},
+    {"config_file", "config_table", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 

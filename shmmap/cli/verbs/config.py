@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from pathlib import Path
-from typing import Any
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line
@@ -22,20 +20,6 @@ Sizes stand there under two names, such as budget (as in the file) and budget_by
 _CHECK_JSON = """\
   {"file": path or null, "good": true}
 Exit code: 0 good, 66 no map there, 78 a mistake: the codes that the daemon would exit with."""
-
-_CHOSEN = {
-    "metadata": "beside or inside the map",
-    "runtime_dir": "/run/shmmap; a user's daemon: $XDG_RUNTIME_DIR/shmmap, else /tmp/shmmap-UID",
-    "endpoint": "INSTANCE.sock in the runtime directory",
-    "group": "only the daemon's own user may connect",
-    "admin_group": "only root and the daemon's own user",
-    "budget_bytes": "at start: a quarter of the memory available, at most 4 GiB",
-    "trust": "nothing is verified: the version that the map's origin names is taken",
-    "workers": "at start: one less than there are processors, from 1 to 4",
-    "cache_dir": "the service's or the user's cache directory",
-    "cache_bytes": "no layers are kept",
-}
-"""What a setting stands for that is empty or 0."""
 
 _EPILOG = """\
 `check` and `show` read FILE, or the one that the installed service reads, and SHMMAP_* variables."""
@@ -114,49 +98,35 @@ def run_check(args: argparse.Namespace) -> int:
 
 def run_show(args: argparse.Namespace) -> int:
     """Print every setting."""
-    from shmmap.daemon.config import FILE_NAMES, trace_settings
+    from dataclasses import asdict
+
+    from shmmap.daemon.config import ROWS, trace_settings
     from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.config_live import LIVE_ROWS
 
     file = args.file or installed_config_file()
     settings = trace_settings({}, file=file)
+    live = settings.pop("live")
+    tables = [asdict(one) for one in live.value]
     if args.json:
-        shown = {name: {"value": _plain(one.value), "origin": one.origin} for name, one in settings.items()}
-        shown |= {called: shown[name] for name, called in FILE_NAMES.items()}
+        shown = {name: {"value": one.value, "origin": one.origin} for name, one in settings.items()}
+        shown["live"] = {"value": tables, "origin": live.origin}
+        shown |= {row.called: shown[name] for name, row in ROWS.items()}
         print_json({"file": file or None, "settings": shown})
         return 0
-    live = settings.pop("live")
-    lines = {
-        name: f"{FILE_NAMES.get(name, name)} = {_toml(one.value, size=name in FILE_NAMES)}"
-        for name, one in settings.items()
-    }
+    lines = {name: row.example(settings[name].value)[1] for name, row in ROWS.items()}
     width = max(map(len, lines.values()))
     for name, line in lines.items():
         remarks = [settings[name].origin] if args.origin else []
-        if not settings[name].value and name in _CHOSEN:
-            remarks.append(_CHOSEN[name])
+        if not settings[name].value and ROWS[name].unset:
+            remarks.append(ROWS[name].unset)
         print_line(f"{line.ljust(width)}  # {': '.join(remarks)}" if remarks else line)
-    for table in _plain(live.value):
+    for table in tables:
         print_line()
-        print_line(f"[live.{table.pop('name')}]" + (f"  # {live.origin}" if args.origin else ""))
-        for name, value in table.items():
-            print_line(f"{name} = {_toml(value, size=False)}")
+        print_line(f"[live.{table['name']}]" + (f"  # {live.origin}" if args.origin else ""))
+        for name, row in LIVE_ROWS.items():
+            print_line(row.example(table[name])[1])
     return 0
-
-
-def _plain(value: Any) -> Any:
-    """Settings of live maps as what JSON and TOML can say."""
-    import msgspec
-
-    return [msgspec.structs.asdict(one) for one in value] if isinstance(value, tuple) else value
-
-
-def _toml(value: Any, *, size: bool) -> str:
-    if size and value:
-        for power, unit in ((3, "G"), (2, "M"), (1, "K")):
-            if value % 1024**power == 0:
-                return f'"{value // 1024**power}{unit}"'
-    # settings are strings, numbers and truths, which TOML writes as JSON does
-    return json.dumps(value, ensure_ascii=False)
 
 
 def run_init(args: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_rows import CellRows
-from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.holders import Holders
 from shmmap.daemon.cache.segment_name_watch import LostSegments, SegmentNameWatch
 from shmmap.daemon.cache.survey import Survey

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from shmmap.daemon.cache.eviction.eviction_order import EvictionOrder
+from shmmap.daemon.cache.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.sharded_dict import ShardedDict
 
@@ -73,7 +73,7 @@ class Ledger:
     segments
         All in memory, retired ones included.
     order
-        In which order residents give way.
+        In which order residents are evicted.
     retired_bytes, freeing_bytes
         Memory of what is out of service, and how much of it the kernel is taking back just now.
     condemned_bytes
@@ -175,7 +175,7 @@ class Ledger:
         if count:
             self._needed[key] = count
         elif key in self.by_key:
-            self.order.again(self.by_key[key])
+            self.order.reconsider(self.by_key[key])
 
     def needed(self) -> Iterable[Key]:
         """Keys that requests or pins need."""
@@ -196,8 +196,7 @@ class Ledger:
         self.unchecked_count += not resident.checked
         self.prefetched_bytes += resident.nbytes * resident.prefetched
         self.segments.add(resident)
-        self.order.new[resident] = None
-        self.order.changes += 1
+        self.order.enter(resident)
         if old is not None:
             self._leave_service(old)
         return old

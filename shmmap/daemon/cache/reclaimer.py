@@ -241,7 +241,7 @@ class Reclaimer:
         for resident in residents:
             retired = self.ledger.retired.get(resident.name)
             if retired is None:
-                self.ledger.order.again(resident)
+                self.ledger.order.reconsider(resident)
             elif retired.probe_after_s > now_s and not retired.condemned:
                 self._look_at(retired, now_s)
 
@@ -292,7 +292,7 @@ class Reclaimer:
         """Somebody closed something: have a look at it; whether anything may fit that did not."""
         names = self.pins.closed()
         if names is None:
-            self.ledger.order.all_again()
+            self.ledger.order.reconsider_all()
             self._unheard = self.ledger.segments.walk()
             return True
         changed = False
@@ -304,7 +304,7 @@ class Reclaimer:
                 if not retired.condemned:
                     self._look_at(retired, now_s)
             elif resident is not None:
-                changed |= self.ledger.order.again(resident)
+                changed |= self.ledger.order.reconsider(resident)
         return changed
 
     # --- the end --------------------------------------------------------------------------------

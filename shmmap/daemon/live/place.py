@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from typing import Final
-
-import msgspec
 
 from shmmap.daemon.config_live import LiveSettings, live_directory
 from shmmap.daemon.host.mounts import mounts
@@ -92,7 +91,7 @@ def place_live_maps(
             hint="free some, or lower --live-budget",
         )
     maps = tuple(
-        msgspec.structs.replace(one, path=one.path or live_directory(instance, one.name)) for one in live
+        dataclasses.replace(one, path=one.path or live_directory(instance, one.name)) for one in live
     )
     marks = os.path.join(directory.path, f"shmmap-live.{instance}.marks")
     return Begin(instance, maps, directory.path, marks, budget, gid, marks_gid)

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
-from shmmap.daemon.cache.eviction.evictor import Evictor
+from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.reclaimer import Reclaimer
@@ -96,7 +95,7 @@ class InnerDaemon:
         self.ledger.overhead_bytes = self.statistics.size_bytes
         pins = PinWatch(self.directory, events=True)
         self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, pins)
-        self.evictor = Evictor(self.reclaimer, POLICIES["time"])
+        self.evictor = Evictor(self.reclaimer)
         self.watched = WatchedDescriptors()
         self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
         self.pool = WorkerPool(workers, self.directory, self.parent, load_timeout_s, self.watched)

@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.cli.parser import build_parser
-from shmmap.daemon.config import DaemonConfig, load_config, option_of, parse_bytes
+from shmmap.daemon.config import ROWS, DaemonConfig, load_config, option_of
+from shmmap.daemon.config_table import parse_bytes
 from shmmap.errors import ConfigError
 
 
@@ -108,7 +109,7 @@ BAD: list[tuple[str, Any]] = [
     ("session_quota", -0.5), ("session_quota", "x"), ("session_quota", float("inf")),
     ("session_quota", float("nan")), ("session_quota", "1.2.3"), ("session_quota", "\u00b2"),
     ("budget_bytes", -1), ("budget_bytes", "lots"), ("budget_bytes", 1.5), ("budget_bytes", 1 << 70),
-    ("budget_bytes", True), ("eviction", "fifo"), ("eviction", 3), ("strict", "maybe"), ("strict", 1),
+    ("budget_bytes", True), ("log_level", "loud"), ("log_level", 3), ("strict", "maybe"), ("strict", 1),
     ("instance", "a/b"), ("instance", ""), ("instance", "x" * 65), ("instance", "a.b"), ("instance", 5),
     ("map_path", 5), ("group", ["x"]),
 ]  # fmt: skip
@@ -127,18 +128,44 @@ def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None
 
 def test_the_command_line_has_the_options_that_errors_name() -> None:
     (verbs,) = (one for one in build_parser()._actions if isinstance(one, argparse._SubParsersAction))
-    names = {field.name for field in fields(DaemonConfig)} - {"live"}
-    actions = [action for action in verbs.choices["serve"]._actions if action.dest in names]
-    assert len(actions) >= 15
-    for action in actions:
-        assert option_of(action.dest) in (*action.option_strings, action.metavar)
+    actions = {action.dest: action for action in verbs.choices["serve"]._actions}
+    assert set(actions) == {*(field.name for field in fields(DaemonConfig)), "config", "help", "eviction"}
+    for name in ROWS:
+        assert option_of(name) in (*actions[name].option_strings, actions[name].metavar)
+        assert actions[name].default is None, "the configuration file may say"
 
 
 def test_a_value_out_of_range_is_told_what_may_be() -> None:
-    for name, value, hint in (("eviction", "fifo", "distance or lru"), ("session_quota", "90", "up to 1")):
+    for name, value, hint in (
+        ("log_level", "loud", "debug, info or warning"),
+        ("session_quota", "90", "up to 1"),
+        ("workers", 65, "0 to 64; 0: one less than there are processors"),
+        ("live_budget", "1M", "at least 4M; 0: an eighth"),
+        ("poll_s", "0.5", "1 to 86400 seconds; 0: only on"),
+        ("workers", "many", "its default is 0"),
+        ("cache_size", 1.5, 'its default is "8G"'),
+        ("strict", "maybe", "its default is false"),
+        ("map_path", 5, "in quotes"),
+    ):
         with pytest.raises(ConfigError) as failure:
             load({name: value})
         assert hint in failure.value.hint
+
+
+def test_a_setting_that_is_gone_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    """Also one that says what always holds now."""
+    file = tmp_path / "shmmap.toml"
+    file.write_text('workers = 2\neviction = "time"\n')
+    for flags, environ, path, message, hint in (
+        ({}, {}, str(file), f"{file}:2: eviction is gone: what clients will need", "delete this line"),
+        ({}, {"SHMMAP_EVICTION": "lru"}, "", "SHMMAP_EVICTION: eviction is gone", "unset SHMMAP_EVICTION"),
+        ({"eviction": "distance"}, {}, "", "command line: --eviction is gone", "leave it out"),
+    ):
+        with pytest.raises(ConfigError) as failure:
+            load(flags, environ, path)
+        assert message in failure.value.message
+        assert failure.value.hint == hint
+        assert failure.value.exit_code == 78
 
 
 def test_a_wrong_variable_is_named() -> None:

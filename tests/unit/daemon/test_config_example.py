@@ -4,68 +4,39 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import fields
 from pathlib import Path
 
-import pytest
-
-from shmmap.daemon.config import FILE_NAMES, DaemonConfig, load_config
-from shmmap.daemon.config_live import LiveSettings, live_settings
+from shmmap.daemon.config import ROWS, DaemonConfig, load_config
+from shmmap.daemon.config_live import LIVE_ROWS, LiveSettings
+from shmmap.service.installation import configuration
 from tests.support.daemon_process import ROOT
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 EXAMPLE = ROOT / "systemd" / "shmmap.toml"
-ASSIGNMENT = re.compile(r"#?([a-z_]+) = (.+)")
-SET_FOR_THE_SERVICE = {"map_path", "group"}
-ATTRIBUTES = {called: name for name, called in FILE_NAMES.items()}
+SET_FOR_THE_SERVICE = {"map_path": "/var/lib/shmmap/maps", "group": "shmmap"}
 
 
-def assignments() -> dict[str, str]:
-    """Each assignment of the example, those in comments too, by the setting's name."""
-    found = {}
-    for line in EXAMPLE.read_text(encoding="utf-8").splitlines():
-        if match := ASSIGNMENT.fullmatch(line):
-            found[ATTRIBUTES.get(match[1], match[1])] = line
-    return found
-
-
-def test_every_setting_is_explained() -> None:
-    """A new setting of `DaemonConfig` needs its lines in systemd/shmmap.toml."""
-    assert sorted([*assignments(), "live"]) == sorted(field.name for field in fields(DaemonConfig))
-
-
-def test_every_setting_of_a_live_map_is_explained_with_its_default() -> None:
-    text = EXAMPLE.read_text(encoding="utf-8")
-    table = text[text.index("#[live.lidar]") :].replace("#", "", 1)
-    rows = {match[1]: match[2] for match in re.finditer(r"^#  ([a-z_]+) = (.+)$", table, re.MULTILINE)}
-    default = LiveSettings("lidar")
-    assert set(rows) == set(default.__struct_fields__) - {"name"}
-    lines = [re.sub(r"^#  (?=[a-z_]+ = )", "", line) for line in table.splitlines()]
-    assert live_settings((), tomllib.loads("\n".join(lines))["live"]) == (default,)
-
-
-@pytest.mark.parametrize("name", sorted(assignments()))
-def test_what_is_commented_out_is_the_default(name: str, tmp_path: Path) -> None:
-    line = assignments()[name]
-    assert line.startswith("#") == (name not in SET_FOR_THE_SERVICE)
-    if name not in SET_FOR_THE_SERVICE:
-        file = tmp_path / "one.toml"
-        file.write_text(line.removeprefix("#"))
-        assert getattr(load_config({}, file=str(file), environ={}), name) == getattr(DaemonConfig(), name)
-
-
-def test_every_setting_has_words_above_it() -> None:
-    lines = EXAMPLE.read_text(encoding="utf-8").splitlines()
-    for number, line in enumerate(lines):
-        if ASSIGNMENT.fullmatch(line):
-            assert lines[number - 1].startswith("# "), line
+def test_it_is_the_one_that_settings_make() -> None:
+    """After a setting is changed: ``python -m tests.unit.daemon.test_config_example`` writes it again."""
+    assert EXAMPLE.read_text(encoding="utf-8") == configuration()
 
 
 def test_it_can_be_used_as_it_stands() -> None:
-    config = load_config({}, file=str(EXAMPLE), environ={})
-    assert (config.map_path, config.group) == ("/var/lib/shmmap/maps", "shmmap")
+    assert load_config({}, file=str(EXAMPLE), environ={}) == DaemonConfig(**SET_FOR_THE_SERVICE)
+
+
+def test_what_is_commented_out_are_all_settings_with_their_defaults(tmp_path: Path) -> None:
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assignment = re.compile(r"^#?(?:  )?(?=([a-z_]+) = |\[live\.lidar\]$)", re.MULTILINE)
+    named = [match[1] for match in assignment.finditer(text) if match[1]]
+    assert named == [*(row.called for row in ROWS.values()), *LIVE_ROWS]
+    assert [*ROWS, "live"] == [one.name for one in fields(DaemonConfig)]
+    assert ["name", *LIVE_ROWS] == [one.name for one in fields(LiveSettings)]
+    file = tmp_path / "all.toml"
+    file.write_text(assignment.sub("", text))
+    expected = DaemonConfig(**SET_FOR_THE_SERVICE, live=(LiveSettings("lidar"),))
+    assert load_config({}, file=str(file), environ={}) == expected
+
+
+if __name__ == "__main__":
+    EXAMPLE.write_text(configuration(), encoding="utf-8")

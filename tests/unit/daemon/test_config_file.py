@@ -15,12 +15,12 @@ from shmmap.errors import ConfigError
 
 def test_each_setting_knows_its_origin(tmp_path: Path) -> None:
     file = tmp_path / "shmmap.toml"
-    file.write_text("# settings\nworkers = 2\n\n  'eviction' = \"lru\"\nbudget = '1G'\ninstance = \"car\"\n")
+    file.write_text("# settings\nworkers = 2\n\n  'log_level' = \"debug\"\nbudget = '1G'\ninstance = 'car'\n")
     found = trace_settings(
         {"instance": "bus", "group": None}, file=str(file), environ={"SHMMAP_BUDGET": "2G", "HOME": "/"}
     )
     assert found["workers"] == (2, f"{file}:2")
-    assert found["eviction"] == ("lru", f"{file}:4")
+    assert found["log_level"] == ("debug", f"{file}:4")
     assert found["budget_bytes"] == (2 << 30, "SHMMAP_BUDGET")
     assert found["instance"] == ("bus", "command line")
     assert found["group"] == ("", "default")

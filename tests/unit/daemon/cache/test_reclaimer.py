@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from shmmap.daemon.cache.eviction.eviction_policy import POLICIES
-from shmmap.daemon.cache.eviction.evictor import WORK_AT_ONCE, Evictor
+from shmmap.daemon.cache.evictor import WORK_AT_ONCE, Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
@@ -38,7 +37,7 @@ class Memory:
         self.reclaimer = Reclaimer(self.ledger, directory, Sessions(), self.pins)
         self.reclaimer.on_retired = lambda *_: None
         self.reclaimer.on_gone = lambda *_: None
-        self.evictor = Evictor(self.reclaimer, POLICIES["lru"])
+        self.evictor = Evictor(self.reclaimer)
         self.looks = 0
         look = PinWatch.is_used_elsewhere
 
@@ -267,7 +266,7 @@ def test_what_the_kernel_will_tell_of_is_looked_at_less_and_less(memory: Memory)
         for _ in range(8):
             assert sum(memory.until_it_waits(SMALL, now_s)) == 1
             assert not memory.evictor.free(SMALL, now_s)
-            first = memory.ledger.order.aside.first()
+            first = memory.ledger.order.deferred.first()
             assert first is not None
             found.append(round(first[0] - now_s, 3))
             now_s = first[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which segments give way, against a plain sort; and how little work it takes."""
+"""The order in which segments are evicted, against a plain sort; and how little work it takes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from shmmap.daemon.cache.eviction.eviction_order import BATCH, FRONT, TRIES, EvictionOrder, Score
+from shmmap.daemon.cache.eviction_order import BATCH, FRONT, TRIES, EvictionOrder, Score
 from shmmap.daemon.records import Key, Resident
 
 
@@ -74,7 +74,7 @@ class Machine(RuleBasedStateMachine):
         one = made(self.number, last_use_s)
         self.worth.of_number[self.number] = score
         self.known[one] = -math.inf
-        self.order.new[one] = None
+        self.order.enter(one)
 
     @precondition(lambda self: self.known)
     @rule(draw=st.integers(0, 100))
@@ -84,25 +84,25 @@ class Machine(RuleBasedStateMachine):
         self.order.leave(one)
 
     @precondition(lambda self: self.known)
-    @rule(draw=st.integers(0, 100), delay_s=st.sampled_from([0.5, 2.0, math.inf]), graced=st.booleans())
-    def set_aside(self, draw: int, delay_s: float, graced: bool) -> None:
+    @rule(draw=st.integers(0, 100), delay_s=st.sampled_from([0.5, 2.0, math.inf]), in_grace=st.booleans())
+    def defer(self, draw: int, delay_s: float, in_grace: bool) -> None:
         one = self.any(draw)
-        self.order.set_aside(one, self.order.graced if graced else self.order.aside, self.now_s + delay_s)
+        self.order.defer(one, self.order.in_grace if in_grace else self.order.deferred, self.now_s + delay_s)
         self.known[one] = self.now_s + delay_s
 
     @precondition(lambda self: self.known)
     @rule(draw=st.integers(0, 100))
-    def again(self, draw: int) -> None:
+    def reconsider(self, draw: int) -> None:
         one = self.any(draw)
-        if one not in self.order.graced:
+        if one not in self.order.in_grace:
             self.known[one] = -math.inf
-        self.order.again(one)
+        self.order.reconsider(one)
 
     @rule()
-    def all_again(self) -> None:
-        self.order.all_again()
+    def reconsider_all(self) -> None:
+        self.order.reconsider_all()
         for one in self.known:
-            if one not in self.order.graced:
+            if one not in self.order.in_grace:
                 self.known[one] = -math.inf
 
     @precondition(lambda self: self.known)
@@ -142,7 +142,7 @@ def test_all_of_many_in_order(count: int) -> None:
     some = [made(number, random.random()) for number in range(count)]
     for one in some:
         worth.of_number[one.version] = random.random() * 100
-        order.new[one] = None
+        order.enter(one)
     while not order.settled:
         order.score_new(worth.score)
     for one in random.sample(some, count // 3):
@@ -159,7 +159,7 @@ def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
     order, some = EvictionOrder(), [made(number) for number in range(count)]
     for one in some:
         worth.of_number[one.version] = float(one.version)
-        order.new[one] = None
+        order.enter(one)
     while not order.settled:
         order.score_new(worth.score)
     return order, some
@@ -203,14 +203,14 @@ def test_so_many_come_back_at_a_time() -> None:
     worth = Worth()
     order, some = settled(4 * BATCH, worth)
     for one in some:
-        order.set_aside(one, order.aside, 5.0)
+        order.defer(one, order.deferred, 5.0)
     assert offered(order, worth, 4.0) == []
     before = order.scored
     assert len(offered(order, worth, 5.0)) == FRONT
     assert order.scored - before == FRONT
-    assert len(order.aside) == 2 * BATCH
-    order.all_again()
-    assert len(order.aside) == 0
+    assert len(order.deferred) == 2 * BATCH
+    order.reconsider_all()
+    assert len(order.deferred) == 0
     offered(order, worth, 5.0)
     assert order.scored - before == FRONT, "there are enough"
     order.score_new(worth.score)

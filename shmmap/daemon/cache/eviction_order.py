@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which segments give way, kept while they come, go and are used; without any I/O.
+"""The order in which segments are evicted, kept while they come, go and are used; without any I/O.
 
 Asking for the next ones costs O(log n), however many segments there are.  Scores are remembered: those at
-the front are checked whenever somebody asks, so that nothing goes by an outdated one; all others are
+the front are checked at each question, so that nothing is evicted by an outdated one; all others are
 brought up to date a few at a time (`EvictionOrder.refresh`) while clients move.  What has become worth
 less since is found at the next round.  As long as no client moves, the order is exactly that of a sort.
 
-A segment that cannot go now is set aside: until a time, or until somebody says that it may (`again`).
+A segment that cannot be evicted now is deferred: until a time, or until `EvictionOrder.reconsider`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import Final, NamedTuple
 from shmmap.daemon.records import Resident
 from shmmap.sharded_dict import ShardedDict
 
-__all__ = ["BATCH", "FRONT", "EvictionOrder", "Score", "SetAside"]
+__all__ = ["BATCH", "FRONT", "Deferred", "EvictionOrder", "Score"]
 
 FRONT: Final = 8
-"""Segments offered at a time; when fewer are in order, so many are scored."""
+"""Segments offered at a time; when fewer are in order, as many are scored."""
 TRIES: Final = 4
-"""How often the front is scored anew before it is taken as it is, if its scores were outdated."""
+"""How often the front is scored again before it is taken as it is, if its scores were outdated."""
 BATCH: Final = 16
 """Segments scored, or taken back, at a time: 0.1 ms, if all their places in the order change."""
 TOLERANCE: Final = 0.1
@@ -41,9 +41,9 @@ class Score(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """A segment by its score; the greatest goes first. No two have the same number."""
+    """A segment by its score; the greatest is evicted first. No two have the same number."""
 
-    loose: bool  # no session says that it holds it: most likely nobody has it mapped
+    unclaimed: bool  # no session says that it holds it: most likely no process has it mapped
     score: float
     unused: float
     number: int
@@ -55,7 +55,7 @@ class _Entry(NamedTuple):
         return (
             self.version != version
             or self.unused != -resident.last_use_s
-            or self.loose is bool(resident.sessions)
+            or self.unclaimed is bool(resident.sessions)
         )
 
 
@@ -99,8 +99,8 @@ class _Sorted:
         return found
 
 
-class SetAside:
-    """Segments that cannot go now, and until when; infinity for those that somebody will speak of."""
+class Deferred:
+    """Segments that cannot be evicted now, and until when; infinity: until they are reconsidered."""
 
     def __init__(self) -> None:
         self._until_s: ShardedDict[Resident, float | None] = ShardedDict()
@@ -114,18 +114,18 @@ class SetAside:
         return resident in self._until_s
 
     def put(self, resident: Resident, until_s: float) -> None:
-        """Set one aside."""
+        """Add a segment."""
         self._until_s[resident] = until_s
         if until_s < math.inf:
             self._number += 1
             heapq.heappush(self._heap, (until_s, self._number, resident))
 
     def take(self, resident: Resident) -> bool:
-        """Take one back; whether it was there."""
+        """Remove a segment; whether it was there."""
         return self._until_s.pop(resident, None) is not None
 
     def first(self) -> tuple[float, Resident] | None:
-        """Whose time comes next, and when."""
+        """Return the segment whose time comes next, and when that is."""
         while self._heap:
             until_s, _, resident = self._heap[0]
             if self._until_s.get(resident) == until_s:
@@ -134,7 +134,7 @@ class SetAside:
         return None
 
     def due(self, now_s: float) -> list[Resident]:
-        """Take back those whose time has come, a bounded number."""
+        """Remove and return segments whose time has come, a bounded number."""
         found = []
         for _ in range(BATCH):
             if not self._heap or self._heap[0][0] > now_s:
@@ -146,33 +146,31 @@ class SetAside:
         return found
 
     def take_all(self) -> ShardedDict[Resident, float | None]:
-        """Take back all."""
+        """Remove and return all segments."""
         found, self._until_s = self._until_s, ShardedDict()
         return found
 
 
 class EvictionOrder:
-    """All residents, each in one place: new (not scored yet), in order, or set aside.
+    """All residents, each in one place: new (not scored yet), in order, or deferred.
 
     Attributes
     ----------
-    graced
-        Set aside: just handed out, their readers may be opening them.
-    aside
-        Set aside: somebody needs or maps them.
-    new : ShardedDict
-        Not scored yet; whatever comes into service is put here.
+    in_grace
+        Deferred because they were just handed out: their readers may be opening them.
+    deferred
+        Deferred because a request or pin needs them, or a process has them mapped.
     changes : int
-        How often something came or was taken back: there may be more that can go now.
+        How often a segment came or was reconsidered: there may be more that can be evicted now.
     scored : int
         How many scores were computed so far.
     """
 
     def __init__(self) -> None:
-        self.graced = SetAside()
-        self.aside = SetAside()
+        self.in_grace = Deferred()
+        self.deferred = Deferred()
         self.scored = self.changes = 0
-        self.new: ShardedDict[Resident, float | None] = ShardedDict()
+        self._new: ShardedDict[Resident, float | None] = ShardedDict()
         self._entries: ShardedDict[Resident, _Entry] = ShardedDict()
         self._sorted = _Sorted()
         self._number = 0
@@ -180,44 +178,48 @@ class EvictionOrder:
         self._tried: dict[Resident, None] = {}
 
     def __len__(self) -> int:
-        return len(self.new) + len(self._entries) + len(self.graced) + len(self.aside)
+        return len(self._new) + len(self._entries) + len(self.in_grace) + len(self.deferred)
+
+    def enter(self, resident: Resident) -> None:
+        """Add a segment that came into service, or may be evicted again."""
+        self._new[resident] = None
+        self.changes += 1
 
     def leave(self, resident: Resident) -> None:
-        """It is not any more."""
+        """Remove a segment from the order."""
         entry = self._entries.pop(resident, None)
         if entry is not None:
             self._sorted.remove(entry)
-        elif resident in self.new:
-            del self.new[resident]
-        elif not self.graced.take(resident):
-            self.aside.take(resident)
+        elif resident in self._new:
+            del self._new[resident]
+        elif not self.in_grace.take(resident):
+            self.deferred.take(resident)
 
-    def again(self, resident: Resident) -> bool:
-        """Somebody who used it says that it does not; whether it had been set aside for that."""
-        entry, resident.aside_s = self._entries.get(resident), 0.0
-        if self.aside.take(resident) or (entry is not None and entry.loose is bool(resident.sessions)):
+    def reconsider(self, resident: Resident) -> bool:
+        """Take note that a user of a segment has released it; whether it had been deferred for that."""
+        entry, resident.deferred_s = self._entries.get(resident), 0.0
+        if self.deferred.take(resident) or (entry is not None and entry.unclaimed is bool(resident.sessions)):
             self.leave(resident)
-            self.new[resident] = None
-            self.changes += 1
+            self.enter(resident)
             return entry is None
         return False
 
-    def all_again(self) -> None:
-        """Anything that was set aside as mapped or needed may not be any more."""
-        few, many = self.new, self.aside.take_all()
+    def reconsider_all(self) -> None:
+        """Take note that any segment deferred as mapped or needed may have been released."""
+        few, many = self._new, self.deferred.take_all()
         if len(few) > len(many):
             few, many = many, few
         many.update(few)  # however many there are, few of them are touched
         self.changes += 1
-        self.new = many
+        self._new = many
 
-    def set_aside(self, resident: Resident, where: SetAside, until_s: float) -> None:
-        """It cannot go now; ``where`` is `graced` or `aside`."""
+    def defer(self, resident: Resident, where: Deferred, until_s: float) -> None:
+        """Defer a segment; ``where`` is `in_grace` or `deferred`."""
         self.leave(resident)
         where.put(resident, until_s)
 
     def front(self, score: Score) -> list[Resident] | None:
-        """Those that should go first, in that order, at most `FRONT`; empty when all are set aside.
+        """Return what should be evicted first, in that order, at most `FRONT`; empty if all are deferred.
 
         As far as they have been scored, see `fill`.  None if scores at the front were outdated: they were
         brought up to date, and it is worth asking again.
@@ -240,21 +242,21 @@ class EvictionOrder:
     @property
     def settled(self) -> bool:
         """Whether all have been scored."""
-        return not self.new
+        return not self._new
 
     def fill(self, score: Score, now_s: float) -> bool:
-        """Score some of those that came or may go again if there are few in order; whether there were any."""
-        for resident in (*self.graced.due(now_s), *self.aside.due(now_s)):
-            self.new[resident] = None
-        if len(self._entries) >= FRONT or not self.new:
+        """Score some new segments, or some whose time has come, if few are in order; whether any were."""
+        for resident in (*self.in_grace.due(now_s), *self.deferred.due(now_s)):
+            self._new[resident] = None
+        if len(self._entries) >= FRONT or not self._new:
             return False  # they wait: many at once cost little more than one
         self.score_new(score, FRONT)
         return True
 
     def score_new(self, score: Score, most: int = BATCH) -> None:
-        """Score those that came, a bounded number."""
-        if self.new:
-            self._place([self.new.popitem()[0] for _ in range(min(most, len(self.new)))], score)
+        """Score new segments, a bounded number."""
+        if self._new:
+            self._place([self._new.popitem()[0] for _ in range(min(most, len(self._new)))], score)
 
     def refresh(self, some: Iterable[Resident], score: Score) -> None:
         """Bring the scores of some segments up to date."""
@@ -264,8 +266,8 @@ class EvictionOrder:
             return
         scores = self._scores([entry.resident for entry in outdated], score)
         for entry, now in zip(outdated, scores, strict=True):
-            loose = not entry.resident.sessions
-            if loose is not entry.loose or abs(now - entry.score) > TOLERANCE * abs(entry.score):
+            unclaimed = not entry.resident.sessions
+            if unclaimed is not entry.unclaimed or abs(now - entry.score) > TOLERANCE * abs(entry.score):
                 self._put(entry.resident, now, score.version)
 
     def _place(self, some: Sequence[Resident], score: Score) -> None:
