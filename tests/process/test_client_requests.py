@@ -21,8 +21,7 @@ import pytest
 
 import shmmap
 from shmmap.client import map_listing
-from shmmap.client.connection import Connection
-from shmmap.client.program_name import program_name
+from shmmap.client.connection import Connection, program_name
 from shmmap.errors import (
     BadRequest,
     LoadFailed,
