@@ -325,8 +325,8 @@ class Client:
         *,
         new: bool = True,
     ) -> CellSet:
-        """Return an answer; what it lacks is said, or raised."""
-        if not found.complete or not any(cell.points for cell in found.cells):
+        """Return an answer; what it lacks is said, or raised.  Where not all are ``new``, it may be empty."""
+        if not found.complete or (new and not any(cell.points for cell in found.cells)):
             from shmmap.lacking import judge
 
             judge(self, found, area, waited=bool(wait), strict=strict, new=new)
