@@ -41,9 +41,8 @@ if TYPE_CHECKING:
         connect,
     )
     from shmmap.client.live.chunk_reader import ChunkInfo
-    from shmmap.client.live.live_map import LiveMap, Sphere
+    from shmmap.client.live.live_map import LiveMap, Sphere, Voxels
     from shmmap.client.live.mapper import LiveMapper
-    from shmmap.client.live.voxels import Voxels
     from shmmap.errors import (
         BadRequest,
         Busy,
@@ -181,7 +180,7 @@ _LIVE: Final = {
     "LiveMapRow": "protocol.live",
     "LiveMapper": "client.live.mapper",
     "Sphere": "client.live.live_map",
-    "Voxels": "client.live.voxels",
+    "Voxels": "client.live.live_map",
 }
 _LAYERS: Final = {
     "LayerKind": "contract",

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Handles to cells: each segment is mapped once in a client, and unmapped where no thread is disturbed.
 
+What this process sees of the daemon's segments shows in the one that every daemon has, its statistics.
+
 Cells and views end wherever the last reference to them is dropped, in any thread and in the middle of
 anything.  What happens then is built in, appending to a deque or putting into a `queue.SimpleQueue`: it takes
 no lock, and no signal handler runs in it, whose exception Python would have to ignore.
@@ -9,18 +11,19 @@ no lock, and no signal handler runs in it, whose exception Python would have to 
 from __future__ import annotations
 
 import contextlib
+import os
 import warnings
 import weakref
 from collections import deque
 from queue import Empty, SimpleQueue
 
 from shmmap.client.cell import Access, Cell
-from shmmap.errors import ShmmapWarning
+from shmmap.errors import SegmentError, ShmmapWarning
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import attach
 from shmmap.segment.owned import Owned
 
-__all__ = ["Attacher"]
+__all__ = ["Attacher", "check_visible", "owner_of_segments"]
 
 
 class _Attached(weakref.ref[Cell]):
@@ -128,7 +131,7 @@ class Attacher:
         return bool(self._mapped)
 
     def unmapped(self) -> list[int]:
-        """Versions of which nothing is mapped any more; to be emptied by whoever has told the daemon."""
+        """Versions of which nothing is mapped any more; to be emptied when the daemon knows them."""
         while self._ended:
             version = self._ended[0].version  # it stays until all is done: an exception may come anywhere
             known = left = self._mapped.get(version)
@@ -160,3 +163,35 @@ class Attacher:
         """After a fork: threads stayed in the parent, and so did the session of what is unmapped here."""
         self._ended = deque()
         self._sinks.clear()
+
+
+# --- the daemon's segments, as this process sees them ---------------------------------------------
+
+
+def owner_of_segments(shm_dir: str, segment_prefix: str) -> int | None:
+    """User whose segments they are, as this process sees it; None where it sees none."""
+    try:
+        return os.lstat(_statistics_path(shm_dir, segment_prefix)).st_uid
+    except OSError:
+        return None
+
+
+def check_visible(shm_dir: str, segment_prefix: str) -> None:
+    """Refuse a directory without the daemon's statistics: in a container it may be another one.
+
+    Raises
+    ------
+    SegmentError
+        The directory, as this process sees it, is not the daemon's.
+    """
+    if owner_of_segments(shm_dir, segment_prefix) is None:
+        raise SegmentError(
+            f"the daemon's segments are not in {shm_dir}, as this process sees it",
+            hint="in a container mount the daemon's directory of segments, and name it with shm_dir or"
+            " SHMMAP_SHM_DIR where its path differs",
+        )
+
+
+def _statistics_path(shm_dir: str, segment_prefix: str) -> str:
+    """Path of the statistics segment of the daemon whose segments' names begin so."""
+    return f"{shm_dir}/{segment_prefix.lstrip('/')}statistics"

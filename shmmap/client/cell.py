@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
+from shmmap.optional_packages import needed_packages
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment, attach_writable
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp
@@ -127,9 +128,16 @@ class Cell:
     def handle(self) -> Handle:
         """Return the handle it was attached by, with its whole segment's name."""
         return Handle(
-            self.name, self.version, self.layer, self.segment, self.offset, self.nbytes, self.points,
-            *self.box, self.stale,
-        )  # fmt: skip
+            self.name,
+            self.version,
+            self.layer,
+            self.segment,
+            self.offset,
+            self.nbytes,
+            self.points,
+            *self.box,
+            self.stale,
+        )
 
     # --- what it is ---------------------------------------------------------------------------
 
@@ -177,7 +185,7 @@ class Cell:
         return MappingProxyType({name: self[name] for name in self.column_names})
 
     def unit(self, column: str) -> str:
-        """SI unit of a column, empty where the source does not tell; errors are those of ``cell[column]``."""
+        """SI unit of a column, empty where the source names none; errors are those of ``cell[column]``."""
         self[column]
         return next(row[5] for row in self._attached.columns if row[0] == column)
 
@@ -241,6 +249,9 @@ class Cell:
         self._attached.verify()
 
     # --- other libraries ------------------------------------------------------------------------
+    # None of them knows read-only memory: the memory that they are given may be written.  DLPack: numpy 2.1
+    # and later export ``cell.xyz`` read-only to consumers that ask for DLPack 1.0, as
+    # ``np.from_dlpack(cell.xyz)`` does; older consumers get a BufferError, never a copy.
 
     def to_open3d(self) -> open3d.t.geometry.PointCloud:
         """Return an Open3D tensor point cloud over the cell's memory, which may be written.
@@ -254,9 +265,15 @@ class Cell:
         LimitReached
             There is no room for another mapping, and no memory for a copy.
         """
-        from shmmap.client.wrapping import open3d_cloud
+        with needed_packages("to_open3d()"):
+            import open3d
 
-        return open3d_cloud(self._writable())
+        cloud = open3d.t.geometry.PointCloud()
+        for name, view in self._writable().items():
+            # Open3D wants a row per point, also where a point has one value
+            rows = view if view.ndim > 1 else view.reshape(-1, 1)
+            cloud.point["positions" if name == "xyz" else name] = open3d.core.Tensor.from_numpy(rows)
+        return cloud
 
     def to_torch(self) -> dict[str, torch.Tensor]:
         """Return torch tensors by column name over the cell's memory, which may be written.
@@ -269,12 +286,13 @@ class Cell:
         LimitReached
             There is no room for another mapping, and no memory for a copy.
         """
-        from shmmap.client.wrapping import torch_tensors
+        with needed_packages("to_torch()"):
+            import torch
 
-        return torch_tensors(self._writable())
+        return {name: torch.from_numpy(view) for name, view in self._writable().items()}
 
     def _writable(self) -> Mapping[str, NDArray[Any]]:
-        """Return the columns over memory that may be written without anybody else's seeing it."""
+        """Return the columns over memory that may be written, which no other view or process sees."""
         segment = self._attached
         if self._access is not None:
             segment = attach_writable(segment, self.segment, offset=self.offset, shm_dir=self._access.shm_dir)

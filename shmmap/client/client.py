@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 import numpy as np
 
 from shmmap import geometry
-from shmmap.client.arguments import heights, names, timeout_s
-from shmmap.client.cell_set import CellSet
+from shmmap.client.arguments import checked_intent, heights, names, timeout_s
+from shmmap.client.cell_set import CellSet, Held, HeldCells
+from shmmap.client.connection import until_served
 from shmmap.client.discovery import candidates
-from shmmap.client.held import Held, HeldCells
-from shmmap.client.operator_requests import OperatorRequests
-from shmmap.client.route import sendable
 from shmmap.client.session import Session
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Intent, Welcome
@@ -31,6 +29,9 @@ __all__ = ["DEFAULT_WAIT_S", "Client", "MapOrigin", "connect"]
 
 DEFAULT_WAIT_S: Final = 5.0
 CONNECT_S: Final = 60.0
+RELOAD_S: Final = 60.0
+RELOAD_CELL_S: Final = 60e-6
+"""How long reading a map's catalogue may take, in all and for each cell, beside what any request may."""
 
 
 class MapOrigin(NamedTuple):
@@ -55,7 +56,7 @@ class MapOrigin(NamedTuple):
     unit_m: tuple[float, float]
 
 
-class Client(OperatorRequests):
+class Client:
     """A session with the daemon; get one from `connect`.
 
     May be used from several threads: one request is on its way at a time, others wait for it.
@@ -77,8 +78,8 @@ class Client(OperatorRequests):
         name: str,
         shm_dir: str,
     ) -> None:
-        super().__init__(
-            Session(paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir)
+        self._session = Session(
+            paths, timeout_s=timeout, connect_timeout_s=connect_timeout, name=name, shm_dir=shm_dir
         )
 
     def __enter__(self) -> Client:
@@ -133,7 +134,7 @@ class Client(OperatorRequests):
 
     @property
     def epoch(self) -> int:
-        """Which life of the daemon the session is with."""
+        """Which run of the daemon the session is with."""
         return self._session.welcome.epoch
 
     @property
@@ -211,7 +212,7 @@ class Client(OperatorRequests):
             This user may not read the segments, or the process has no room for more mappings.
         """
         specs = names("layers", layers)
-        message, sent = messages.area_to_message(area), sendable(intent)
+        message, sent = messages.area_to_message(area), checked_intent(intent)
         found = self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
         return found if strict is None else self._judged(found, area, wait, strict)
 
@@ -274,7 +275,7 @@ class Client(OperatorRequests):
             Cells of earlier answers; or ids, alone (meaning the current version) or with a version.
         by_name
             Send held cells by name and version, not by version alone: for the first request to a
-            restarted daemon, which cannot know what the versions of an earlier life belonged to.
+            restarted daemon, which cannot know what the versions of a previous run belonged to.
         populate
             Let the kernel map every page while attaching instead of at first touch.
         timeout
@@ -283,7 +284,7 @@ class Client(OperatorRequests):
         Other parameters and errors are those of `area`.
         """
         specs = names("layers", layers)
-        message, sent = messages.area_to_message(area), sendable(intent)
+        message, sent = messages.area_to_message(area), checked_intent(intent)
         mine = HeldCells(held, by_name=by_name)
         found = self._session.ask_cells(
             lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, sent),
@@ -311,7 +312,7 @@ class Client(OperatorRequests):
         parameters and errors are those of `area`.
         """
         specs = names("layers", layers)
-        wanted, sent = names("ids", ids), sendable(intent)
+        wanted, sent = names("ids", ids), checked_intent(intent)
         found = self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, sent), wait)
         return found if strict is None else self._judged(found, None, wait, strict)
 
@@ -324,19 +325,19 @@ class Client(OperatorRequests):
         *,
         new: bool = True,
     ) -> CellSet:
-        """Return an answer; what it lacks is said, or raised."""
-        if not found.complete or not any(cell.points for cell in found.cells):
+        """Return an answer; what it lacks is said, or raised.  Where not all are ``new``, it may be empty."""
+        if not found.complete or (new and not any(cell.points for cell in found.cells)):
             from shmmap.lacking import judge
 
             judge(self, found, area, waited=bool(wait), strict=strict, new=new)
         return found
 
     def release(self) -> int:
-        """Tell the daemon now what this process let go since the last request; returns how many versions.
+        """Report now what this process has dropped since the last request; returns how many versions.
 
-        Every request tells it anyway; this is for programs that drop cells and then stay quiet.
+        Every request reports it, too; this is for programs that drop cells and then ask for nothing.
         """
-        return self._session.tell_unmapped()
+        return self._session.report_unmapped()
 
     # --- live maps ------------------------------------------------------------------------------
 
@@ -361,7 +362,6 @@ class Client(OperatorRequests):
 
     def live_maps(self) -> tuple[LiveMapRow, ...]:
         """Which live maps the daemon keeps, and how they are."""
-        from shmmap.client.live.patience import until_served
         from shmmap.protocol.live import LiveList, LiveListed
 
         return until_served(lambda: self._session.ask(LiveList, LiveListed).maps, self.timeout)
@@ -381,11 +381,88 @@ class Client(OperatorRequests):
             Only what changed after this map version, if the daemon still knows it
             (`MapListing.since_known`).
         most
-            If there are more, some of them are enough: more than so many, the first ones.
+            If the map has more, some of them are enough: the first ones, more than this many.
         """
         from shmmap.client.map_listing import list_cells  # most clients never ask
 
         return list_cells(self._session, area, since, most=most)
+
+    # --- the daemon, for operators ----------------------------------------------------------------
+
+    def stats(self) -> messages.StatsReply:
+        """Return the daemon's counters, its sessions, and memory that processes without a session use."""
+        return self._session.ask(messages.Stats, messages.StatsReply)
+
+    def show(self, cell: str) -> messages.ShownCell:
+        """Return everything about one cell: versions, segments and which processes use them, last failure.
+
+        Raises
+        ------
+        UnknownCell
+            The map has no such cell.
+        """
+        return self._session.ask(lambda n: messages.Show(n, cell), messages.ShownCell)
+
+    def reload(self) -> messages.Reloaded:
+        """Have the daemon read the map's directory again.
+
+        That may take a minute more than other requests, and another one for every million cells: all files
+        are looked at.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        """
+        most_s = RELOAD_S + RELOAD_CELL_S * self._session.welcome.cells
+        return self._session.ask(messages.Reload, messages.Reloaded, quiet_s=most_s)
+
+    def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
+        """Have the daemon drop cells, all by default; those in use are freed when they are released.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        """
+        wanted = names("ids", ids) if ids is not None else None
+        return self._session.ask(lambda n: messages.Evict(n, wanted), messages.Evicted)
+
+    def pin(
+        self, ids: str | Iterable[str] = (), layers: str | Sequence[str] = ("points",)
+    ) -> messages.Pinned:
+        """Have the daemon keep cells in memory, until `unpin` or its end; without ids, list its pins.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        OverBudget
+            All pins together would exceed the budget.
+        """
+        wanted, specs = names("ids", ids), names("layers", layers)
+        return self._session.ask(lambda n: messages.Pin(n, wanted, specs), messages.Pinned)
+
+    def unpin(self, ids: str | Iterable[str] | None = None) -> messages.Pinned:
+        """Have the daemon keep cells, all by default, no longer; returns what stays pinned.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        """
+        wanted = names("ids", ids) if ids is not None else None
+        return self._session.ask(lambda n: messages.Unpin(n, wanted), messages.Pinned)
+
+    def shutdown(self) -> None:
+        """End the daemon, as SIGTERM would; what is mapped stays readable.
+
+        Raises
+        ------
+        NotPermitted
+            The daemon lets only administrators do this.
+        """
+        self._session.ask(messages.Shutdown, messages.Stopping)
 
 
 def connect(
@@ -411,8 +488,8 @@ def connect(
     timeout
         Seconds a reply may take; what a request lets the daemon wait comes on top.
     connect_timeout
-        Seconds until the daemon must have said welcome, where there is one: where nobody listens, that is
-        said at once.  Long, since when a machine starts many programs at once everybody waits for processors.
+        Seconds until the daemon must have said welcome, where there is one; where nothing listens, that is
+        an error at once.  Long, since programs wait for processors when a machine starts many at once.
     name
         How this program appears in ``shmmap clients``, at most 64 characters; empty: by the name of its
         script, or of the module it was started as (``python -m``).
@@ -425,7 +502,7 @@ def connect(
     NoSocket, SocketPermission, StaleSocket, NoAnswer
         Why no daemon can be reached; all of them are `DaemonUnreachable`.
     ProtocolMismatch
-        Who listens is no shmmap daemon, or one of another major version.
+        What listens is no shmmap daemon, or one of another major version.
     LimitReached
         This process may not have the descriptors or threads that are needed.
     BadRequest

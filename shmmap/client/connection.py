@@ -3,32 +3,40 @@
 
 A request travels on a DEALER socket, which reconnects by itself.  What was in flight when a daemon
 was killed is lost; so a request is sent again, with the same id, as soon as the connection is back,
-and now and then while nothing is heard.  Every request may be repeated; replies to requests that
-nobody waits for any more are dropped.
+and now and then during silence.  Every request may be repeated; replies to requests that are no longer
+waited for are dropped.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import sys
+import threading
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from typing import Any, Final, TypeVar
 
 import zmq
 
-from shmmap.client.connection_watch import CONNECTION, FILES, ConnectionWatch
+from shmmap.client.connection_watch import CONNECTION, FILES, ConnectionWatch, stop_orphans
 from shmmap.client.discovery import find_socket
-from shmmap.client.orphans import stop_orphans
-from shmmap.client.program_name import program_name
-from shmmap.errors import BadRequest, LimitReached, NoAnswer, ProtocolMismatch, ShmmapError, error_from_wire
+from shmmap.errors import (
+    BadRequest,
+    LimitReached,
+    LiveInterrupted,
+    NoAnswer,
+    ProtocolMismatch,
+    ShmmapError,
+    error_from_wire,
+)
 from shmmap.protocol.codec import decode_reply, encode, encode_request
 from shmmap.protocol.messages import PROTOCOL_VERSION, ErrorReply, Hello, Reply, Request, Welcome
 from shmmap.segment.process_limits import check_files
 
-__all__ = ["Connection"]
+__all__ = ["SERVED_PAUSE_S", "Connection", "closed", "program_name", "until_served"]
 
 R = TypeVar("R")
 
@@ -47,6 +55,9 @@ _OPTIONS: Final = (
 )
 _SILENT_HINT: Final = "the daemon is stopped, hung, overloaded or gone: see `shmmap health`"
 _UPDATE_HINT: Final = "update the older of client and daemon"
+_MAX_NAME: Final = 64  # characters of a program's name that the daemon keeps
+SERVED_PAUSE_S: Final = 0.05
+"""Between two tries to reach a live map: nothing reports that its process is there again."""
 
 
 class Connection:
@@ -118,8 +129,8 @@ class Connection:
         self._next_request += 1
         return self._next_request
 
-    def tell(self, message: Request) -> None:
-        """Send a message whose reply nobody waits for; lost if the daemon is away."""
+    def send(self, message: Request) -> None:
+        """Send a message whose reply is not waited for; lost if the daemon is away."""
         self._send(encode_request(message))
 
     def ask(self, message: Request, kind: type[R], *, timeout_s: float, quiet_s: float = 0.0) -> R:
@@ -166,7 +177,7 @@ class Connection:
             self._greet(deadline_s)
 
     def _greet(self, deadline_s: float) -> None:
-        """Begin a session; where that is interrupted, nobody knows how far it came, and it is begun again."""
+        """Begin a session; one whose beginning is interrupted may be incomplete, and is begun again."""
         started_s = time.monotonic()
         self._greeting = True
         hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name, self._slot)
@@ -260,3 +271,48 @@ class Connection:
 
 def _slice_ms(deadline_s: float) -> int:
     return max(0, min(_SLICE_MS, math.ceil((deadline_s - time.monotonic()) * 1000)))
+
+
+def program_name() -> str:
+    """Return what a program is called that gives no name itself, at most 64 characters.
+
+    That is the script's file name, or the module's name after ``python -m``; empty where there is neither.  A
+    module that is the ``__main__`` of a package goes by the package's name.
+    """
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    if spec is not None and spec.name != "__main__":  # python -m package.module
+        name: str = spec.name.removesuffix(".__main__")
+    else:
+        name = os.path.basename(sys.argv[0]) if sys.argv else ""
+        if name in ("-c", "-"):  # python -c, and a program on standard input
+            name = ""
+    return name[:_MAX_NAME]
+
+
+def closed(what: str, hint: str) -> BaseException:
+    """Return the error of a request to what is closed.
+
+    While the interpreter ends, that ends the asking thread silently: nothing waits for it.
+    """
+    main = threading.main_thread()
+    if not main.is_alive() and threading.get_ident() != main.ident:
+        return SystemExit()
+    return BadRequest(f"this {what} is closed", hint=hint)
+
+
+def until_served(ask: Callable[[], R], timeout_s: float) -> R:
+    """Ask about a live map until the process that keeps it answers: it may be restarting.
+
+    Raises
+    ------
+    LiveInterrupted
+        It did not within ``timeout_s`` seconds.
+    """
+    end_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            return ask()
+        except LiveInterrupted:  # noqa: PERF203  that is what it is for
+            if time.monotonic() >= end_s:
+                raise
+            time.sleep(SERVED_PAUSE_S)

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A connection's socket, and the thread that makes it, hears when the connection comes and goes, and ends it.
+"""A connection's socket, and the thread that makes it, watches its connection, and closes it.
 
 The thread is where libzmq's parts belong because signal handlers run in the main thread alone: no handler's
-exception can leave a part behind that nobody knows of.  For the same reason it is started by one function
-that is built in, and whoever waits for it does so in queues.  The thread lets no signal interrupt it: the
-kernel may give one to any thread, and a context whose end it interrupts stays, with a thread and five
-descriptors.
+exception can leave a part behind that nothing refers to.  For the same reason it is started by one function
+that is built in, and is waited for in queues.  The thread lets no signal interrupt it: the kernel may give
+one to any thread, and a context whose end it interrupts stays, with a thread and five descriptors.
 
 Where the interpreter ends nothing is closed: another thread may be using the socket, and libzmq ends the
 process when one is closed under its user.  Python stops such threads, and the kernel closes what is open.
+
+A thread may also outlive its owner, which did not stop it because an exception came when it ended: Python
+ends objects by functions written in Python, at whose first step a signal handler's exception may come.  The
+next connection stops such threads (`stop_orphans`).
 """
 
 from __future__ import annotations
@@ -21,11 +24,10 @@ import time
 import weakref
 from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import zmq
 
-from shmmap.client.orphans import enter, running
 from shmmap.errors import LimitReached
 from shmmap.segment.process_limits import check_files, check_threads, no_threads_left
 
@@ -34,7 +36,16 @@ if TYPE_CHECKING:
 else:
     import _signal  # `signal` is the same with enumerations, which take a millisecond to import
 
-__all__ = ["CONNECTION", "FILES", "ConnectionWatch", "start_thread"]
+__all__ = [
+    "CONNECTION",
+    "FILES",
+    "ConnectionWatch",
+    "Running",
+    "enter",
+    "running",
+    "start_thread",
+    "stop_orphans",
+]
 
 _EVENT: Final = struct.Struct("=HI")  # first frame of a message of zmq_socket_monitor(3): event, value
 _EVENTS: Final = (
@@ -52,7 +63,36 @@ FILES: Final = 10
 """Descriptors that libzmq needs (context, socket, monitor, connection), and one to map segments by."""
 THREADS: Final = 2
 """Threads of libzmq for a context, beside the one that makes it."""
-_OVER_S: Final = 0.5  # who waits for the end looks again after this long, should another have waited, too
+_OVER_S: Final = 0.5  # a wait for the end looks again after this long, should another have waited, too
+
+
+class Running(Protocol):
+    """What runs in a thread on behalf of an owner."""
+
+    @property
+    def owner(self) -> weakref.ref[object]:
+        """The object that stops it."""
+
+    def request_stop(self) -> None:
+        """Have it end, soon."""
+
+
+running: Final[set[Running]] = set()
+"""Each thread enters and leaves by itself."""
+
+
+def enter(one: Running) -> None:
+    """Begin what runs in this thread; its owner may be gone already, and no connection may come later."""
+    running.add(one)
+    if one.owner() is None:
+        one.request_stop()
+
+
+def stop_orphans() -> None:
+    """Stop the threads whose owner is gone."""
+    for one in tuple(running):
+        if one.owner() is None:
+            one.request_stop()
 
 
 def start_thread(run: Callable[..., object], *arguments: object) -> None:
@@ -79,7 +119,7 @@ class ConnectionWatch:
     Parameters
     ----------
     owner
-        Who uses the socket; see `shmmap.client.orphans`.
+        Uses the socket, and stops the thread.
     endpoint
         What the socket connects to.
     options
@@ -98,7 +138,7 @@ class ConnectionWatch:
     hung_up : bool
         The other side hung up before any handshake, and libzmq did not try again yet.
     foreign : bool
-        Who listens speaks something else.
+        What listens there speaks something else.
 
     Raises
     ------
@@ -148,7 +188,7 @@ class ConnectionWatch:
 
     def stop(self) -> None:
         """Have the thread close the socket and end, and wait for it, unless this is that thread itself."""
-        self.tell_to_stop()
+        self.request_stop()
         while not self._elsewhere and _thread.get_ident() != self._thread and not self._ended:
             with contextlib.suppress(Empty):
                 self._over.get(timeout=_OVER_S)
@@ -158,7 +198,7 @@ class ConnectionWatch:
         """Whether this is a forked child: the socket is the parent's."""
         return os.getpid() != self._pid
 
-    def tell_to_stop(self) -> None:
+    def request_stop(self) -> None:
         """Have the thread close the socket and end."""
         self._stopping = True  # where there is no socket yet, the thread looks at this when it has made it
         while self._socket is not None and not self._ended and not self._elsewhere:

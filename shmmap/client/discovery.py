@@ -97,7 +97,7 @@ def _checked(instance: str) -> str:
 def find_socket(paths: Sequence[str], deadline_s: float) -> str:
     """Return the first path at which a ZeroMQ peer answers.
 
-    A path that nobody listens at is passed over at once.  A daemon that is there but silent ends the
+    A path that nothing listens at is passed over at once.  A daemon that is there but silent ends the
     search: the next one might serve another map.
 
     Parameters
@@ -108,7 +108,7 @@ def find_socket(paths: Sequence[str], deadline_s: float) -> str:
     Raises
     ------
     NoSocket, SocketPermission, StaleSocket
-        None of the paths can be connected to; the message tells about each of them, and the kind
+        None of the paths can be connected to; the message names each of them, and the kind
         is that of the first one that at least exists.
     NoAnswer, ProtocolMismatch
         See `check_socket`.
@@ -121,14 +121,14 @@ def find_socket(paths: Sequence[str], deadline_s: float) -> str:
             refusals.append(refusal)
         else:
             return path
-    telling = next((refusal for refusal in refusals if not isinstance(refusal, NoSocket)), refusals[0])
+    worst = next((refusal for refusal in refusals if not isinstance(refusal, NoSocket)), refusals[0])
     if len(refusals) == 1:
-        raise telling
-    raise type(telling)("; ".join(refusal.message for refusal in refusals), hint=telling.hint) from None
+        raise worst
+    raise type(worst)("; ".join(refusal.message for refusal in refusals), hint=worst.hint) from None
 
 
 def check_socket(path: str, deadline_s: float) -> None:
-    """Connect to a socket once, to tell the ways apart in which that can fail.
+    """Connect to a socket once, to distinguish how that can fail.
 
     ZeroMQ itself connects in the background and never says why it does not succeed.
 
@@ -139,11 +139,11 @@ def check_socket(path: str, deadline_s: float) -> None:
     SocketPermission
         This user may not connect.
     StaleSocket
-        Nobody listens any more, or the one who did ended before it answered.
+        Nothing listens any more, or what did ended before it answered.
     NoAnswer
-        Somebody listens, but did not say a word before the deadline.
+        Something listens, but sent nothing before the deadline.
     ProtocolMismatch
-        Who listens does not speak ZeroMQ.
+        What listens does not speak ZeroMQ.
     """
     import socket  # with selectors, 4 ms: not at import
 
@@ -161,22 +161,22 @@ def check_socket(path: str, deadline_s: float) -> None:
             except OSError as error:
                 raise _refusal(path, error) from None
         # Every ZMTP peer speaks first: 0xff, eight bytes, 0x7f (https://rfc.zeromq.org/spec/23/)
-        heard = b""
-        while len(heard) < _SIGNATURE_BYTES:
+        received = b""
+        while len(received) < _SIGNATURE_BYTES:
             probe.settimeout(max(deadline_s - time.monotonic(), 1e-3))
             try:
-                part = probe.recv(_SIGNATURE_BYTES - len(heard))
+                part = probe.recv(_SIGNATURE_BYTES - len(received))
             except TimeoutError:
                 raise _no_answer(path) from None
             except ConnectionError:
                 part = b""
-            heard += part
-            if not heard:  # a connection that had waited, for a daemon that ended or never started
+            received += part
+            if not received:  # a connection that had waited, for a daemon that ended or never started
                 raise StaleSocket(
                     f"{path}: a daemon that ended closed the connection without an answer",
                     hint="see its log, or `systemctl status shmmapd`: did it fail to start?",
                 )
-            if not part or heard[0] != 0xFF or (len(heard) == _SIGNATURE_BYTES and heard[9] != 0x7F):
+            if not part or received[0] != 0xFF or (len(received) == _SIGNATURE_BYTES and received[9] != 0x7F):
                 raise ProtocolMismatch(
                     f"{path}: what listens there does not speak ZeroMQ",
                     hint="is this the socket of another program?",

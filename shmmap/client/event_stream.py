@@ -24,10 +24,9 @@ import msgspec
 import zmq
 
 from shmmap.client.arguments import number, timeout_s
-from shmmap.client.connection import Connection
+from shmmap.client.connection import Connection, closed
 from shmmap.client.connection_watch import ConnectionWatch
 from shmmap.client.discovery import candidates
-from shmmap.client.turn import closed
 from shmmap.errors import NoAnswer, ProtocolMismatch
 from shmmap.protocol.endpoint import endpoint_path
 from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, decode_event
@@ -51,7 +50,7 @@ _OPTIONS: Final = (
 class Missed(msgspec.Struct, frozen=True):
     """Events that are lost: numbers ``first`` to ``last`` of ``epoch``.
 
-    What they told has to be found out otherwise, by asking for cells or metadata again.
+    What they reported has to be found out by asking for cells or metadata again.
     """
 
     epoch: int
@@ -65,7 +64,7 @@ Happening: TypeAlias = Event | Missed
 class EventStream:
     """What happens in the daemon, in order; for one thread, but any may close it.
 
-    Iterating waits for ever; `next` waits as long as one likes.  When the daemon is restarted the stream
+    Iterating waits without bound; `next` has a timeout.  When the daemon is restarted the stream
     continues with the new epoch's events from the first one.
 
     Parameters
@@ -76,7 +75,7 @@ class EventStream:
     instance
         Name of the daemon's instance, instead of an endpoint.
     since
-        Begin with what happened in the last so many seconds, as far as the daemon remembers; None begins now.
+        Begin with what happened in the last ``since`` seconds, as far as the daemon remembers; None: now.
     name
         How this client appears in the daemon's lists.
     timeout
@@ -85,9 +84,9 @@ class EventStream:
     Attributes
     ----------
     epoch : int
-        The daemon's present life.
+        The daemon's present run.
     heard_s : float
-        When the daemon was last heard of, `time.monotonic`; it says something every second.
+        When a message last came from the daemon, `time.monotonic`; it sends one every second.
 
     Raises
     ------
@@ -160,7 +159,7 @@ class EventStream:
     def next(self, timeout: float | None = None) -> Happening | None:
         """Return the next event, or `Missed`; None when nothing happened within ``timeout`` seconds.
 
-        None waits for ever, 0 takes what is there.
+        None waits without bound, 0 takes what is there.
         """
         deadline_s = None if timeout is None else time.monotonic() + number("timeout", timeout)
         while not self._ready:
@@ -169,7 +168,7 @@ class EventStream:
                 if self._closed:
                     raise closed("event stream", "make another one")
                 if self._socket.poll(int(min(left_ms, _SLICE_MS))):
-                    self._hear(self._socket.recv())
+                    self._take(self._socket.recv())
                 elif left_ms <= _SLICE_MS:
                     return None
         return self._ready.popleft()
@@ -189,7 +188,7 @@ class EventStream:
             while not self._catch_up(after=0, since_ns=since_ns):  # it was restarted just now
                 self.epoch = self._ask(Recent(0, limit=0)).epoch
 
-    def _hear(self, data: bytes) -> None:
+    def _take(self, data: bytes) -> None:
         self.heard_s = time.monotonic()
         event = decode_event(data)
         if event is None:  # a kind that this version does not know: its number counts
@@ -212,13 +211,13 @@ class EventStream:
             self._ready.append(event)
 
     def _miss(self, last: int) -> None:
-        """Nobody will ever tell what is missing up to this number: its epoch has ended."""
+        """Report that what is missing up to this number is lost: its epoch has ended."""
         if last >= self._expected:
             self._ready.append(Missed(self.epoch, self._expected, last))
             self._expected = last + 1
 
     def _try_to_catch_up(self) -> bool:
-        """Fetch what is missing, False if it is of an earlier life of the daemon.
+        """Fetch what is missing, False if it is of a previous run of the daemon.
 
         A daemon that does not answer now has more to say when it is back.
         """

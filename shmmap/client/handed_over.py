@@ -19,9 +19,8 @@ from functools import cache
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from shmmap.client.attaching import Attacher
+from shmmap.client.attaching import Attacher, owner_of_segments
 from shmmap.client.cell import Access, Cell
-from shmmap.client.visible import owner_of_segments
 from shmmap.errors import SegmentCorrupt, ShmmapError, StaleHandle
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment

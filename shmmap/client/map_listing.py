@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map's list of cells, as the daemon tells it."""
+"""The map's list of cells, as the daemon has it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class MapListing(Sequence[CellInfo]):
     Attributes
     ----------
     map_version : int
-        Give it as ``since`` next time, to be told only what changed.
+        Give it as ``since`` next time, to get only what changed.
     since_known : bool
         False: the daemon did not know ``since`` any more, this is the whole list.
     removed : tuple of str

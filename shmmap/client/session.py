@@ -1,28 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all requests of one client share: the connection, the attached cells, a lock, and fork."""
+"""What all requests of one client share: the connection, the attached cells, a lock, and fork.
+
+A request for cells is over when its handles are attached: what went stale on the way is asked for again.
+"""
 
 from __future__ import annotations
 
 import math
 import os
+import sys
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from queue import SimpleQueue
+from types import FrameType
 from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
-from shmmap.client.answer import Answer
 from shmmap.client.arguments import number
-from shmmap.client.attaching import Attacher
+from shmmap.client.attaching import Attacher, check_visible, owner_of_segments
 from shmmap.client.cell import Access, Cell
-from shmmap.client.cell_set import CellSet
-from shmmap.client.connection import Connection
-from shmmap.client.turn import Turn, check_not_within, closed, out_of_time
-from shmmap.client.visible import check_visible, owner_of_segments
-from shmmap.errors import BadRequest
+from shmmap.client.cell_set import CellSet, PendingLayer, cell_error
+from shmmap.client.connection import Connection, closed
+from shmmap.errors import BadRequest, CellError, LoadFailed, NoAnswer, SegmentCorrupt, StaleHandle
 from shmmap.failpoints import step
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
@@ -32,6 +34,7 @@ __all__ = ["Session"]
 R = TypeVar("R")
 
 _STALE_ROUNDS: Final = 5  # how often a handle that went stale before it was attached is asked for again
+_MAX_STALE_WAIT_S: Final = 5.0  # that such a request lets the daemon wait
 
 
 class Session:
@@ -98,12 +101,12 @@ class Session:
         """`time.monotonic` of when the connection broke; None while it stands, or has yet to be made."""
         return self._connection.lost_since if self._connection is not None else None
 
-    def tell_when_lost(self, queue: SimpleQueue[Any]) -> None:
+    def notify_when_lost(self, queue: SimpleQueue[Any]) -> None:
         """From now on put a None into a queue when the connection breaks."""
         self._waiting.append(queue)
 
-    def stop_telling(self, queue: SimpleQueue[Any]) -> None:
-        """End `tell_when_lost`; may be repeated."""
+    def stop_notifying(self, queue: SimpleQueue[Any]) -> None:
+        """End `notify_when_lost`; may be repeated."""
         if queue in self._waiting:
             self._waiting.remove(queue)
 
@@ -122,13 +125,13 @@ class Session:
             This is a signal handler that has interrupted a request.
         """
         if self._lock.locked():
-            check_not_within(_TURNS, self)
+            _check_not_within_a_turn(self)
         with self._lock:
             connection = self._connection
             if not self._closed and connection is not None:
-                self._tell_unmapped(connection)
-                if not self.attacher.any_mapped:  # else the daemon should still know who holds them
-                    connection.tell(messages.Bye(connection.new_request()))
+                self._report_unmapped(connection)
+                if not self.attacher.any_mapped:  # else the daemon should still know its holder
+                    connection.send(messages.Bye(connection.new_request()))
             self._closed = True
             if connection is not None:
                 connection.close()
@@ -136,20 +139,23 @@ class Session:
     def _in_turn(self, timeout_s: float, work: Callable[[Connection], R]) -> R:
         """Use the connection for one request, when no other thread does any more."""
         if self._lock.locked():
-            check_not_within(_TURNS, self)
+            _check_not_within_a_turn(self)
         entered = False
         try:
-            with Turn(self._lock, timeout_s):  # type: ignore[misc]
+            with _Turn(self._lock, timeout_s):  # type: ignore[misc]
                 entered = True
                 if self._closed:
                     raise closed("client", "connect again")
                 connection = self._connection or self._connect()
-                self._tell_unmapped(connection)
+                self._report_unmapped(connection)
                 return work(connection)
         except StopIteration:
             if entered:
                 raise
-        raise out_of_time(timeout_s)
+        raise NoAnswer(
+            f"another thread's request was under way for {timeout_s:.3g} s",
+            hint="give each thread that waits long a client of its own",
+        )
 
     def ask(
         self,
@@ -210,7 +216,7 @@ class Session:
             self.map_version = reply.map_version
             self.welcome = connection.welcome
             step("client.answer")
-            answer = Answer(lambda handle: self._attach(handle, connection, populate), self.whole_id)
+            answer = _ReplyCells(lambda handle: self._attach(handle, connection, populate), self.whole_id)
             answer.take(reply, range(len(reply.cells)))
             for _ in range(_STALE_ROUNDS):
                 if not answer.gone or time.monotonic() >= deadline_s:
@@ -225,24 +231,24 @@ class Session:
 
         return self._in_turn(all_s, work)
 
-    def tell_unmapped(self) -> int:
-        """Tell the daemon what was unmapped since the last request; returns how many versions."""
+    def report_unmapped(self) -> int:
+        """Report to the daemon what was unmapped since the last request; returns how many versions."""
 
         def work(connection: Connection) -> int:
-            told = self._told
-            # the reply to this one means that the telling before it has arrived
+            reported = self._reported
+            # the reply to this one means that the report before it has arrived
             connection.ask(
                 messages.Release(connection.new_request(), b""), messages.Released, timeout_s=self.timeout_s
             )
-            return told
+            return reported
 
         return self._in_turn(self.timeout_s, work)
 
-    def _tell_unmapped(self, connection: Connection) -> None:
+    def _report_unmapped(self, connection: Connection) -> None:
         versions = self.attacher.unmapped()
-        self._told = len(versions)
+        self._reported = len(versions)
         if versions:
-            connection.tell(messages.Release(connection.new_request(), _pack(versions)))
+            connection.send(messages.Release(connection.new_request(), _pack(versions)))
             versions.clear()
 
     def whole_id(self, cell_id: str) -> str:
@@ -275,7 +281,139 @@ class Session:
         self.attacher.restart_in_child()
 
 
+class _ReplyCells:
+    """Cells of one reply while they are attached, each at its place in it.
+
+    Parameters
+    ----------
+    attach
+        Makes a cell of a handle; `StaleHandle` and `SegmentCorrupt` cost that cell only.
+    whole_id
+        Makes a cell's id of what replies carry.
+
+    Attributes
+    ----------
+    gone : list
+        Places and handles whose segments were gone before they could be attached.
+    """
+
+    def __init__(self, attach: Callable[[Handle], Cell], whole_id: Callable[[str], str]) -> None:
+        self._attach = attach
+        self._whole = whole_id
+        self._cells: dict[int, Cell] = {}
+        self._failed: list[CellError] = []
+        self._pending: list[PendingLayer] = []
+        self.gone: list[tuple[int, Handle]] = []
+
+    def take(self, reply: messages.Cells, places: Iterable[int]) -> None:
+        """Attach a reply's handles at these places; note what went stale meanwhile and what failed."""
+        for place, handle in zip(places, reply.cells, strict=True):
+            try:
+                self._cells[place] = self._attach(handle)
+            except StaleHandle:  # noqa: PERF203  one cell must not cost the others
+                self.gone.append((place, handle))
+            except SegmentCorrupt as error:
+                cell_id = self._whole(handle.id)
+                message = f"{cell_id} ({handle.layer}): {error}"
+                box = (handle.min_x, handle.min_y, handle.max_x, handle.max_y)
+                failure = LoadFailed(message, cell_id=cell_id, layer=handle.layer, box=box)
+                failure.__cause__ = error
+                self._failed.append(failure)
+        whole = self._whole
+        self._pending += [PendingLayer(whole(cell.id), cell.layer) for cell in reply.pending]
+        self._failed += [
+            cell_error(cell, cell.id if cell.code == "unknown_cell" else whole(cell.id))
+            for cell in reply.failed
+        ]
+
+    def ask_again(self, connection: Connection, deadline_s: float) -> None:
+        """Ask again for the handles whose segments were gone before they could be attached."""
+        gone, self.gone = self.gone, []
+        places: dict[tuple[str, str], list[int]] = {}
+        for place, handle in gone:
+            places.setdefault((handle.id, handle.layer), []).append(place)
+        timeout_s = max(deadline_s - time.monotonic(), 1e-3)
+        message = messages.Selected(
+            connection.new_request(),
+            tuple(dict.fromkeys(cell_id for cell_id, _ in places)),
+            tuple(dict.fromkeys(layer for _, layer in places)),
+            min(timeout_s / 2, _MAX_STALE_WAIT_S),
+        )
+        reply = connection.ask(message, messages.Cells, timeout_s=timeout_s, quiet_s=timeout_s / 2)
+        wanted = [handle for handle in reply.cells if (handle.id, handle.layer) in places]
+        repeated = [(place, handle) for handle in wanted for place in places[handle.id, handle.layer]]
+        again = messages.Cells(
+            reply.request,
+            reply.epoch,
+            reply.map_version,
+            cells=tuple(handle for _, handle in repeated),
+            pending=tuple(cell for cell in reply.pending if (cell.id, cell.layer) in places),
+            failed=tuple(cell for cell in reply.failed if (cell.id, cell.layer) in places),
+        )
+        self.take(again, [place for place, _ in repeated])
+
+    def result(
+        self,
+        reply: messages.Cells,
+        removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None,
+    ) -> CellSet:
+        """Return the answer; what is still gone counts as pending."""
+        self._pending += [PendingLayer(self._whole(handle.id), handle.layer) for _, handle in self.gone]
+        return CellSet(
+            tuple(self._cells[place] for place in sorted(self._cells)),
+            tuple(self._failed),
+            tuple(self._pending),
+            removed(reply.removed, reply.removed_packed) if removed is not None else (),
+            reply.epoch,
+            reply.map_version,
+            reply.layers,
+            reply.covered,
+            reply.reason,
+        )
+
+
+class _Turn:
+    """A turn to use the connection, taken and given back whatever exception a signal handler raises.
+
+    A context manager that waits at most ``timeout_s`` for its lock; entering it later raises `StopIteration`.
+
+    Python runs signal handlers between the steps of its interpreter.  A ``with`` enters its block in the
+    same step in which what it calls returns, and leaves it likewise, if that is built in: no handler's
+    exception can come when the lock is taken and the block not entered, or left and the lock still taken.
+    So entering and leaving are no methods here but built-in functions, which each object has in its slots.
+    """
+
+    __slots__ = ("__enter__", "__exit__")
+
+    __enter__: Callable[[], object]
+    __exit__: Callable[..., None]
+
+    def __init__(self, lock: threading.Lock, timeout_s: float) -> None:
+        # the False of a wait in vain is left out, and there is no next
+        self.__enter__ = filter(None, map(lock.acquire, (True,), (timeout_s,))).__next__
+        self.__exit__ = lock.__exit__
+
+
 _TURNS: Final = (Session._in_turn.__code__, Session.close.__code__)
+
+
+def _check_not_within_a_turn(session: Session) -> None:
+    """Refuse a turn inside of a turn: it would wait for itself.
+
+    Raises
+    ------
+    BadRequest
+        This thread is in one of the session's already.
+    """
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        if frame.f_code in _TURNS and frame.f_locals.get("self") is session:
+            raise BadRequest(
+                "this client is in the middle of a request, which a signal handler has interrupted to use it",
+                hint="have the handler set a flag or raise an exception, or use another client there",
+            )
+        frame = frame.f_back
+
 
 _sessions: Final[list[weakref.ref[Session]]] = []
 """Those alive; not a weak set, which runs functions in Python when one ends (`shmmap.client.attaching`)."""

@@ -15,7 +15,7 @@ import pytest
 import shmmap
 from shmmap.client import attaching
 from shmmap.client.connection import Connection
-from shmmap.client.orphans import running
+from shmmap.client.connection_watch import running
 from shmmap.protocol.messages import Differential
 from shmmap.segment.attach import attach
 from tests.support.daemon_process import DaemonProcess, open_files

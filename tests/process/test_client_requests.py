@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,7 @@ import pytest
 
 import shmmap
 from shmmap.client import map_listing
-from shmmap.client.connection import Connection
-from shmmap.client.program_name import program_name
+from shmmap.client.connection import Connection, program_name
 from shmmap.errors import (
     BadRequest,
     LoadFailed,
@@ -684,3 +684,28 @@ def test_fork(daemon: Factory, divided_map: DividedMap) -> None:
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (0, "good\n"), done.stderr
     assert done.stderr == ""
+
+
+PACKAGE = str(Path(shmmap.__file__).parent)
+
+
+def test_a_warm_differential_enters_few_files(daemon: Factory, divided_map: DividedMap) -> None:
+    """From the call to its return, so that a reader can follow it; with new cells and without."""
+    one = daemon(divided_map.root)
+    entered: set[str] = set()
+
+    def note(frame: FrameType, event: str, _argument: object) -> None:
+        if event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
+            entered.add(frame.f_code.co_filename)
+
+    with shmmap.connect(one.endpoint) as client:
+        everywhere = shmmap.Box(-1e3, -1e3, 1e3, 1e3)
+        cells = client.area(everywhere, wait=60.0).cells
+        for held in (cells[:8], cells):
+            sys.setprofile(note)
+            try:
+                found = client.differential(everywhere, held)
+            finally:
+                sys.setprofile(None)
+            assert len(found) == len(cells) - len(held)
+    assert len(entered) <= 10, sorted(entered)

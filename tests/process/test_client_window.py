@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.client.orphans import running
+from shmmap.client.connection_watch import running
 from shmmap.client.window.follower import WindowFollower
 from shmmap.client.window.retention import Departed
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
@@ -297,7 +297,7 @@ def test_a_daemon_that_ends_is_noticed_at_once(daemon: Factory, divided_map: Div
         window.move_to(0, 0, wait=LONG_S)
         assert [client.disconnected_since] == [None]
         lost: SimpleQueue[None] = SimpleQueue()
-        client.session.tell_when_lost(lost)
+        client.session.notify_when_lost(lost)
         one.kill()
         lost.get(timeout=LONG_S)
         assert type(window.error) is ConnectionLost

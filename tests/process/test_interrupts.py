@@ -29,8 +29,7 @@ import zmq
 
 import shmmap
 from shmmap.client import connection_watch
-from shmmap.client.connection_watch import start_thread
-from shmmap.client.orphans import running
+from shmmap.client.connection_watch import running, start_thread
 from shmmap.client.window import follower
 from shmmap.errors import BadRequest
 from tests.support.daemon_process import DaemonProcess

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
@@ -14,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from shmmap import geometry
 from shmmap.chunks.occupancy import Occupancy
-from shmmap.chunks.voxels import ChunkKey
+from shmmap.chunks.voxels import ChunkKey, voxel_centers
+from shmmap.client.arguments import checked_seconds
+from shmmap.client.connection import until_served
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
-from shmmap.client.live.patience import checked_seconds, until_served
-from shmmap.client.live.voxels import Voxels, read_voxels
 from shmmap.client.session import Session
-from shmmap.errors import BadRequest, StaleHandle
+from shmmap.errors import BadRequest, SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.optional_packages import needed_packages
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage, area_to_message
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from shmmap.chunks.marking import ScanFilter
     from shmmap.client.live.mapper import LiveMapper
 
-__all__ = ["ChunkInfo", "LiveMap", "Sphere"]
+__all__ = ["ChunkInfo", "LiveMap", "Sphere", "Voxels"]
 
 R = TypeVar("R")
 
@@ -39,6 +40,7 @@ MOST_RAY_VOXELS: Final = 100_000
 """Along an axis, of a ray that is followed: 5 km of voxels of 5 cm take about half a second."""
 LISTS: Final = 4
 """Lists of voxels that are asked for, one after the other, until one is there while it is read."""
+_VOXEL_BYTES: Final = 14
 
 
 class Sphere(msgspec.Struct, frozen=True):
@@ -48,6 +50,43 @@ class Sphere(msgspec.Struct, frozen=True):
     y: float
     z: float
     radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class Voxels:
+    """Voxels of one kind in an area, as the daemon lists them.
+
+    Attributes
+    ----------
+    indices
+        (N, 3) int32: ``floor(x / resolution)`` along each axis.
+    log_odds
+        (N,) int16, thousandths.
+    resolution
+        Edge of a voxel, metres.
+    change
+        Number of the map's last change before: send it as ``since`` to get what came after.
+    """
+
+    indices: NDArray[np.int32]
+    log_odds: NDArray[np.int16]
+    resolution: float
+    change: int
+
+    def __len__(self) -> int:
+        return len(self.log_odds)
+
+    @property
+    def xyz(self) -> NDArray[np.float64]:
+        """Their middles, (N, 3) metres in the map's frame."""
+        return voxel_centers(self.indices, self.resolution)
+
+    @property
+    def probability(self) -> NDArray[np.float64]:
+        """How surely each is occupied, (N,), between 0 and 1."""
+        odds = self.log_odds.astype(np.float64) / 1000.0
+        chance: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-odds))
+        return chance
 
 
 class LiveMap:
@@ -78,7 +117,7 @@ class LiveMap:
         self.map_id, self.resolution, self.frame_id = opened.map_id, opened.resolution, opened.frame_id
 
     def _ask(self, make: Callable[[int], messages.LiveRequest], kind: type[R], *, quiet_s: float = 0.0) -> R:
-        """Send a request; again if the process that keeps live maps is started anew."""
+        """Send a request; again if the process that keeps live maps is restarting."""
         return until_served(
             lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
         )
@@ -245,7 +284,7 @@ class LiveMap:
     def _listed(self, ask: Callable[[int], messages.LiveRequest]) -> Voxels:
         reply = self._ask(ask, messages.LiveVoxelsReply, quiet_s=LIST_S)
         try:
-            return read_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
+            return _read_voxels(self._shm_dir + reply.segment, reply.count, self.resolution, reply.change)
         finally:
             self._ask(lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased)
 
@@ -349,3 +388,39 @@ def _metres(*values: float) -> tuple[float, ...]:
         return tuple(float(value) for value in values)
     except OverflowError as error:
         raise BadRequest(f"{values}: a number of metres is not finite") from error
+
+
+def _read_voxels(path: str, count: int, resolution: float, change: int) -> Voxels:
+    """Read a list of voxels into memory of this process.
+
+    Raises
+    ------
+    StaleHandle
+        It is gone, in part or whole: it is kept for some seconds only.
+    SegmentError, SegmentCorrupt
+        It may not be read, or has another size.
+    """
+    if not count:
+        return Voxels(np.empty((0, 3), np.int32), np.empty(0, np.int16), resolution, change)
+    data = np.empty(count * _VOXEL_BYTES, np.uint8)
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError as error:
+        raise StaleHandle(f"{path}: the list is gone") from error
+    except OSError as error:
+        raise SegmentError(f"{path}: {error.strerror}", hint="see `shmmap doctor`") from error
+    try:
+        at = 0
+        while at < len(data) and (some := os.preadv(fd, [data.data[at:]], at)):
+            at += some
+        size = os.fstat(fd).st_size  # after that: what was cut meanwhile has lost its end first
+    except OSError as error:
+        raise SegmentError(f"{path}: {error.strerror}") from error
+    finally:
+        os.close(fd)
+    if not size:
+        raise StaleHandle(f"{path}: the list is gone")
+    if size != len(data) or at != size:
+        raise SegmentCorrupt(f"{path}: it is no list of {count} voxels")
+    indices = data[: 12 * count].view("<i4").reshape(count, 3)
+    return Voxels(indices, data[12 * count :].view("<i2"), resolution, change)

@@ -22,8 +22,8 @@ import numpy as np
 
 from shmmap.chunks.marking import Counts, Marker, ScanFilter
 from shmmap.chunks.marks import encode_marks
-from shmmap.client.connection import Connection
-from shmmap.client.live.patience import PAUSE_S, checked_seconds, until_served
+from shmmap.client.arguments import checked_seconds
+from shmmap.client.connection import SERVED_PAUSE_S, Connection, until_served
 from shmmap.client.session import Session
 from shmmap.errors import (
     BadRequest,
@@ -181,7 +181,7 @@ class _Sender:
                 self.trouble = error
                 if time.monotonic() >= end_s:
                     raise
-                time.sleep(PAUSE_S)
+                time.sleep(SERVED_PAUSE_S)
                 with contextlib.suppress(*PASSING):
                     if not isinstance(error, Busy):
                         self.opened = self._open()

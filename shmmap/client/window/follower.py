@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thread behind a window: it asks, attaches and unmaps, so that the control loop never does."""
+"""What keeps a window current: a thread that asks, attaches and unmaps, or the call that moves the window.
+
+Either asks the daemon when the pose has moved (`shmmap.client.window.state.moved`), when
+``refresh_interval_s`` have passed since it last asked, and while something is missing.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 from typing import Final
 
-from shmmap.client.connection_watch import start_thread
-from shmmap.client.orphans import enter, running
+from shmmap.client.connection_watch import enter, running, start_thread
 from shmmap.client.session import Session
 from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.state import EMPTY, WindowState, moved
@@ -24,14 +27,18 @@ from shmmap.protocol.messages import Intent
 from shmmap.segment.owned import Owned
 from shmmap.segment.process_limits import no_files_left
 
-__all__ = ["PENDING_WAIT_S", "WindowFollower"]
+__all__ = ["BlockingFollower", "WindowFollower"]
 
-PENDING_WAIT_S: Final = 0.25
-"""How long one request waits for loads: what is ready then is shown, and a new pose is heard."""
+_PENDING_WAIT_S: Final = 0.25
+"""How long one request waits for loads: what is ready then is shown, and a new pose is taken."""
 
 _RETRY_S: Final = 0.05  # first pause after an answer that brought nothing although something is missing
 _RETRY_MAX_S: Final = 1.0  # pauses double up to this
-_OVER_S: Final = 0.5  # who waits for the thread's end looks again after this long
+_OVER_S: Final = 0.5  # a wait for the thread's end looks again after this long
+
+_BLOCKING_WAIT_S: Final = 5.0  # of a call that does not say how long it may take
+_FIRST_PAUSE_S: Final = 0.005  # between a call's requests for what does not fit; doubles
+_STALLED_S: Final = 0.5  # a call gives up on what does not fit after this long without progress
 
 
 class WindowFollower:
@@ -39,13 +46,13 @@ class WindowFollower:
 
     Everything reaches the thread through one queue: new poses, memory to unmap, that the connection
     broke, the end.
-    Everything leaves it by replacing one attribute; who waits for that has a queue, and no lock that a
+    Everything leaves it by replacing one attribute; that is waited for in queues, not by a lock that a
     signal handler's exception could leave taken.
 
     Parameters
     ----------
     owner
-        Whose thread it is, see `shmmap.client.orphans`.
+        Whose thread it is: see `shmmap.client.connection_watch`.
 
     Attributes
     ----------
@@ -85,12 +92,12 @@ class WindowFollower:
         self.error: ShmmapError | None = None
         self.stale_since: float | None = None
         session.attacher.unmap_in(self._mailbox)
-        session.tell_when_lost(self._mailbox)
+        session.notify_when_lost(self._mailbox)
         self._thread = 0
         try:
             start_thread(self._run)
         except BaseException:
-            session.stop_telling(self._mailbox)
+            session.stop_notifying(self._mailbox)
             session.attacher.stop_unmapping_in(self._mailbox)
             raise
 
@@ -117,9 +124,7 @@ class WindowFollower:
                 "this window's thread lives in the parent process", hint="make a window after the fork"
             )
         self._pose = pose
-        if not self._called and (
-            moved(self.state, pose, self._update_distance) or self._refresher.tell_at_s(pose) < self._due_s
-        ):
+        if not self._called and moved(self.state, pose, self._update_distance):
             self._called = True  # once is enough, however often poses come
             self._mailbox.put(None)
         return (self.wait_until_current(wait_s) if wait_s else None) or self.state
@@ -151,12 +156,12 @@ class WindowFollower:
         """End the thread; what is attached stays so."""
         if self._elsewhere:
             return
-        self.tell_to_stop()
+        self.request_stop()
         while not self._ended and _thread.get_ident() != self._thread:  # it may be where garbage ends
             with contextlib.suppress(Empty):
                 self._over.get(timeout=_OVER_S)
 
-    def tell_to_stop(self) -> None:
+    def request_stop(self) -> None:
         """Have the thread end."""
         self._stopping = True
         self._mailbox.put(None)
@@ -175,13 +180,11 @@ class WindowFollower:
                     self._due_s = 0.0
                 if time.monotonic() >= self._due_s:
                     self._due_s = time.monotonic() + self._refresh(pose)
-                if self.error is None:  # of the latest pose: it may have come meanwhile, and called nobody
-                    self._due_s = min(self._due_s, self._refresher.tell_at_s(self._pose or pose))
         except BaseException as error:
             self._publish(self.state, InternalError(f"the window's thread ended: {error!r}"))
             raise
         finally:
-            self._session.stop_telling(self._mailbox)
+            self._session.stop_notifying(self._mailbox)
             self._session.attacher.stop_unmapping_in(self._mailbox)
             running.discard(self)
             self._ended = True
@@ -199,7 +202,7 @@ class WindowFollower:
             except Empty:
                 return not self._stopping
             if memory is not None:
-                memory.end()  # who put it here may still have it for a moment
+                memory.end()  # the thread that put it here may still have it for a moment
                 del memory
                 continue
             self._called = False  # before the pose is read: the next one calls again
@@ -209,7 +212,7 @@ class WindowFollower:
     def _refresh(self, pose: Intent) -> float:
         """Ask once and publish what came; returns after how many seconds to ask again."""
         before = self.state
-        wait_s = PENDING_WAIT_S if before.pending and self.error is None else None
+        wait_s = _PENDING_WAIT_S if before.pending and self.error is None else None
         try:
             state, progress = self._refresher.refresh(before, pose, wait_s)
         except ShmmapError as error:
@@ -236,7 +239,7 @@ class WindowFollower:
         return self._pause_s
 
     def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
-        self.state = state  # before the error: who finds none finds the state that came with it
+        self.state = state  # before the error: where there is none, the state is the one that came with it
         if error is None:
             self.stale_since = None
         elif self.stale_since is None:
@@ -248,3 +251,78 @@ class WindowFollower:
                 self._waiters.remove(waiter)
             else:
                 queue.put(None)
+
+
+class BlockingFollower:
+    """Keeps a window current in the thread that moves it; otherwise as `WindowFollower`."""
+
+    def __init__(
+        self, refresher: WindowRefresher, *, update_distance: float, refresh_interval_s: float
+    ) -> None:
+        self._refresher = refresher
+        self._update_distance = update_distance
+        self._refresh_interval_s = refresh_interval_s
+        self._pose: Intent | None = None
+        self._asked_s = 0.0
+        self.state = EMPTY
+        self.error: ShmmapError | None = None
+        self.stale_since: float | None = None
+
+    def answers(self, state: WindowState) -> bool:
+        """Whether a state answers the latest pose."""
+        return self._pose is not None and not moved(state, self._pose, self._update_distance)
+
+    def move(self, pose: Intent, wait_s: float | None) -> WindowState:
+        """Take a new pose, ask until nothing is missing, nothing more comes, or time is up.
+
+        Raises
+        ------
+        ShmmapError
+            The daemon cannot be asked; the state stays as it was.
+        """
+        self._pose = pose
+        try:
+            self._refresh(pose, _BLOCKING_WAIT_S if wait_s is None else wait_s)
+        except ShmmapError as error:
+            self.error = error
+            if self.stale_since is None:
+                self.stale_since = time.monotonic()
+            raise
+        return self.state
+
+    def wait_until_current(self, timeout_s: float) -> WindowState | None:  # noqa: ARG002
+        """Return the state if it answers the latest pose and nothing is missing; waiting changes nothing."""
+        state = self.state
+        asked_in_vain = self.error is not None or self._refresher.lost
+        return state if self.answers(state) and state.settled and not asked_in_vain else None
+
+    def stop(self) -> None:
+        """Do nothing: there is no thread."""
+
+    def _refresh(self, pose: Intent, wait_s: float) -> None:
+        now_s = time.monotonic()
+        state = self.state
+        due = now_s - self._asked_s >= self._refresh_interval_s or self.error is not None
+        if state.settled and not due and not moved(state, pose, self._update_distance):
+            return
+        deadline_s = now_s + wait_s
+        progress_s = now_s
+        pause_s = _FIRST_PAUSE_S
+        del state  # the last reference to what is replaced may be this one
+        request_wait_s: float | None = None
+        while True:
+            after, progress = self._refresher.refresh(self.state, pose, request_wait_s)
+            self.state = after
+            self.error = self.stale_since = None
+            self._asked_s = now_s = time.monotonic()
+            if after.settled or now_s >= deadline_s:
+                return
+            if progress or after.pending:
+                progress_s, pause_s = now_s, _FIRST_PAUSE_S
+            elif now_s - progress_s >= _STALLED_S:
+                return  # what is missing waits for memory that others have
+            else:
+                time.sleep(min(pause_s, deadline_s - now_s))  # what was just dropped has to be freed
+                pause_s *= 2
+            del after
+            request_wait_s = max(0.0, min(_PENDING_WAIT_S, deadline_s - now_s))

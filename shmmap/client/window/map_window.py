@@ -5,18 +5,15 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from shmmap.client.arguments import heights, names, number, timeout_s
+from shmmap.client.arguments import heights, names, number, pose_intent, timeout_s
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
 from shmmap.client.points_around import PointsAround, points_around
-from shmmap.client.window.blocking import BlockingFollower
-from shmmap.client.window.follower import WindowFollower
-from shmmap.client.window.layers import layer_name
-from shmmap.client.window.pose import pose_intent
+from shmmap.client.window.follower import BlockingFollower, WindowFollower
 from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.retention import Retention, RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowUpdate, update_between
@@ -59,8 +56,8 @@ class MapWindow:
     update_distance
         Metres the pose moves before the daemon is asked again (20 in Autoware).
     refresh_interval
-        Seconds after which it is asked anyhow, to learn of a changed map.  Of another route or velocity, or a
-        pose 5 m away, the daemon learns after a second at the latest.
+        Seconds after which it is asked anyhow: the window learns of a changed map, and the daemon of another
+        route or velocity.
     retention
         What to keep attached of what has left the window; default nothing.
     background
@@ -193,7 +190,7 @@ class MapWindow:
         route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         wait: float | None = None,
     ) -> WindowUpdate:
-        """Tell the window the pose; returns what has changed since the last call.
+        """Give the window the pose; returns what has changed since the last call.
 
         Parameters
         ----------
@@ -205,8 +202,8 @@ class MapWindow:
             Radians, counter-clockwise from the map's x axis.
         route
             The polyline ahead, (x, y) each or (N, 2): give it with every pose.  The daemon fetches what lies
-            along it before the window asks for it, and keeps it longest.  Of more than 512 places so many
-            are sent, equally far apart.
+            along it before the window asks for it, and keeps it longest.  Of a longer route 512 places are
+            sent, equally far apart.
         wait
             Seconds this call may take until the window is current.  None: no waiting in the background mode,
             5 s in the blocking one, which waits no longer than half a second for cells that do not fit in
@@ -319,7 +316,7 @@ class MapWindow:
     def points_around(self, x: float, y: float, radius: float, *, layer: str | None = None) -> PointsAround:
         """Views of the window's cells that touch a circle; nothing is copied.
 
-        `PointsAround.covered` tells whether they are all that the map has there: a pose that has jumped, or
+        `PointsAround.covered` says whether they are all that the map has there: a pose that has jumped, or
         outrun a daemon that died, is not to be mistaken for an empty place.
 
         Parameters
@@ -336,10 +333,47 @@ class MapWindow:
             The circle makes no sense, or the window has no such layer.
         """
         state = self._follower.state
-        name = layer_name(layer if layer is not None else self._layers[0], self._layers, state.by_layer)
+        name = _layer_name(layer if layer is not None else self._layers[0], self._layers, state.by_layer)
         Circle(x, y, radius)
         covered = state.covers(x, y, radius, name)
         cells = state.by_layer.get(name)
         if not cells:
             return PointsAround(x, y, radius, (), (), covered)
         return points_around(cells, state.boxes[name], x, y, radius, covered=covered)
+
+
+def _layer_name(layer: str, asked: Sequence[str], present: Collection[str]) -> str:
+    """Return the name that the cells of a layer have, in whatever form it is named.
+
+    Parameters
+    ----------
+    layer
+        As it was asked for, or as `Cell.layer` names it.
+    asked
+        The window's layers as they were asked for.
+    present
+        Layers of the cells that are there, in canonical form.
+
+    Raises
+    ------
+    BadRequest
+        The window has no such layer.
+    """
+    if layer in present:
+        return layer
+    kind = _kind(layer)
+    alike = [one for one in asked if _kind(one) == kind]
+    if len(alike) > 1:
+        return layer  # parameters distinguish them; only the canonical form does so by itself
+    there = next((name for name in present if _kind(name) == kind), None)
+    if layer in alike:
+        return there or layer
+    if there or not alike:
+        raise BadRequest(
+            f"the window has no layer {layer!r}", hint=f"it has {', '.join([*present] or asked)}"
+        )
+    return layer
+
+
+def _kind(layer: str) -> str:
+    return layer.partition("(")[0].strip()

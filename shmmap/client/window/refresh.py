@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final, TypeAlias
 
 import msgspec
@@ -16,7 +15,7 @@ from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client
 from shmmap.client.window.retention import Departed, RetentionPolicy
-from shmmap.client.window.state import EMPTY, LayerKey, WindowState
+from shmmap.client.window.state import LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.geometry import distance_to_boxes
 from shmmap.protocol.messages import Intent
@@ -27,12 +26,6 @@ _Shape: TypeAlias = type[geometry.Circle] | type[geometry.AutowareSquare]
 
 _SHAPES: Final[dict[str, _Shape]] = {"circle": geometry.Circle, "square": geometry.AutowareSquare}
 
-SENT_S: Final = 1.0
-"""A pose that says more of where a client goes than what was asked with last waits for so long at most."""
-_SENT_M: Final = 5.0
-_SENT_MPS: Final = 1.0
-"""A pose or a velocity that differs by so much says more, as does another route."""
-
 
 class WindowRefresher:
     """Turns answers of the daemon into states; used by one thread at a time.
@@ -40,7 +33,7 @@ class WindowRefresher:
     Parameters
     ----------
     client
-        Who asks.
+        Asks the daemon.
     radius
         Of the window, metres.
     layers
@@ -55,8 +48,6 @@ class WindowRefresher:
         Let the kernel map every page while attaching.
     timeout_s
         How long a reply may take beyond what the request waits; None: as long as the client lets it.
-    clock
-        Seconds.
 
     Attributes
     ----------
@@ -80,7 +71,6 @@ class WindowRefresher:
         retention: RetentionPolicy,
         populate: bool,
         timeout_s: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if not isinstance(shape, str) or shape not in _SHAPES:
             raise BadRequest(f"window shape {shape!r} is unknown", hint="use 'circle' or 'square'")
@@ -93,22 +83,12 @@ class WindowRefresher:
         self._retention = retention
         self._populate = populate
         self._timeout_s = timeout_s
-        self._clock = clock
         self.retained: dict[LayerKey, tuple[Cell, float]] = {}
-        self._sent: tuple[Intent, float] | None = None
 
     @property
     def lost(self) -> bool:
         """Whether the connection to the daemon is broken at present."""
         return self._client.disconnected_since is not None
-
-    def tell_at_s(self, pose: Intent) -> float:
-        """When the daemon should hear of a pose at the latest: infinity if it says nothing new of the way.
-
-        Whoever has told of another route or velocity less than a second ago lets that second pass.
-        """
-        sent = self._sent
-        return sent[1] + SENT_S if sent is not None and _says_more(pose, sent[0]) else math.inf
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
         """Ask the daemon once.
@@ -126,16 +106,14 @@ class WindowRefresher:
             As `Client.differential`; the old state stays true.
         """
         area = self._make_area(pose.x, pose.y, self._radius, self._z)
-        asked_s = self._clock()
         answer = self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
-            # Another life of the daemon cannot know what versions of an earlier one belonged to, and takes
-            # those that are not current for strangers.  What was attached stays so while asking again.
+            # Another run of the daemon cannot know what versions of a previous one belonged to, and does not
+            # recognise those that are not current.  What was attached stays so while asking again.
             first = answer
             answer = self._ask(state, area, pose, wait_s, by_name=True)
             del first
-        now_s = self._clock()
-        self._sent = pose, asked_s
+        now_s = time.monotonic()
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
             # what is kept beyond the window may be outdated, or in the way of what is in it
             self.retained.clear()
@@ -208,16 +186,6 @@ class WindowRefresher:
             key: value for (key, value), kept in zip(self.retained.items(), keep, strict=True) if kept
         }
 
-    def forget(self) -> WindowState:
-        """Drop what is retained; returns the state of a window that holds nothing."""
+    def forget(self) -> None:
+        """Drop what is retained."""
         self.retained.clear()
-        return EMPTY
-
-
-def _says_more(pose: Intent, sent: Intent) -> bool:
-    """Whether a pose says more of where a client goes than the one that the daemon was sent last."""
-    return (
-        pose.route != sent.route
-        or math.hypot(pose.vx - sent.vx, pose.vy - sent.vy) >= _SENT_MPS
-        or math.hypot(pose.x - sent.x, pose.y - sent.y) >= _SENT_M
-    )

@@ -113,8 +113,8 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     def covers(self, x: float, y: float, radius: float, layer: str | None = None) -> bool:
         """Whether all that the map has within a circle is in ``cells``, of one layer or of all.
 
-        A cell is missing that is being loaded or has failed, and of which no older version is here.  Where
-        nobody knows where it lies, it counts as if it lay in the circle.
+        A cell is missing that is being loaded or has failed, and of which no older version is here.  One
+        whose place is not known counts as if it lay in the circle.
         """
         if self.area is None or not self.covered or not self.area.contains_circle(x, y, radius):
             return False

@@ -36,7 +36,7 @@ class Played(EventStream):
     def hear(self, *heard: bytes) -> list[object]:
         """Hear these; returns what `next` would: (epoch, number) of events, and what was missed."""
         for data in heard:
-            self._hear(data)
+            self._take(data)
         told: list[object] = [h if isinstance(h, Missed) else (h.epoch, h.seq) for h in self._ready]
         self._ready.clear()
         return told

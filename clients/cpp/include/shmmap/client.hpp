@@ -203,9 +203,9 @@ class Client {
     throw Unreachable("no_answer", path_ + ": the map changed each time before its list had come", "ask again");
   }
 
-  /// Tell the daemon at once what was unmapped; each request does so before.
+  /// Report to the daemon at once what was unmapped; each request does so before.
   void release() {
-    tell_unmapped();
+    report_unmapped();
     const auto number = next_request();
     auto message = begun("release", number, 1);
     message.binary("", 0);
@@ -523,7 +523,7 @@ class Client {
   Answer cells(std::string_view tag, const std::optional<double>& wait, const Write& write, std::size_t elements) {
     if (wait && !(*wait >= 0.0 && *wait <= 3600.0))
       throw BadRequest("bad_request", "wait is 0 to 3600 seconds, not " + detail::short_text(*wait));
-    tell_unmapped();
+    report_unmapped();
     const auto deadline = after(wait.value_or(0.0) + options_.patience);
     auto found = one_reply(tag, wait.value_or(0.0), write, elements);
     Answer& answer = found.answer;
@@ -720,12 +720,12 @@ class Client {
     return cell;
   }
 
-  /// Tell the daemon which versions nobody here maps any more: memory can be used again at once.
-  void tell_unmapped() {
+  /// Report to the daemon which versions are not mapped here any more: memory can be used again at once.
+  void report_unmapped() {
     std::vector<std::uint64_t> versions;
     for (const auto& key : unmapped_->take()) {
       const auto known = cells_.find(key);
-      if (known == cells_.end() || !known->second.expired()) continue;  // it was told, or is mapped again
+      if (known == cells_.end() || !known->second.expired()) continue;  // it was reported, or is mapped again
       versions.push_back(key.first);
       cells_.erase(known);
     }
@@ -733,7 +733,7 @@ class Client {
     auto message = begun("release", next_request(), 1);
     message.binary(versions.data(), versions.size() * sizeof(std::uint64_t));
     try {
-      socket_.send(message.data());  // its answer is that to an id for which nobody waits
+      socket_.send(message.data());  // the answer has an id that is not waited for
     } catch (const Unreachable&) {
       socket_ = detail::Socket();
     }

@@ -80,7 +80,7 @@ struct WindowOptions {
   std::vector<std::string> layers = {"points"};  ///< what to have of each cell
   Shape shape = Shape::circle;                   ///< `square`: Autoware's area test
   double update_distance = 20.0;   ///< metres that the pose moves before the daemon is asked again
-  double refresh_interval = 1.0;   ///< seconds after which it is asked anyhow, to learn of a changed map
+  double refresh_interval = 1.0;   ///< seconds after which it is asked anyhow: for a changed map, with the present route
   std::optional<ZRange> z = std::nullopt;  ///< heights of interest
   RetentionPolicy retention = Retention{};  ///< what to keep attached of what has left the window
 };
@@ -262,7 +262,6 @@ class Window {
   };
 
   static constexpr double pending_wait_s = 0.25, first_pause_s = 0.005, longest_pause_s = 0.5, stalled_s = 0.5;
-  static constexpr double tell_s = 1.0, tell_m = 5.0, tell_mps = 1.0;  // the daemon learns of a pose that differs so much
 
   static void check_pose(const Intent& pose) {
     bool is_finite = std::isfinite(pose.x) && std::isfinite(pose.y) && std::isfinite(pose.vx) &&
@@ -294,12 +293,9 @@ class Window {
            });
   }
 
-  /// Whether the daemon should be asked again: the pose has moved, time has passed, or it goes elsewhere.
+  /// Whether the daemon should be asked again although nothing is missing: the pose has moved, or time has passed.
   [[nodiscard]] bool is_due(Clock::time_point now) const {
-    if (has_moved(*pose_) || error_ || seconds(now - asked_at_) >= options_.refresh_interval) return true;
-    return asked_ && seconds(now - asked_at_) >= tell_s &&
-           (pose_->route != asked_->route || std::hypot(pose_->vx - asked_->vx, pose_->vy - asked_->vy) >= tell_mps ||
-            std::hypot(pose_->x - asked_->x, pose_->y - asked_->y) >= tell_m);
+    return has_moved(*pose_) || error_ || seconds(now - asked_at_) >= options_.refresh_interval;
   }
 
   /// Ask until nothing is missing, nothing more has come for `stalled` seconds, or time is up.
@@ -346,7 +342,7 @@ class Window {
 
   /// Begin to ask for what the area around the pose has, and is not here.
   void ask(std::optional<double> wait, bool by_name) {
-    client_.tell_unmapped();
+    client_.report_unmapped();
     question_ = detail::Question{*pose_, area_around(*pose_), Clock::now(), by_name};
     const auto number = client_.next_request();
     auto message = Client::begun("differential", number, 6);
@@ -423,7 +419,7 @@ class Window {
     retain(now);
     answer.cells.clear();
     earlier_.clear();
-    client_.tell_unmapped();
+    client_.report_unmapped();
     pause_s_ = made_progress_ || !pending_.empty() ? 0.0 : std::clamp(2.0 * pause_s_, first_pause_s, longest_pause_s);
     not_before_ = is_settled() ? now : now + std::chrono::duration_cast<Clock::duration>(detail::Seconds(pause_s_));
   }
@@ -489,7 +485,7 @@ class Window {
       one = at < keep.size() && keep[at] ? std::next(one) : retained_.erase(one);
   }
 
-  // --- telling ---
+  // --- what has changed ---
 
   WindowUpdate changes_since_last() {
     WindowUpdate update;

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap import BadRequest, Intent
-from shmmap.client.route import FARTHEST_M, MOST_PLACES, sendable, thinned
-from shmmap.client.window.pose import pose_intent
+from shmmap.client.arguments import FARTHEST_M, MAX_ROUTE_PLACES, checked_intent, pose_intent, thinned
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -24,25 +23,25 @@ def spiral(places: int) -> np.ndarray:
 
 
 def test_a_short_one_is_sent_as_it_is() -> None:
-    route = spiral(MOST_PLACES)
+    route = spiral(MAX_ROUTE_PLACES)
     assert thinned(route) is route
     assert pose_intent(1, 2, 0, 0, None, route).route == tuple(map(tuple, route.tolist()))
     intent = Intent(1.0, 2.0, route=((3.0, 4.0),))
-    assert sendable(intent) is intent
-    assert sendable(None) is None
+    assert checked_intent(intent) is intent
+    assert checked_intent(None) is None
 
 
 def test_of_a_long_one_places_equally_far_apart() -> None:
     route = spiral(20_000)
     found = thinned(route)
-    assert found.shape == (MOST_PLACES, 2)
+    assert found.shape == (MAX_ROUTE_PLACES, 2)
     assert found[0].tolist() == route[0].tolist()
     assert found[-1] == pytest.approx(route[-1], abs=1e-9)
     apart = np.hypot(*np.diff(found, axis=0).T)
     assert apart.max() / apart.min() < 1.01
     nearest = np.hypot(*(found[:, np.newaxis] - route[np.newaxis]).transpose(2, 0, 1)).min(axis=1)
     assert nearest.max() < 0.15, "they lie on the route"
-    sent = sendable(Intent(1.0, 2.0, 3.0, 4.0, 0.5, tuple(map(tuple, route.tolist()))))
+    sent = checked_intent(Intent(1.0, 2.0, 3.0, 4.0, 0.5, tuple(map(tuple, route.tolist()))))
     assert sent is not None
     assert sent == pose_intent(1, 2, 3, 4, 0.5, route)
     assert sent.route == tuple(map(tuple, found.tolist()))
@@ -51,7 +50,7 @@ def test_of_a_long_one_places_equally_far_apart() -> None:
 def test_places_passed_twice_and_places_stood_at() -> None:
     there_and_back = np.concatenate([spiral(400), spiral(400)[::-1], np.tile(spiral(400)[0], (300, 1))])
     found = thinned(there_and_back)
-    assert len(found) == MOST_PLACES
+    assert len(found) == MAX_ROUTE_PLACES
     assert found[0].tolist() == found[-1].tolist() == [0.0, 0.0]
     assert np.hypot(*found.T).max() > 359.0, "it turns at the far end"
     assert thinned(np.tile([7.0, 8.0], (5000, 1))).tolist() == [[7.0, 8.0]]
@@ -60,9 +59,9 @@ def test_places_passed_twice_and_places_stood_at() -> None:
 @given(st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=40), st.integers(14, 40))
 def test_whatever_is_finite_stays_so(some: list[tuple[float, float]], repeats: int) -> None:
     found = thinned(np.array(some * repeats))
-    assert len(found) <= max(MOST_PLACES, 1)
+    assert len(found) <= max(MAX_ROUTE_PLACES, 1)
     assert np.isfinite(found).all()
-    if len(some) * repeats > MOST_PLACES:
+    if len(some) * repeats > MAX_ROUTE_PLACES:
         assert np.abs(found).max() <= FARTHEST_M
 
 
@@ -75,7 +74,7 @@ def test_what_is_no_route_is_refused(route: Any) -> None:
         pose_intent(0, 0, 0, 0, None, route)
     if not isinstance(route[0], float):
         with pytest.raises(BadRequest):
-            sendable(Intent(0.0, 0.0, route=tuple(route) * 600))
+            checked_intent(Intent(0.0, 0.0, route=tuple(route) * 600))
 
 
 @pytest.mark.parametrize(

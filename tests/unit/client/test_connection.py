@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-PROGRAM = "from shmmap.client.program_name import program_name\nprint(program_name())\n"
+PROGRAM = "from shmmap.client.connection import program_name\nprint(program_name())\n"
 
 
-def told(*arguments: str, cwd: Path, program: str = "") -> str:
+def printed(*arguments: str, cwd: Path, program: str = "") -> str:
     done = subprocess.run(
         [sys.executable, *arguments], cwd=cwd, input=program, capture_output=True, text=True, check=True
     )
@@ -43,10 +43,10 @@ def programs(tmp_path: Path) -> Path:
     ],
 )
 def test_names(programs: Path, arguments: list[str], name: str) -> None:
-    assert told(*arguments, cwd=programs, program=PROGRAM) == name
+    assert printed(*arguments, cwd=programs, program=PROGRAM) == name
 
 
 def test_a_long_name_is_cut(programs: Path) -> None:
     long = "a" * 100 + ".py"
     (programs / long).write_text(PROGRAM)
-    assert told(long, cwd=programs) == "a" * 64
+    assert printed(long, cwd=programs) == "a" * 64
