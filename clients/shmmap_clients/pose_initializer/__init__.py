@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
@@ -30,14 +30,4 @@ __all__ = [
     "RoughPose",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "Alternative": "initial_pose",
-        "InitialPose": "initial_pose",
-        "InitializerRules": "initializer",
-        "PoseInitializer": "initializer",
-        "Relocalizer": "relocalizer",
-        "RoughPose": "rough_pose",
-    },
-)
+__getattr__ = lazy_names(__name__)

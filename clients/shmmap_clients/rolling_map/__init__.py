@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.rolling_map.live_section import LiveSettings, live_section
@@ -22,15 +22,4 @@ __all__ = [
     "read_parameters",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "LiveSettings": "live_section",
-        "MapContent": "picture",
-        "Parameters": "parameters",
-        "Shown": "parameters",
-        "live_section": "live_section",
-        "map_picture": "picture",
-        "read_parameters": "parameters",
-    },
-)
+__getattr__ = lazy_names(__name__)
