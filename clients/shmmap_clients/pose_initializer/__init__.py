@@ -16,10 +16,14 @@ from typing import TYPE_CHECKING
 from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
-    from shmmap_clients.pose_initializer.initializer import InitializerRules, PoseInitializer
+    from shmmap_clients.pose_initializer.candidates import RoughPose
+    from shmmap_clients.pose_initializer.initializer import (
+        Alternative,
+        InitializerRules,
+        InitialPose,
+        PoseInitializer,
+    )
     from shmmap_clients.pose_initializer.relocalizer import Relocalizer
-    from shmmap_clients.pose_initializer.rough_pose import RoughPose
 
 __all__ = [
     "Alternative",

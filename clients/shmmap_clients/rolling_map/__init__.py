@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING
 from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap_clients.rolling_map.live_section import LiveSettings, live_section
-    from shmmap_clients.rolling_map.parameters import Parameters, Shown, read_parameters
+    from shmmap_clients.rolling_map.parameters import (
+        LiveSettings,
+        Parameters,
+        Shown,
+        live_section,
+        read_parameters,
+    )
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
 
 __all__ = [
