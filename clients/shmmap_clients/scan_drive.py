@@ -56,7 +56,7 @@ class ScanDrive:
     one_line
         Progress is one line of a terminal, which is written over; by default it is a line for each scan.
     rate
-        A directory is read no faster than so many scans a second, if that is given.
+        Scans a second that a directory is read at most, if that is given.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class ScanDrive:
         report: DriveReport[Outcome],
         document: Callable[[Outcome], dict[str, Any]] | None = None,
         *,
-        most: int | None = None,
+        max_scans: int | None = None,
     ) -> None:
         """Go through the scans to their end.
 
@@ -128,15 +128,15 @@ class ScanDrive:
             Counts what came of it, and says so on stderr.
         document
             Returns what ``--json-lines`` writes of it.
-        most
-            So many scans are taken, if that is given.
+        max_scans
+            Number of scans that are taken at most, if that is given.
 
         Raises
         ------
         ShmmapError
             A scan cannot be read, or the step cannot be done.
         """
-        for scan in islice(self._begin(), most):
+        for scan in islice(self._begin(), max_scans):
             outcome = step(scan)
             report.add(outcome)
             if self._lines is not None and document is not None:

@@ -92,12 +92,12 @@ def test_progress_is_one_line_of_a_terminal(
     scans: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ExitStack() as stack:
-        ScanDrive(options(scans), "program", None, stack, one_line=True).run(size, Report(), most=2)
+        ScanDrive(options(scans), "program", None, stack, one_line=True).run(size, Report(), max_scans=2)
     assert capsys.readouterr().err == "", "stderr is no terminal"
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     with ExitStack() as stack:
         drive = ScanDrive(options(scans), "program", None, stack, one_line=True)
-        drive.run(size, Report(), most=2)
+        drive.run(size, Report(), max_scans=2)
         drive.say("something", "a hint")
         drive.say("something else")
     shown = "\r\\x1b[1m1 of 1\r\\x1b[1m2 of 3\n"
@@ -124,7 +124,7 @@ def test_the_scan_after_the_last_one_is_not_waited_for(
         assert publisher.wait_for_listener(30.0)
         for _ in range(2):
             publisher.send(Scan("one", 0.0, {"xyz": np.full((3, 3), 9.0, np.float32)}))
-        drive.run(size, report, most=2)  # there is no third
+        drive.run(size, report, max_scans=2)  # there is no third
     assert report.points == 6
     assert capsys.readouterr().err.splitlines()[0] == f"waiting for scans from {endpoint}"
 

@@ -116,12 +116,12 @@ def _voxel_cloud(live: LiveMap, kind: str) -> Content:
 
 
 class LiveWorker(Worker):
-    """Answers with voxels, and publishes them where somebody listens and something has changed.
+    """Answers with voxels, and publishes them where a node subscribes and something has changed.
 
     Parameters
     ----------
     live
-        The map, of a client that nobody else uses.
+        The map, of a client that serves nothing else.
     clouds
         Writers of the two topics by kind of voxels, ``occupied`` and ``free``.
     listening
@@ -155,7 +155,7 @@ class LiveWorker(Worker):
         return _failed_reply(message)
 
     def tick(self) -> None:
-        """Publish what has changed, or what somebody has come to hear."""
+        """Publish what has changed, or what a new subscriber asks for."""
         for kind, writer in self._clouds.items():
             readers = frozenset(writer.get_matched_subscriptions())
             change = self._live.status().change if readers else 0

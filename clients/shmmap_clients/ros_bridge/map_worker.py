@@ -49,7 +49,7 @@ def _whole_map(
     stamp_ns
         Time in the header.
     most_bytes
-        The message may have so many.
+        Size of the message at most.
     wait_s
         How long a cell may take to load.
 
@@ -106,7 +106,7 @@ class MapWorker(Worker):
     Parameters
     ----------
     client
-        Of the daemon, used by nobody else.
+        Of the daemon; only this worker uses it.
     metadata, whole
         Writers of the two topics; ``whole`` is None where the whole map is not published.
     listening
@@ -114,7 +114,7 @@ class MapWorker(Worker):
     wait_s
         How long cells may take to load.
     whole_bytes
-        The whole map may take so many.
+        Size of the whole map at most.
 
     Attributes
     ----------

@@ -68,7 +68,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
     wait_s
         How long cells may take to load.
     whole_map, whole_bytes
-        Publish the whole map; it may take so many bytes.
+        Publish the whole map; its size at most.
     voxels_every_s
         How often voxels are published at most.
     """
@@ -110,7 +110,7 @@ class RosBridge:
     CannotStart
         CycloneDDS does not start.
     DaemonUnreachable
-        Nobody answers.
+        The daemon does not answer.
     """
 
     def __init__(

@@ -66,7 +66,7 @@ class Requester:
     incompatible
         It has none.
     vendor
-        Whose DDS it speaks; empty where that cannot be told.
+        Whose DDS it speaks; empty where that is unknown.
     found_s
         When it was found, on the clock of `time.monotonic`.
     """
@@ -201,8 +201,8 @@ class ServiceServer:
         return True
 
     def gone(self, request: Request) -> bool:
-        """Whether nobody waits for the reply any more."""
-        return self._requester(request.handle, anew=True) is None
+        """Whether the client that asked is gone."""
+        return self._requester(request.handle, afresh=True) is None
 
     def reply(self, content: Content) -> str:
         """Send a reply; returns why it cannot be sent, empty when it was."""
@@ -220,12 +220,12 @@ class ServiceServer:
             return str(error)
         return ""
 
-    def _requester(self, handle: int, *, anew: bool = False) -> Requester | None:
-        """Who writes there; None when it is gone.  ``anew``: what was known before does not count."""
+    def _requester(self, handle: int, *, afresh: bool = False) -> Requester | None:
+        """Who writes there; None when it is gone.  ``afresh``: what was known before does not count."""
         with self._lock:
             known = self._requesters.get(handle)
             if known is not None and (
-                not anew or handle in _unsigned(self._reader.get_matched_publications())
+                not afresh or handle in _unsigned(self._reader.get_matched_publications())
             ):
                 return known
             found = None if known is not None else self._reader.get_matched_publication_data(handle)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What answers requests that need the daemon: in a thread of its own, and clients take turns.
 
-A ROS client waits for ever. So while the daemon is away a request is kept, and answered when it is back,
+A ROS client waits without end. So while the daemon is away a request is kept, and answered when it is back,
 unless the client has gone meanwhile. One that takes long, or fails while others succeed, waits behind those
 of other clients, and is given up after some tries. What the daemon refuses is answered with nothing, and
 logged; what is too large is not answered at all, because an answer without cells would be taken for one.
@@ -105,13 +105,13 @@ class Worker(ABC):
     Parameters
     ----------
     listening
-        Where requests come; to nobody else.
+        Where requests come, for this worker only.
     stop
         Set when the program ends.
     every_s
         How often `tick` is called.
     log
-        Told what goes wrong, and when it is right again.
+        Takes a line about what goes wrong, and when it is right again.
     """
 
     def __init__(

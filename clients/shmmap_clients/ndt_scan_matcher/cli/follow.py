@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
                 tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
             return frame
 
-        drive.run(step, report, frame_document, most=args.frames)
+        drive.run(step, report, frame_document, max_scans=args.frames)
     summary = report.statistics.summary(
         maps.statistics, maps.too_slow, matcher.trust, backend=matcher.backend_name, fault=matcher.fault
     )
