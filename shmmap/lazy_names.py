@@ -57,5 +57,6 @@ def _imported_for_types(package: str) -> dict[str, str]:
         for block in tree.body
         if isinstance(block, _ast.If) and getattr(block.test, "id", "") == "TYPE_CHECKING"
         for statement in block.body
+        if isinstance(statement, _ast.ImportFrom) and statement.module is not None
         for alias in statement.names
     }

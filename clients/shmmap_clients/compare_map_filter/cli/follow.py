@@ -134,13 +134,13 @@ def run(args: argparse.Namespace) -> int:
 
         def step(scan: Scan) -> ComparedScan:
             compared = comparer(scan)
-            position = scan.pose[:2, 3].tolist()
+            x, y = scan.pose[:2, 3].tolist()
             if output is not None:
                 output.write(compared)
             if args.picture:
-                view.add(to_map(scan.xyz, scan.pose), compared.comparison.kept, tuple(position))
+                view.add(to_map(scan.xyz, scan.pose), compared.comparison.kept, (x, y))
             if compared.comparison.no_map and not statistics.no_map:
-                drive.say(f"no map around scan {scan.name}: {map_extent(client, position)}")
+                drive.say(f"no map around scan {scan.name}: {map_extent(client, (x, y))}")
             return compared
 
         drive.run(step, statistics, statistics.document)
