@@ -14,9 +14,9 @@ loads what says why a name cannot be loaded.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+from shmmap.lazy_names import lazy_names
 from shmmap.optional_packages import needed_packages
 from shmmap.segment.process_limits import no_files_left
 
@@ -171,77 +171,18 @@ __all__ = [
     "write_pcd",
 ]
 
-_GEOMETRY: Final = frozenset({"Area", "AutowareSquare", "Box", "Circle", "ZRange"})
-_MESSAGES: Final = frozenset({"HeldCell", "Holder", "Intent"})
-_CHUNKS: Final = {"Counts": "scan_filter", "Occupancy": "occupancy", "ScanFilter": "scan_filter"}
-_LIVE: Final = {
-    "ChunkInfo": "client.live.chunk_reader",
-    "LiveMap": "client.live.live_map",
-    "LiveMapRow": "protocol.live",
-    "LiveMapper": "client.live.mapper",
-    "Sphere": "client.live.live_map",
-    "Voxels": "client.live.live_map",
-}
-_LAYERS: Final = {
-    "LayerKind": "contract",
-    "LayerTable": "contract",
-    "build_layer": "build",
-    "canonical_layer": "spec",
-    "ground_height": "ground",
-    "voxel_covariances": "ndt",
-}
-_CLIENT: Final = frozenset(
-    {
-        "Cell",
-        "CellInfo",
-        "CellSet",
-        "Client",
-        "Departed",
-        "EventStream",
-        "MapListing",
-        "MapWindow",
-        "Missed",
-        "PendingLayer",
-        "PointsAround",
-        "Retention",
-        "RetentionPolicy",
-        "WindowUpdate",
-        "connect",
-    }
-)
+_load = lazy_names(__name__)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _CLIENT:
-        module = "shmmap.client"
-    elif name in _GEOMETRY:
-        module = "shmmap.geometry"
-    elif name in _MESSAGES:
-        module = "shmmap.protocol.messages"
-    elif name in _CHUNKS:
-        module = f"shmmap.chunks.{_CHUNKS[name]}"
-    elif name in _LIVE:
-        module = f"shmmap.{_LIVE[name]}"
-    elif name in _LAYERS:
-        module = f"shmmap.layers.{_LAYERS[name]}"
-    elif name == "read_cloud":
-        module = "shmmap.formats.cloud"
-    elif name == "write_pcd":
-        module = "shmmap.formats.pcd.writer"
-    elif name in __all__:
-        module = "shmmap.errors"
-    else:
-        raise AttributeError(f"module 'shmmap' has no attribute {name!r}")
     try:
         with needed_packages(f"shmmap.{name}"):
-            value = getattr(importlib.import_module(module), name)
+            return _load(name)
     except (OSError, ImportError) as error:
         limit = no_files_left(error, f"shmmap.{name} cannot be loaded: ")
         if limit is None:
             raise
         raise limit from None
-    globals()[name] = value
-    return value
 
 
 def __dir__() -> list[str]:

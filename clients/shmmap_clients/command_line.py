@@ -43,12 +43,12 @@ from shmmap.cli.programs import (
 )
 
 __all__ = [
+    "ProgressLine",
     "Verb",
     "add_allow_empty",
     "add_daemon_options",
     "add_json_option",
     "add_verb",
-    "announce_scans",
     "at_least",
     "complain",
     "connect",
@@ -198,9 +198,42 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def announce_scans(args: argparse.Namespace) -> None:
-    """Say that ``--scans`` is waited for where it is the address of a publisher, unless ``--quiet``."""
-    from shmmap_clients.streams import is_endpoint
+class ProgressLine:
+    """What a program is doing, on stderr.
 
-    if is_endpoint(args.scans) and not args.quiet:
-        print_line(f"waiting for scans from {args.scans}", file=sys.stderr)
+    Parameters
+    ----------
+    quiet
+        Show nothing.
+    written_over
+        Each text takes the place of the one before, as on a terminal; else each is a line.
+    """
+
+    def __init__(self, *, quiet: bool, written_over: bool) -> None:
+        self.quiet = quiet
+        self.written_over = written_over
+        self._shown = ""
+
+    def __enter__(self) -> ProgressLine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def show(self, text: str) -> None:
+        """Show what is being done."""
+        if self.quiet:
+            return
+        text = printable(text)
+        if self.written_over:
+            sys.stderr.write("\r" + text.ljust(len(self._shown)))
+            self._shown = text
+        else:
+            sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        """Let what comes next begin a line."""
+        if self._shown:
+            sys.stderr.write("\n")
+            self._shown = ""

@@ -5,31 +5,46 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from shmmap_clients.command_line import complain, finite, not_negative, positive
+from shmmap_clients.command_line import at_least, complain, finite, not_negative, positive
 
 if TYPE_CHECKING:
+    from shmmap_clients.ndt_scan_matcher import DeviceOptions, TrustLimits
     from shmmap_clients.scans.bin_layout import BinLayout
     from shmmap_clients.scans.scan_file import ScanReader
 
 __all__ = [
+    "FAILED_LIMITS",
     "Parser",
     "add_backend_option",
+    "add_device_options",
     "add_height_option",
+    "add_json_lines_option",
     "add_leaf_option",
     "add_min_range_option",
+    "add_poses_option",
     "add_quiet_option",
     "add_radius_option",
     "add_scan_option",
     "add_scans_option",
+    "add_scoring_options",
     "add_sigma_options",
     "add_thin_option",
     "add_threads_option",
+    "add_trust_options",
+    "device_options_from",
     "reader_from",
+    "scoring_settings",
+    "trust_from",
 ]
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
+
+FAILED_LIMITS: Final = """\
+failed_limits names what did not hold: no_map, converged (the alignment did not
+converge), nvtl, transform_probability, oscillations, points, distance,
+angle, sharpness, spread."""
 
 
 def add_scan_option(parser: Parser) -> None:
@@ -45,7 +60,7 @@ def add_scan_option(parser: Parser) -> None:
 
 
 def add_scans_option(parser: Parser, *, min_range: bool = True) -> None:
-    """Add ``--scans``, see `shmmap_clients.scans.scan_source`, and how they are read."""
+    """Add ``--scans``, see `shmmap_clients.scan_drive.open_scans`, and how they are read."""
     parser.add_argument(
         "--scans",
         required=True,
@@ -56,6 +71,23 @@ def add_scans_option(parser: Parser, *, min_range: bool = True) -> None:
     _add_bin_option(parser)
     if min_range:
         add_min_range_option(parser)
+
+
+def add_poses_option(parser: Parser) -> None:
+    """Add ``--poses``."""
+    parser.add_argument(
+        "--poses",
+        metavar="FILE",
+        help="poses of the frame that the points are in, for the scans of a directory, TUM format; a"
+        " publisher's scans bring theirs",
+    )
+
+
+def add_json_lines_option(parser: Parser) -> None:
+    """Add ``--json-lines``."""
+    parser.add_argument(
+        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
+    )
 
 
 def _add_bin_option(parser: Parser) -> None:
@@ -200,4 +232,132 @@ def add_height_option(parser: Parser, *, default: float | None, shown: str) -> N
         default=default,
         metavar="M",
         help=f"height of the frame that the points are in above the map's ground (default: {shown})",
+    )
+
+
+def add_scoring_options(parser: Parser, *, all_processors: bool = False) -> None:
+    """Add ``--backend``, ``--fallback``, ``--threads`` as `add_threads_option`, and devices' options."""
+    parser.add_argument(
+        "--backend",
+        default="numba",
+        metavar="NAME",
+        help="numba; numpy: same results, slower, no compiler; or opencl: same results, on a GPU or any other"
+        " device with a driver (default: numba)",
+    )
+    parser.add_argument(
+        "--fallback",
+        metavar="NAME",
+        help="backend that goes on, and says so, when the device fails in the middle of the work (default:"
+        " that is an error)",
+    )
+    add_device_options(parser)
+    add_threads_option(parser, all_processors=all_processors)
+
+
+def add_device_options(parser: Parser) -> None:
+    """Add ``--device``, ``--precision`` and ``--memory``."""
+    parser.add_argument(
+        "--device",
+        metavar="INDEX|NAME",
+        help="device for --backend opencl, as `shmmap-ndt devices` lists them (default: SHMMAP_OPENCL_DEVICE,"
+        " or the first GPU, else the first device)",
+    )
+    parser.add_argument(
+        "--precision",
+        choices=("auto", "double", "float"),
+        default="auto",
+        help="of a device; auto: double where it has that (default: auto)",
+    )
+    parser.add_argument(
+        "--memory",
+        choices=("auto", "svm", "copy"),
+        default="auto",
+        help="where the map lies for a device: svm reads shared memory in place, copy copies each cell once;"
+        " auto: in place where the device says that it can (default: auto)",
+    )
+
+
+def device_options_from(args: argparse.Namespace) -> DeviceOptions:
+    """Return which device is asked for, and how."""
+    from shmmap_clients.ndt_scan_matcher import DeviceOptions
+
+    return DeviceOptions(args.device, args.precision, args.memory)
+
+
+def scoring_settings(args: argparse.Namespace) -> dict[str, Any]:
+    """Return what `Settings` has of these options."""
+    return {"backend": args.backend, "device": device_options_from(args), "fallback": args.fallback}
+
+
+def add_trust_options(parser: argparse.ArgumentParser) -> None:
+    """Add the limits beyond which a pose is not trusted."""
+    trust = parser.add_argument_group("trust (a result beyond one of these limits is not trusted)")
+    trust.add_argument(
+        "--trust-nvtl",
+        type=not_negative,
+        metavar="N",
+        help="lowest nearest-voxel transformation likelihood (default by --leaf: 1.22 at 1 m, 2.30 at 2 m,"
+        " 2.96 at 3 m; for alignments with true covariances 0.91 at 1 m)",
+    )
+    trust.add_argument(
+        "--trust-tp", type=not_negative, metavar="N", help="lowest transform probability (default: any)"
+    )
+    trust.add_argument(
+        "--trust-oscillations",
+        type=at_least(0),
+        default=10,
+        metavar="N",
+        help="most reversals of the step (default: 10)",
+    )
+    trust.add_argument(
+        "--trust-points",
+        type=at_least(0),
+        default=80,
+        metavar="N",
+        help="least points of the scan with a voxel of the map near (default: 80)",
+    )
+    trust.add_argument(
+        "--trust-distance",
+        type=not_negative,
+        default=10.0,
+        metavar="M",
+        help="20 points of the scan must be at least so far away (default: 10)",
+    )
+    trust.add_argument(
+        "--trust-angle",
+        type=not_negative,
+        default=35.0,
+        metavar="DEG",
+        help="least width of the sector that the points of the scan lie in (default: 35)",
+    )
+    trust.add_argument(
+        "--trust-sharpness",
+        type=not_negative,
+        metavar="N",
+        help="lowest curvature of the score per matched point in any direction (default: 2.7; for alignments"
+        " with true covariances 3.4)",
+    )
+    trust.add_argument(
+        "--trust-spread",
+        type=not_negative,
+        default=0.03,
+        metavar="N",
+        help="lowest ratio of the variances of the position in its most and least certain directions, 0 to 1"
+        " (default: 0.03)",
+    )
+
+
+def trust_from(args: argparse.Namespace) -> TrustLimits:
+    """Return the limits of trust that the options ask for."""
+    from shmmap_clients.ndt_scan_matcher import TrustLimits
+
+    return TrustLimits(
+        nvtl=args.trust_nvtl,
+        transform_probability=args.trust_tp,
+        oscillations=args.trust_oscillations,
+        points=args.trust_points,
+        distance=args.trust_distance,
+        angle=args.trust_angle,
+        sharpness=args.trust_sharpness,
+        spread=args.trust_spread,
     )

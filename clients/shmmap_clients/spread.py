@@ -1,16 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mean, variance, percentiles and maximum of a stream of numbers, in bounded memory."""
+"""A stream of any length in bounded memory: some of its values, and how numbers are distributed."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 
-from shmmap_clients.decimation import Decimated
+__all__ = ["KEPT", "Decimated", "RunningSpread", "Spread"]
 
-__all__ = ["RunningSpread", "Spread"]
+KEPT: Final = 4096
+
+T = TypeVar("T")
+
+
+class Decimated(Generic[T]):
+    """Keeps all values until there are ``most``, from then on every second, fourth, eighth, ... one.
+
+    Parameters
+    ----------
+    most
+        How many values are kept at most; at least 2.
+    """
+
+    def __init__(self, most: int = KEPT) -> None:
+        self._most = most
+        self._stride = 1
+        self._count = 0
+        self.values: list[T] = []
+
+    def add(self, value: T) -> None:
+        """Take the next value of the stream."""
+        if self._count % self._stride == 0:
+            if len(self.values) == self._most:
+                del self.values[1::2]
+                self._stride *= 2
+            if self._count % self._stride == 0:
+                self.values.append(value)
+        self._count += 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,3 +88,9 @@ class RunningSpread:
     def root_mean_square(self) -> float:
         """Of the numbers so far; NaN where there are none."""
         return math.sqrt(self._mean**2 + self._squares / self.count) if self.count else math.nan
+
+    @property
+    def document(self) -> dict[str, float] | None:
+        """Median, 99th percentile and maximum, for JSON; None where there are no numbers."""
+        spread = self.spread
+        return {"p50": spread.p50, "p99": spread.p99, "max": spread.max} if self.count else None

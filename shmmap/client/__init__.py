@@ -11,9 +11,8 @@ border of two, it maps and unmaps memory in every round (30 ms).
 from __future__ import annotations
 
 import copyreg
-import importlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import msgspec  # noqa: F401
 import numpy as np  # noqa: F401
@@ -23,6 +22,7 @@ import zmq  # noqa: F401
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, PendingLayer
 from shmmap.client.client import Client, connect
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, Missed
@@ -50,18 +50,7 @@ __all__ = [
     "connect",
 ]
 
-_LATER: Final = {
-    "CellInfo": "map_listing",
-    "Departed": "window.retention",
-    "EventStream": "event_stream",
-    "MapListing": "map_listing",
-    "MapWindow": "window.map_window",
-    "Missed": "event_stream",
-    "PointsAround": "points_around",
-    "Retention": "window.retention",
-    "RetentionPolicy": "window.retention",
-    "WindowUpdate": "window.state",
-}
+__getattr__ = lazy_names(__name__)
 
 
 def _hand_over(cell: Cell) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
@@ -71,11 +60,3 @@ def _hand_over(cell: Cell) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
 
 
 copyreg.pickle(Cell, _hand_over)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LATER:
-        raise AttributeError(f"module 'shmmap.client' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"shmmap.client.{_LATER[name]}"), name)
-    globals()[name] = value
-    return value

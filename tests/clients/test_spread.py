@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from shmmap_clients.decimation import KEPT, Decimated
-from shmmap_clients.spread import RunningSpread
+from shmmap_clients.spread import KEPT, Decimated, RunningSpread
 
 
 def test_few_numbers_are_all_kept() -> None:

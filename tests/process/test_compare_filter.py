@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.compare_map_filter import CompareMapFilter, CompareRule
-from shmmap_clients.compare_map_filter.drive import compare_drive
+from shmmap_clients.compare_map_filter.drive import ScanComparer
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber
 from shmmap_clients.scans.trajectory import matrix_of, tum_line
@@ -112,8 +112,9 @@ def test_a_scan_is_compared_with_one_state_of_the_window(daemon: Factory, divide
     rule = CompareRule("distance", 0.5)
     scans = [make_scan(divided_map, number) for number in range(2)]
     with RestlessWindow(one.endpoint, 45.0, layers=rule.layer, update_distance=0.0) as window:
-        drive = compare_drive(scans, window, CompareMapFilter(rule), first_wait_s=LONG_S, wait_s=LONG_S)
-        for scan, compared in zip(scans, drive, strict=True):
+        comparer = ScanComparer(window, CompareMapFilter(rule), first_wait_s=LONG_S, wait_s=LONG_S)
+        for scan in scans:
+            compared = comparer(scan)
             near = np.hypot(*scan.xyz[:, :2].T) < 40.0
             expected = kept_by_brute_force(scan, divided_map, 0.5)
             assert compared.missing == ""

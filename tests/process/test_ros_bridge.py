@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES
+from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES
 from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo, MapMetaData
 from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2

@@ -36,6 +36,7 @@ BASE = {
     "sharded_dict",
     "sparse_table",
     "disk_budget",
+    "lazy_names",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -56,14 +57,15 @@ PARTS = {
     "sharded_dict": set[str](),
     "sparse_table": set[str](),
     "disk_budget": {"failpoints"},
+    "lazy_names": set[str](),
     "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "sharded_dict", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},
     "client": {
-        "errors", "columns", "failpoints", "geometry", "lacking", "optional_packages", "chunks", "segment",
-        "protocol", "statistics.layout",
+        "errors", "columns", "failpoints", "geometry", "lacking", "lazy_names", "optional_packages", "chunks",
+        "segment", "protocol", "statistics.layout",
     },
     "daemon": BASE | {
         "chunks", "formats", "segment", "protocol", "statistics", "layers", "origin", "dividing",
@@ -192,7 +194,7 @@ def test_no_imports_in_a_circle() -> None:
 
 @pytest.mark.parametrize("module", modules(CLIENTS))
 def test_programs_use_public_names_alone(module: str) -> None:
-    """But for kernels and archives, made as shmmap's own, and their command lines, which answer as those."""
+    """But for kernels, archives and lazy names, as shmmap's own, and command lines, which answer as its."""
     for node in ast.walk(ast.parse(source(module).read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "shmmap":
             if module == "shmmap_clients.command_line" and node.module == "shmmap.cli.programs":
@@ -201,7 +203,7 @@ def test_programs_use_public_names_alone(module: str) -> None:
                 ("shmmap.demo.", "shmmap.simulation.")
             ):
                 continue
-            if node.module in ("shmmap.compiling", "shmmap.formats.npz_writer"):
+            if node.module in ("shmmap.compiling", "shmmap.formats.npz_writer", "shmmap.lazy_names"):
                 continue
             assert node.module == "shmmap", f"{module} imports {node.module}"
             assert {alias.name for alias in node.names} <= set(shmmap.__all__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.compare_map_filter.filter import CompareMapFilter, Comparison
@@ -17,11 +17,4 @@ __all__ = [
     "Comparison",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "CompareMapFilter": "filter",
-        "CompareRule": "rule",
-        "Comparison": "filter",
-    },
-)
+__getattr__ = lazy_names(__name__)

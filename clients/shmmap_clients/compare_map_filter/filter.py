@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from shmmap import BadRequest, Cell, LayerTable, MapWindow, canonical_layer
 from shmmap_clients.compare_map_filter import numpy_path
 from shmmap_clients.compare_map_filter.rule import CompareRule
-from shmmap_clients.compare_map_filter.search_cell import SearchCell
-from shmmap_clients.compare_map_filter.search_table import SearchTable
+from shmmap_clients.compare_map_filter.search_table import SearchCell, SearchTable
 
 __all__ = ["CompareMapFilter", "Comparison"]
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap_clients.compare_map_filter.rule import VOXEL, VOXEL_DISTANCE, CompareRule
-from shmmap_clients.compare_map_filter.search_cell import TILE_COLUMNS, SearchCell
-from shmmap_clients.compare_map_filter.search_table import SearchTable
+from shmmap_clients.compare_map_filter.search_table import TILE_COLUMNS, SearchCell, SearchTable
 
 __all__ = ["SLACK", "explain", "to_map"]
 

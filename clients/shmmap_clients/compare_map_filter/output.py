@@ -64,8 +64,7 @@ class PcdDirectory:
 
     def write(self, compared: ComparedScan) -> None:
         """Write one file."""
-        T = compared.scan.T_map_sensor
-        assert T is not None  # noqa: S101  a compared scan has a pose
+        T = compared.scan.pose
         x, y, z, w = quaternion_of(T[:3, :3])
         viewpoint = (*T[:3, 3].tolist(), w, x, y, z)
         path = self._directory / f"{Path(compared.scan.name).name}.pcd"

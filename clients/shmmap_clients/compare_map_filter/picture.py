@@ -11,8 +11,8 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.decimation import Decimated
 from shmmap_clients.png import png_bytes
+from shmmap_clients.spread import Decimated
 
 __all__ = ["TopView"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import build_elevation_map
@@ -20,12 +20,4 @@ __all__ = [
     "build_elevation_map",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "ElevationGrid": "grid",
-        "ElevationRule": "rule",
-        "WindowHeights": "window_heights",
-        "build_elevation_map": "build",
-    },
-)
+__getattr__ = lazy_names(__name__)

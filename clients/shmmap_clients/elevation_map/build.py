@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole map, one cell at a time: list, load by id, reduce to columns, let go."""
+"""The whole map, one cell at a time: list, load by id, reduce to columns, release."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ import contextlib
 import fcntl
 import hashlib
 import json
+import os
 import shutil
+import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shmmap import (
+    BadRequest,
     Cell,
     CellError,
     CellInfo,
@@ -26,17 +30,191 @@ from shmmap import (
     MapMissing,
     ShmmapError,
 )
-from shmmap_clients.elevation_map.cell_columns import columns_of, heights_of
-from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
-from shmmap_clients.elevation_map.far_cells import far_cells
+from shmmap.formats.npz_writer import write_npz
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.rule import ElevationRule
-from shmmap_clients.elevation_map.seams import ColumnBox, Seams, column_boxes
+from shmmap_clients.elevation_map.seams import ColumnBox, Columns, Seams, column_boxes
+from shmmap_clients.elevation_map.surface import surface_heights
 
-__all__ = ["BuildProgress", "BuiltElevation", "MapChanged", "build_elevation_map"]
+__all__ = [
+    "BuildProgress",
+    "BuiltElevation",
+    "Checkpoint",
+    "Journal",
+    "MapChanged",
+    "build_elevation_map",
+    "far_cells",
+]
 
+_APART_M: Final = 1000.0  # cells nearer than about that are in one part of a map
+_SHARE: Final = 0.01  # of the map's bytes: a part that has more is no stray point
+_FEW_BYTES: Final = 4096
+_LARGER: Final = 4.0  # times: where the box does not grow by that much, nothing is left out
+_MIN, _MAX, _MEAN, _COUNT = range(4)
 FORMAT: Final = 3
 _EVERY: Final = 64  # cells between checkpoints
+
+
+def far_cells(boxes: NDArray[np.float64], sizes: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return how far each cell lies from the map, where it is alone and holds next to nothing; else 0.
+
+    A stray point or two make such a cell.  A grid covers the box around its cells: one point kilometres off
+    would make it a thousand times as large.
+
+    Parameters
+    ----------
+    boxes
+        (N, 4) float64: min_x, min_y, max_x, max_y, metres.
+    sizes
+        (N,) int64: bytes of their sources.
+
+    Returns
+    -------
+    (N,) float64, metres to the nearest cell of the map; 0 for the map's own cells.
+    """
+    parts = _parts(boxes)
+    held = np.bincount(parts, weights=sizes if sizes.any() else np.ones(len(sizes)))
+    few = min(max(_SHARE * held.sum(), _FEW_BYTES), held.max() / 10)
+    own = (held > few)[parts]
+    far = np.zeros(len(boxes))
+    if own.all() or _extent(boxes) < _LARGER * _extent(boxes[own]):
+        return far
+    for number in np.flatnonzero(~own):
+        box = boxes[number]
+        gap = np.maximum(np.maximum(boxes[own, :2] - box[2:], box[:2] - boxes[own, 2:]), 0.0)
+        far[number] = float(np.hypot(gap[:, 0], gap[:, 1]).min())
+    return far
+
+
+def _extent(boxes: NDArray[np.float64]) -> float:
+    """Return the area of the box around boxes, square metres; a line is a metre wide."""
+    sides = boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)
+    return float(np.maximum(sides, 1.0).prod())
+
+
+def _parts(boxes: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the part of the map that each cell is in, counted from 0: squares that touch are one part."""
+    edge = max(_APART_M, float((boxes[:, 2:] - boxes[:, :2]).max()))
+    squares, member = np.unique(
+        np.floor((boxes[:, :2] + boxes[:, 2:]) / (2 * edge)).astype(np.int64), axis=0, return_inverse=True
+    )
+    number = {(i, j): place for place, (i, j) in enumerate(squares.tolist())}
+    part = np.full(len(squares), -1, np.int64)
+    count = 0
+    for start in range(len(squares)):
+        if part[start] >= 0:
+            continue
+        part[start] = count
+        ahead = [start]
+        while ahead:
+            i, j = squares[ahead.pop()].tolist()
+            for near in ((i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)):
+                place = number.get(near)
+                if place is not None and part[place] < 0:
+                    part[place] = count
+                    ahead.append(place)
+        count += 1
+    return part[member.reshape(-1)]
+
+
+def _columns_of(cell: Cell, rule: ElevationRule) -> Columns:
+    """Points of a cell, (N, 3); or of its ``elevation`` layer min, max, mean and count, (N, 4) float64."""
+    if rule.name == "surface":
+        xyz = cell.xyz if not any(cell.origin) else cell.xyz.astype(np.float64) + cell.origin
+        index = np.floor(xyz[:, :2].astype(np.float64) * (1.0 / rule.resolution)).astype(np.int64)
+        return Columns(index[:, 0], index[:, 1], xyz)
+    lattice = cell.header.lattice
+    if lattice is None:
+        raise BadRequest(f"{cell.id}: layer {cell.layer} has no lattice")
+    count = cell["count"]
+    j, i = np.nonzero(count)
+    values = np.stack([cell[name][j, i].astype(np.float64) for name in ("min", "max", "mean")], axis=1)
+    values = np.column_stack([values, count[j, i].astype(np.float64)])
+    return Columns(i + lattice.first[0], j + lattice.first[1], values)
+
+
+def _heights_of(
+    rows: Columns, rule: ElevationRule
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Columns i and j, (M,), and the height of each, (M,) float64 metres, from all their rows."""
+    low_i, low_j = int(rows.i.min()), int(rows.j.min())
+    width = int(rows.i.max()) - low_i + 1
+    key = (rows.j - low_j) * width + (rows.i - low_i)
+    if rule.name == "surface":
+        columns, heights = surface_heights(rows.values, key, rule)
+    else:
+        columns, member = np.unique(key, return_inverse=True)
+        member = member.reshape(-1)
+        if rule.name == "mean":
+            points = np.bincount(member, weights=rows.values[:, _COUNT])
+            sums = np.bincount(member, weights=rows.values[:, _MEAN] * rows.values[:, _COUNT])
+            heights = sums / points
+        else:
+            lowest = rule.name == "min"
+            heights = np.full(len(columns), np.inf if lowest else -np.inf)
+            ufunc = np.minimum if lowest else np.maximum
+            ufunc.at(heights, member, rows.values[:, _MIN if lowest else _MAX])
+    return columns % width + low_i, columns // width + low_j, heights
+
+
+@dataclass(slots=True)
+class Checkpoint:
+    """Cells done, in order; rows read; points outside their cell; columns that had a point."""
+
+    done: int = 0
+    rows: int = 0
+    stray: int = 0
+    occupied: int = 0
+
+
+class Journal:
+    """Keeps the latest checkpoint of a build in its directory.
+
+    Heights and ``seams-N.npz`` are forced to the disk first, then ``state.json`` with N appears by rename:
+    whenever a build or its machine dies, the state speaks of what is there whole.  Columns finished after a
+    checkpoint are made again, with the same heights.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+
+    def write(self, state: Checkpoint, seams: Seams) -> None:
+        """Replace the checkpoint."""
+        arrays = {}
+        for number, rows in seams.waiting.items():
+            arrays[f"i{number}"], arrays[f"j{number}"] = rows.i, rows.j
+            arrays[f"values{number}"] = rows.values
+        with open(self._directory / f"seams-{state.done}.npz", "wb") as file:
+            write_npz(file, arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        with open(self._directory / "heights", "rb") as heights:
+            os.fsync(heights.fileno())
+        interim = self._directory / "state.json.tmp"
+        interim.write_text(json.dumps(asdict(state)), encoding="utf-8")
+        interim.replace(self._directory / "state.json")
+        for path in self._directory.glob("seams-*.npz"):
+            if path.name != f"seams-{state.done}.npz":
+                path.unlink()
+
+    def read(self, seams: Seams) -> Checkpoint | None:
+        """Return the latest checkpoint and fill ``seams`` from it; None where there is no good one."""
+        try:
+            state = Checkpoint(**json.loads((self._directory / "state.json").read_text(encoding="utf-8")))
+            with np.load(self._directory / f"seams-{state.done}.npz", allow_pickle=False) as archive:
+                waiting = {
+                    int(name[1:]): Columns(
+                        archive[name], archive[f"j{name[1:]}"], archive[f"values{name[1:]}"]
+                    )
+                    for name in archive.files
+                    if name.startswith("i")
+                }
+        except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile):
+            return None
+        if not (self._directory / "heights").exists():
+            return None
+        seams.waiting.update(waiting)
+        return state
 
 
 class MapChanged(ShmmapError):
@@ -187,7 +365,7 @@ def _build(
         cell = _load(client, listing[order[number]], rule.layer, wait_s, failed, listing.map_version)
         rows = None
         if cell is not None:
-            rows = columns_of(cell, rule)
+            rows = _columns_of(cell, rule)
             state.rows += len(rows)
             inside = rows.inside(ColumnBox(*boxes[number].tolist()))
             if not inside.all():
@@ -196,7 +374,7 @@ def _build(
         complete = seams.add(number, rows)
         del rows, cell
         if complete is not None:
-            i, j, heights = heights_of(complete, rule)
+            i, j, heights = _heights_of(complete, rule)
             state.occupied += len(i)
             grid.put(i, j, heights)
         state.done = number + 1

@@ -19,16 +19,18 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 from shmmap.formats.npz_writer import npz_archive
 from shmmap_clients.elevation_map.grid import ElevationGrid
-from shmmap_clients.elevation_map.hillshade import hillshade
 from shmmap_clients.png import PngWriter
 
-__all__ = ["check_output", "write_elevation", "write_hillshade"]
+__all__ = ["check_output", "hillshade", "write_elevation", "write_hillshade"]
 
 _GEOTIFF: Final = (".tif", ".tiff")
 _SUFFIXES: Final = (".npz", ".png", *_GEOTIFF)
 _USER_DEFINED: Final = 32767  # GeoTIFF 1.1: the highest code, a system of the user's own
 _TILE: Final = 256
 _FINEST_STEP: Final = 0.001  # metres: a PNG has no finer steps
+_AZIMUTH: Final = math.radians(315.0)
+_ALTITUDE: Final = math.radians(45.0)
+_EXAGGERATION: Final = 2.0
 
 
 def check_output(path: Path, epsg: int | None = None) -> None:
@@ -190,3 +192,43 @@ def _world_file(path: Path, grid: ElevationGrid) -> None:
     numbers = (grid.resolution, 0.0, 0.0, -grid.resolution, west + half, north - half)
     with _replacing(path.with_suffix(".pgw")) as file:
         file.write("".join(f"{number:.12g}\n" for number in numbers).encode())
+
+
+def hillshade(heights: NDArray[np.float32], resolution: float) -> NDArray[np.uint8]:
+    """Shade rows; the first and the last row, which only serve as neighbours, are left out.
+
+    Slopes after Horn (1981); a missing neighbour counts as level.
+
+    Parameters
+    ----------
+    heights
+        (n + 2, columns) float32, metres, row 0 the southernmost; NaN where there is none.
+    resolution
+        Metres.
+
+    Returns
+    -------
+    (n, columns, 2) uint8: grey, and 255 where there is a height, 0 where not.
+    """
+    middle = heights[1:-1].astype(np.float64)
+    known = ~np.isnan(middle)
+    wide = np.pad(heights, ((0, 0), (1, 1)), constant_values=np.nan).astype(np.float64)
+    rows, columns = middle.shape
+
+    def at(dy: int, dx: int) -> NDArray[np.float64]:
+        near = wide[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
+        return np.where(np.isnan(near), middle, near)
+
+    span = 8 * resolution / _EXAGGERATION
+    east = (at(-1, 1) + 2 * at(0, 1) + at(1, 1) - at(-1, -1) - 2 * at(0, -1) - at(1, -1)) / span
+    north = (at(1, -1) + 2 * at(1, 0) + at(1, 1) - at(-1, -1) - 2 * at(-1, 0) - at(-1, 1)) / span
+    light = np.array(
+        [
+            math.cos(_ALTITUDE) * math.sin(_AZIMUTH),
+            math.cos(_ALTITUDE) * math.cos(_AZIMUTH),
+            math.sin(_ALTITUDE),
+        ]
+    )
+    shade = (light[2] - east * light[0] - north * light[1]) / np.sqrt(1 + east * east + north * north)
+    grey = np.where(known, np.clip(shade, 0.0, 1.0) * 254 + 1, 0)
+    return np.stack([grey.astype(np.uint8), np.where(known, 255, 0).astype(np.uint8)], axis=2)

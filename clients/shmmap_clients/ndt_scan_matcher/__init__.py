@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
@@ -55,26 +55,4 @@ __all__ = [
     "voxel_cell",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "BACKENDS": "backends.registry",
-        "Backend": "backends.backend",
-        "Cut": "matching.limits",
-        "DeviceError": "backends.opencl.errors",
-        "DeviceOptions": "backends.device_options",
-        "Evaluation": "matching.evaluation",
-        "Limits": "matching.limits",
-        "NdtMatcher": "matching.matcher",
-        "Regularization": "matching.regularization",
-        "Result": "matching.result",
-        "Settings": "matching.settings",
-        "TrustLimits": "matching.trust",
-        "VoxelCell": "map.voxel_cell",
-        "VoxelMap": "map.voxel_map",
-        "cell_from_layer": "map.voxel_cell",
-        "matrix_from_pose": "matching.euler_derivatives",
-        "pose_from_matrix": "matching.euler_derivatives",
-        "voxel_cell": "map.voxel_cell",
-    },
-)
+__getattr__ = lazy_names(__name__)

@@ -13,13 +13,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
-    from shmmap_clients.pose_initializer.initializer import InitializerRules, PoseInitializer
+    from shmmap_clients.pose_initializer.candidates import RoughPose
+    from shmmap_clients.pose_initializer.initializer import (
+        Alternative,
+        InitializerRules,
+        InitialPose,
+        PoseInitializer,
+    )
     from shmmap_clients.pose_initializer.relocalizer import Relocalizer
-    from shmmap_clients.pose_initializer.rough_pose import RoughPose
 
 __all__ = [
     "Alternative",
@@ -30,14 +34,4 @@ __all__ = [
     "RoughPose",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "Alternative": "initial_pose",
-        "InitialPose": "initial_pose",
-        "InitializerRules": "initializer",
-        "PoseInitializer": "initializer",
-        "Relocalizer": "relocalizer",
-        "RoughPose": "rough_pose",
-    },
-)
+__getattr__ = lazy_names(__name__)

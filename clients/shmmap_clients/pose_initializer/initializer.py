@@ -28,17 +28,71 @@ from shmmap_clients.ndt_scan_matcher import (
     cell_from_layer,
     matrix_from_pose,
 )
-from shmmap_clients.pose_initializer.initial_pose import Alternative, InitialPose
-from shmmap_clients.pose_initializer.parzen import ParzenEstimator
-from shmmap_clients.pose_initializer.rough_pose import RoughPose
+from shmmap_clients.pose_initializer.candidates import ParzenEstimator, RoughPose
 
-__all__ = ["InitializerRules", "PoseInitializer"]
+__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer"]
 
 _APART_M: Final = 1.0
 _APART_YAW: Final = math.radians(10.0)
 _SEED_APART_M: Final = 0.5
 _SEED_APART_YAW: Final = math.radians(3.0)
 _SAME_HEIGHT_M: Final = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alternative:
+    """Another pose that the scan might have been taken from.
+
+    Attributes
+    ----------
+    T_map_base : (4, 4) float64
+    score
+        Transform probability there.
+    nvtl
+        Nearest-voxel transformation likelihood.
+    """
+
+    T_map_base: NDArray[np.float64]
+    score: float
+    nvtl: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialPose:
+    """The best pose, and what speaks for it.
+
+    Attributes
+    ----------
+    result
+        The alignment that ended there.
+    score
+        Its transform probability: over all points, also those that found no map.
+    reliable
+        Whether the result is within all limits of trust.
+    ground_z
+        Height of the map's ground below the pose, metres: of the two heights that the search tries, the one
+        that fits; None where there is none near.
+    alternatives
+        Others, best first; at least a metre or ten degrees away from the best and each other.
+    candidates
+        Poses that were scored.
+    map_s, search_s
+        Seconds for the map around the place, and for the search.
+    """
+
+    result: Result
+    score: float
+    reliable: bool
+    ground_z: float | None
+    alternatives: tuple[Alternative, ...]
+    candidates: int
+    map_s: float
+    search_s: float
+
+    @property
+    def T_map_base(self) -> NDArray[np.float64]:  # noqa: N802
+        """(4, 4) float64, metres."""
+        return self.result.T_map_base
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,8 +347,8 @@ class PoseInitializer:
                 hint="`shmmap status` tells whether the daemon still loads, or has no memory left",
             )
         raise NoMapHere(
-            f"no map within {self.rules.map_radius:g} m of the rough pose: {map_extent(self._window.client)},"
-            f" the pose is at ({rough.x:.3f}, {rough.y:.3f})"
+            f"no map within {self.rules.map_radius:g} m of the rough pose:"
+            f" {map_extent(self._window.client, (rough.x, rough.y))}"
         )
 
 

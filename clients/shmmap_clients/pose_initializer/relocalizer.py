@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from shmmap import ShmmapError
 from shmmap_clients.ndt_scan_matcher import Result, pose_from_matrix
+from shmmap_clients.pose_initializer.candidates import RoughPose
 from shmmap_clients.pose_initializer.initializer import PoseInitializer
-from shmmap_clients.pose_initializer.rough_pose import RoughPose
 
 __all__ = ["Relocalizer"]
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap_clients.rolling_map.live_section import LiveSettings, live_section
-    from shmmap_clients.rolling_map.parameters import Parameters, Shown, read_parameters
+    from shmmap_clients.rolling_map.parameters import (
+        LiveSettings,
+        Parameters,
+        Shown,
+        live_section,
+        read_parameters,
+    )
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
 
 __all__ = [
@@ -22,15 +27,4 @@ __all__ = [
     "read_parameters",
 ]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "LiveSettings": "live_section",
-        "MapContent": "picture",
-        "Parameters": "parameters",
-        "Shown": "parameters",
-        "live_section": "live_section",
-        "map_picture": "picture",
-        "read_parameters": "parameters",
-    },
-)
+__getattr__ = lazy_names(__name__)

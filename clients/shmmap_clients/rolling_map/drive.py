@@ -1,16 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of the program: a scan, the window at its pose, and the scan on its way into the map."""
+"""A drive: each scan on its way into the map at its pose, with counts and times of all of them."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from shmmap import BadRequest, Counts, LiveMapper
+from shmmap import (
+    ChunkInfo,
+    Counts,
+    DaemonUnreachable,
+    LiveInterrupted,
+    LiveMap,
+    LiveMapper,
+    LiveMapRow,
+)
 from shmmap_clients.scans.scan_sequence import Scan
+from shmmap_clients.spread import Decimated, RunningSpread
 
-__all__ = ["MappedScan", "map_drive"]
+__all__ = ["DriveStatistics", "MappedScan", "map_scan", "states_text", "usage_text"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,28 +49,118 @@ class MappedScan:
     add_s: float
 
 
-def map_drive(scans: Iterable[Scan], mapper: LiveMapper) -> Iterator[MappedScan]:
-    """Map scan after scan.
-
-    Parameters
-    ----------
-    scans
-        With poses.
-    mapper
-        What sends scans to the map, whose window follows them.
+def map_scan(scan: Scan, mapper: LiveMapper) -> MappedScan:
+    """Send a scan to the map, whose window follows it.
 
     Raises
     ------
     BadRequest
-        A scan has no pose.
+        The scan has no pose.
     ShmmapError
         The daemon does not take it.
     """
-    for scan in scans:
-        T = scan.T_map_sensor
-        if T is None:
-            raise BadRequest(f"scan {scan.name} has no pose", hint="give poses with --poses FILE")
-        begin_s = time.perf_counter()
-        number = mapper.add(scan.xyz, T)
-        add_s = time.perf_counter() - begin_s
-        yield MappedScan(scan, number, mapper.counts, max(0, number - mapper.applied), add_s)
+    begin_s = time.perf_counter()
+    number = mapper.add(scan.xyz, scan.pose)
+    add_s = time.perf_counter() - begin_s
+    return MappedScan(scan, number, mapper.counts, max(0, number - mapper.applied), add_s)
+
+
+class DriveStatistics:
+    """Sums over the scans of a drive; its size does not depend on how many.
+
+    Parameters
+    ----------
+    live
+        The map, for progress that says what it takes.
+    """
+
+    def __init__(self, live: LiveMap | None = None) -> None:
+        self._live = live
+        self.scans = 0
+        self.points = 0
+        self.first: int | None = None
+        self.last: int | None = None
+        self._counts: Counter[str] = Counter(dict.fromkeys(Counts.__struct_fields__, 0))
+        self._path: Decimated[tuple[float, float, float]] = Decimated()
+        self._position: tuple[float, float, float] | None = None
+        self._add_ms = RunningSpread()
+
+    def add(self, mapped: MappedScan) -> None:
+        """Count one scan."""
+        self.scans += 1
+        self.points += len(mapped.scan.xyz)
+        self.first = mapped.number if self.first is None else self.first
+        self.last = mapped.number
+        self._counts.update({name: getattr(mapped.counts, name) for name in Counts.__struct_fields__})
+        self._add_ms.add(mapped.add_s * 1e3)
+        x, y, z = mapped.scan.pose[:3, 3].tolist()
+        self._position = (x, y, z)
+        self._path.add(self._position)
+
+    @property
+    def counted(self) -> int:
+        """Points that said something: in range, or beyond it."""
+        return self._counts["near"] + self._counts["far"]
+
+    @property
+    def path(self) -> Sequence[tuple[float, float, float]]:
+        """Where the sensor was, metres; of a long drive a part of the places."""
+        path = self._path.values
+        return path if self._position is None or path[-1] == self._position else [*path, self._position]
+
+    @property
+    def left_out(self) -> str:
+        """Why points were left out, and how many; empty where none was."""
+        return _left_out(self._counts)
+
+    def line(self, mapped: MappedScan) -> str:
+        """One line about the latest scan."""
+        counts = {name: getattr(mapped.counts, name) for name in Counts.__struct_fields__}
+        left_out = _left_out(counts)
+        return (
+            f"{mapped.scan.name}: {len(mapped.scan.xyz)} points, {counts['near']} in range,"
+            f" {counts['far']} beyond"
+            + (f", {left_out}" if left_out else "")
+            + f"; {mapped.add_s * 1e3:.1f} ms"
+            + (f", {mapped.on_their_way} on their way" if mapped.on_their_way > 1 else "")
+            + ("" if self._live is None else f"; {_usage_now(self._live)}")
+        )
+
+    def summary(self, *, applied: int, durable: int) -> dict[str, Any]:
+        """Return what ``--json`` prints of the drive; times in milliseconds, null without a scan."""
+        return {
+            "scans": self.scans,
+            "points": self.points,
+            "counts": dict(self._counts),
+            "first_scan": self.first,
+            "last_scan": self.last,
+            "applied": applied,
+            "durable": durable,
+            "add_ms": self._add_ms.document,
+        }
+
+
+def usage_text(usage: LiveMapRow) -> str:
+    """What a map takes, in words: 1 234 567 active cells, 12.3 MB, 27 chunks."""
+    waiting = f", {usage.waiting_bytes / 1e6:.1f} MB waiting" if usage.waiting_bytes else ""
+    active = f"{usage.active:,}".replace(",", " ")
+    return f"{active} active cells, {usage.bytes / 1e6:.1f} MB, {usage.chunks} chunks{waiting}"
+
+
+def _usage_now(live: LiveMap) -> str:
+    """What the map takes; a daemon that is away keeps no scan from being read."""
+    try:
+        return usage_text(live.status())
+    except (DaemonUnreachable, LiveInterrupted):
+        return "the daemon does not answer"
+
+
+def states_text(chunks: Sequence[ChunkInfo]) -> str:
+    """How many chunks are in which state, in words; the most frequent first."""
+    states = Counter(row.state for row in chunks)
+    return ", ".join(f"{count} {state}" for state, count in states.most_common())
+
+
+def _left_out(counts: Counter[str] | dict[str, int]) -> str:
+    reasons = (("too_near", "too near"), ("outside_z", "too low or high"), ("not_finite", "not finite"))
+    return ", ".join(f"{counts[name]} {words}" for name, words in reasons if counts[name])

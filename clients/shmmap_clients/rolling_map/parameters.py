@@ -1,27 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of Rolling-Bonxai, version 1: its parameter file is read as it is.
+"""The parameters of Rolling-Bonxai, version 1, and the section of the daemon's settings that means the same.
 
-What a file leaves out is as in the file that Rolling-Bonxai ships.
+Its parameter file is read as it is. What a file leaves out is as in the file that Rolling-Bonxai ships.
 """
 
 from __future__ import annotations
 
 import difflib
+import json
+import math
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from shmmap import ConfigError, LiveMap, Occupancy, ScanFilter
-from shmmap_clients.rolling_map.foreign_names import VERSION_2, is_version_2, version_2_advice
-from shmmap_clients.rolling_map.live_section import LiveSettings
+from shmmap import BadRequest, ConfigError, LiveMap, Occupancy, ScanFilter
 from shmmap_clients.rolling_map.parameter_file import Entry, Value, read_parameter_file
 
-__all__ = ["Parameters", "Shown", "read_parameters"]
+__all__ = ["LiveSettings", "Parameters", "Shown", "live_section", "read_parameters"]
 
+_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_FRAME_BYTES: Final = 40  # in a chunk's header
+_VERSION_2: Final = {
+    "frame_id": "map_frame",
+    "base_frame_id": "robot_frame",
+    "topic_in": "",
+    "resolution": "m_resolution",
+    "occupancy_min_z": "s_min_z",
+    "occupancy_max_z": "s_max_z",
+    "occupancy_threshold": "",
+    "occupancy.resolution": "m_resolution",
+    "occupancy.occupancy_min_z": "s_min_z",
+    "occupancy.occupancy_max_z": "s_max_z",
+    "occupancy.occupancy_threshold": "",
+    "sensor_model.max_range": "s_max_range",
+    "sensor_model.hit": "s_probability_hit",
+    "sensor_model.miss": "s_probability_miss",
+    "sensor_model.min": "m_occupancy_min_thresh",
+    "sensor_model.max": "m_occupancy_max_thresh",
+    "rolling.coordinate_system.chunk_size": "c_chunk_dim",
+    "rolling.storage.full_save_folder_path": "c_chunk_folder_path",
+    "stats.publish_occupied_voxels": "viz_occupied",
+    "stats.enable_stats": "viz_usage",
+    "stats.quick_stats": "viz_usage",
+}
+"""By the name in version 2 (without dots: of its server that does not roll), that in version 1, if any."""
+_HERE: Final = {
+    "topic_in": "give --scans",
+    "occupancy_threshold": "occupied_above in [live.NAME] of the daemon's settings",
+    "occupancy.occupancy_threshold": "occupied_above in [live.NAME] of the daemon's settings",
+    "rolling.transition_manager.hysteresis_ratio": "hysteresis in [live.NAME] of the daemon's settings",
+    "rolling.loading_policy.neighborhood.radius": "radius in [live.NAME] of the daemon's settings",
+    "rolling.loading_policy.neighbourhood.radius": "radius in [live.NAME] of the daemon's settings",
+}
+"""What does the same here, where version 1 has no name for it."""
+_GROUPS: Final = ("occupancy.", "sensor_model.", "rolling.", "server.", "stats.")
 _CHUNK_DIM: Final = 64
-
 _LIVE: Final = {"m_resolution": "resolution", "map_frame": "frame_id", "c_chunk_folder_path": "path"}
 _OCCUPANCY: Final = {
     "m_occupancy_min_thresh": "clamp_min",
@@ -36,7 +72,6 @@ _FILTER: Final = {
     "s_max_z": "max_z",
 }
 _SHOWN: Final = {f"viz_{name}": name for name in ("occupied", "free", "chunks", "usage")}
-
 _WITHOUT_MEANING: Final = {
     "sensor_frame": "scans come with the poses of their frame",
     "robot_frame": "scans come with the poses of their frame",
@@ -46,7 +81,6 @@ _WITHOUT_MEANING: Final = {
     "use_sor_filter": "scans are not searched for outliers",
 }
 """Names that are known and change nothing, and why; the last two only with some values."""
-
 _KINDS: Final[Mapping[type, str]] = {bool: "true or false", float: "a number", str: "text"}
 _KNOWN: Final[Mapping[str, type]] = {
     **dict.fromkeys(("map_frame", "sensor_frame", "robot_frame", "c_chunk_folder_path"), str),
@@ -54,6 +88,96 @@ _KNOWN: Final[Mapping[str, type]] = {
     **dict.fromkeys(("c_chunk_dim", "c_chunk_neiborhood", "c_chunk_cache_capacity"), float),
     **dict.fromkeys(("use_sor_filter", *_SHOWN), bool),
 }
+
+
+class LiveSettings(msgspec.Struct, frozen=True):
+    """What the daemon has to know of a live map.
+
+    Attributes
+    ----------
+    resolution
+        Edge of a voxel, metres.
+    occupancy
+        What a hit and a miss are worth.
+    frame_id
+        Frame of the map.
+    radius, hysteresis
+        The window: chunks around the vehicle's along each axis, and how far the vehicle has to be in another
+        chunk until its window follows, as a part of a chunk.  Rolling-Bonxai keeps the 26 neighbours, and
+        follows at once.
+    path
+        Directory of the map's files; empty: the daemon chooses.
+
+    Raises
+    ------
+    ConfigError
+        The resolution is no positive number, or a text is too long or cannot be printed.
+    """
+
+    resolution: float = 0.05
+    occupancy: Occupancy = Occupancy()
+    frame_id: str = "map"
+    radius: int = 1
+    hysteresis: float = 0.0
+    path: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.resolution < math.inf:
+            raise ConfigError(
+                f"resolution = {self.resolution!r}: need a positive number of metres", key="resolution"
+            )
+        size = len(self.frame_id.encode("utf-8", "replace"))
+        if not self.frame_id or not self.frame_id.isprintable() or size > _FRAME_BYTES:
+            raise ConfigError(
+                f"frame_id = {self.frame_id!r}: need 1 to {_FRAME_BYTES} bytes of printable text",
+                key="frame_id",
+            )
+        if not self.path.isprintable():
+            raise ConfigError(f"path = {self.path!r}: need printable text", key="path")
+
+
+def live_section(name: str, settings: LiveSettings) -> str:
+    """Return the section as TOML; a relative path is made absolute.
+
+    Raises
+    ------
+    BadRequest
+        A map cannot have this name.
+    """
+    if not _NAME.fullmatch(name):
+        raise BadRequest(f"{name!r} is no name of a map", hint="use letters, digits, _ and -")
+    occupancy = settings.occupancy
+    lines = [
+        f"[live.{name}]",
+        f"resolution = {settings.resolution!r}  # metres",
+        f"frame_id = {_quoted(settings.frame_id)}",
+        *(f"{field} = {getattr(occupancy, field)!r}" for field in occupancy.__struct_fields__),
+        f"radius = {settings.radius}  # chunks of 64 voxels around the vehicle's",
+        f"hysteresis = {settings.hysteresis!r}  # as a part of a chunk",
+    ]
+    if settings.path:
+        lines.append(f"path = {_quoted(os.path.abspath(settings.path))}")
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _is_version_2(name: str) -> bool:
+    """Whether a parameter is one of version 2."""
+    return name in _VERSION_2 or name.startswith(_GROUPS)
+
+
+def _version_2_advice(names: Iterable[str]) -> str:
+    """Return what to write in place of names of version 2."""
+    said = []
+    for name in names:
+        if _VERSION_2.get(name):
+            said.append(f"{_VERSION_2[name]} for {name}")
+        else:
+            said.append(f"{_HERE[name]} for {name}" if name in _HERE else f"nothing for {name}")
+    return "write " + "; ".join(said)
 
 
 class Shown(NamedTuple):
@@ -164,15 +288,15 @@ def _check_names(entries: Mapping[str, Entry]) -> None:
     strange = [name for name in entries if name not in _KNOWN]
     if not strange:
         return
-    foreign = [name for name in strange if is_version_2(name)]
+    foreign = [name for name in strange if _is_version_2(name)]
     if foreign:
         name, origin = foreign[0], entries[foreign[0]].origin
-        same = f", which version 1 calls {VERSION_2[name]}" if VERSION_2.get(name) else ""
+        same = f", which version 1 calls {_VERSION_2[name]}" if _VERSION_2.get(name) else ""
         raise ConfigError(
             f"{origin}: {name} is a name of Rolling-Bonxai's version 2{same}",
             key=name,
             origin=origin,
-            hint=version_2_advice(foreign),
+            hint=_version_2_advice(foreign),
         )
     name, origin = strange[0], entries[strange[0]].origin
     near = difflib.get_close_matches(name, _KNOWN, n=1, cutoff=0.0)
@@ -199,7 +323,7 @@ def _made(
     kind: Any, names: Mapping[str, str], values: Mapping[str, Value], entries: Mapping[str, Entry],
     **others: Any,
 ) -> Any:  # fmt: skip
-    """Make a structure of the values; what it refuses is told with the file's name for it, and the line."""
+    """Make a structure of the values; what it refuses is named as in the file, with the line."""
     given = {ours: values[name] for name, ours in names.items() if name in values}
     try:
         return kind(**given, **others)

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap_clients.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.ros_bridge.node import BridgeSettings, RosBridge
 
 __all__ = ["BridgeSettings", "RosBridge"]
 
-__getattr__ = lazy_names(__name__, {"BridgeSettings": "node", "RosBridge": "node"})
+__getattr__ = lazy_names(__name__)

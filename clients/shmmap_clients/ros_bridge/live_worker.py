@@ -1,33 +1,127 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Services and topics of a live map: the thread that asks the daemon for voxels."""
+"""Services and topics of a live map: the thread that asks the daemon for voxels.
+
+Rolling-Bonxai planned a service for voxels in memory and one for saved chunks; ``bonxai_msgs`` has the types.
+Voxels are named by their indices there, as they are here: ``floor(position / resolution)``.
+"""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
 from cyclonedds.pub import DataWriter
+from numpy.typing import NDArray
 
 from shmmap import LiveMap
-from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.listening import Listening
-from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES, failed_reply, voxel_cloud, voxel_reply
+from shmmap_clients.rolling_map.voxel_parts import all_voxels
+from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
+from shmmap_clients.ros_bridge.messages.bonxai import FREE, OCCUPIED
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
-from shmmap_clients.ros_bridge.messages.wire import ready_made
-from shmmap_clients.ros_bridge.service_server import Request
-from shmmap_clients.ros_bridge.worker import Answer, Worker
+from shmmap_clients.ros_bridge.messages.wire import ServiceKind, ready_made
+from shmmap_clients.ros_bridge.point_cloud import cloud_layout, write_cloud
+from shmmap_clients.ros_bridge.service_server import Listening, Request
+from shmmap_clients.ros_bridge.worker import Answer, Worker, no_followup
 
-__all__ = ["LiveWorker"]
+__all__ = ["LIVE_SERVICES", "LiveWorker"]
+
+LIVE_SERVICES: Final[dict[str, tuple[ServiceKind, str, str]]] = {
+    "get_occupied_voxels": (OCCUPIED, "occupied", "memory"),
+    "get_free_voxels": (FREE, "free", "memory"),
+    "get_saved_occupied_voxels": (OCCUPIED, "occupied", "disk"),
+    "get_saved_free_voxels": (FREE, "free", "disk"),
+}
+"""By the last part of a service's name: types, kind of voxels, and where they are looked for."""
+
+
+def _voxel_reply(live: LiveMap, message: Any, kind: str, scope: str) -> Content:
+    """Return a reply with all voxels of a kind.
+
+    The counts are those of the daemon's list of chunks: for ``disk`` those of every chunk, a chunk in memory
+    as it is there. ``memory_mb`` is what the map takes in memory, or its files on the disk, in MiB.
+
+    Raises
+    ------
+    ShmmapError
+        The daemon does not answer, or has no memory for a list.
+    """
+    rows = live.chunks(saved=scope == "disk")
+    occupied, free = (sum(getattr(row, name) for row in rows) for name in ("occupied", "free"))
+    status = live.status()
+    xyz = all_voxels(live, kind, scope)
+    indices = np.floor(xyz / live.resolution).astype(np.int32)
+    writer = _head(live, message, indices)
+    count = len(indices)
+    writer.uint64(count, sum(row.active for row in rows))
+    taken = status.file_bytes if scope == "disk" else status.bytes
+    writer.float32(occupied / (occupied + free) if occupied + free else 0.0, taken / 2**20)
+    writer.boolean(True)
+    return writer.content()
+
+
+def _failed_reply(message: Any) -> Content:
+    """Return a reply without voxels, and without success."""
+    writer = _head(None, message, np.empty((0, 3), np.int32))
+    writer.uint64(0, 0)
+    writer.float32(0.0, 0.0)
+    writer.boolean(False)
+    return writer.content()
+
+
+def _head(live: LiveMap | None, message: Any, indices: NDArray[np.int32]) -> CdrWriter:
+    """Write a reply as far as its ``bonxai_msgs/VoxelGrid``."""
+    writer = CdrWriter()
+    writer.uint64(message.client)
+    writer.int64(message.number)
+    now_ns = time.time_ns() if live is not None else 0
+    writer.int32(now_ns // 10**9)
+    writer.uint32(now_ns % 10**9)
+    writer.text(live.frame_id if live is not None else "")
+    writer.float64(live.resolution if live is not None else 0.0)
+    for axis in range(3):
+        writer.uint32(len(indices))
+        if len(indices):
+            writer.blob(4 * len(indices), _Axis(indices, axis))
+    writer.uint32(len(indices))
+    for ends in (indices.min(axis=0), indices.max(axis=0)) if len(indices) else ((0, 0, 0), (0, 0, 0)):
+        writer.int32(*(int(one) for one in ends))
+    return writer
+
+
+class _Axis:
+    """One column of the indices, to be written."""
+
+    def __init__(self, indices: NDArray[np.int32], axis: int) -> None:
+        self._values = indices[:, axis]
+
+    def __call__(self, place: memoryview) -> None:
+        np.frombuffer(place, "<i4")[...] = self._values
+
+
+def _voxel_cloud(live: LiveMap, kind: str) -> Content:
+    """Return the middles of all voxels of a kind in memory as a ``PointCloud2``, in the map's frame.
+
+    Raises
+    ------
+    ShmmapError
+        The daemon does not answer, or has no memory for a list.
+    """
+    xyz = all_voxels(live, kind)
+    columns, writer = {"xyz": xyz}, CdrWriter()
+    write_cloud(writer, columns, (0.0, 0.0, 0.0), cloud_layout(columns), live.frame_id, time.time_ns())
+    return writer.content()
 
 
 class LiveWorker(Worker):
-    """Answers with voxels, and publishes them where somebody listens and something has changed.
+    """Answers with voxels, and publishes them where a node subscribes and something has changed.
 
     Parameters
     ----------
     live
-        The map, of a client that nobody else uses.
+        The map, of a client that serves nothing else.
     clouds
         Writers of the two topics by kind of voxels, ``occupied`` and ``free``.
     listening
@@ -54,22 +148,18 @@ class LiveWorker(Worker):
     def answer(self, message: Any, request: Request) -> Answer:
         """Return a reply with voxels."""
         _, kind, scope = LIVE_SERVICES[request.server.name.rpartition("/")[2]]
-        return voxel_reply(self._live, message, kind, scope), _nothing
+        return _voxel_reply(self._live, message, kind, scope), no_followup
 
     def empty(self, message: Any) -> Content:
         """Return a reply without voxels."""
-        return failed_reply(message)
+        return _failed_reply(message)
 
     def tick(self) -> None:
-        """Publish what has changed, or what somebody has come to hear."""
+        """Publish what has changed, or what a new subscriber asks for."""
         for kind, writer in self._clouds.items():
             readers = frozenset(writer.get_matched_subscriptions())
             change = self._live.status().change if readers else 0
             before, had = self._published.get(kind, (-1, frozenset()))
             if readers and (change != before or readers - had):
-                writer.write(ready_made(PointCloud2, voxel_cloud(self._live, kind)))
+                writer.write(ready_made(PointCloud2, _voxel_cloud(self._live, kind)))
             self._published[kind] = (change if readers else -1, readers)
-
-
-def _nothing() -> None:
-    """Nothing has to be remembered."""

@@ -16,22 +16,27 @@ What is more than the daemon answers at once is asked for in slices.
 
 from __future__ import annotations
 
+import math
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from shmmap import Cell, CellSet, Client
-from shmmap_clients.ros_bridge.areas import sensible, touches
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap import AutowareSquare, Cell, CellSet, Client
 from shmmap_clients.ros_bridge.catalogue import Catalogue
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.messages.autoware import GetDifferentialRequest, GetPartialRequest
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
-from shmmap_clients.ros_bridge.recent_cells import RecentCells
 from shmmap_clients.ros_bridge.requesters import Requesters
-from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge
+from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge, no_followup
 
-__all__ = ["MapAnswers"]
+__all__ = ["MapAnswers", "RecentCells", "sensible", "touches"]
 
+_MAX_RECENT_BYTES: Final = 64 << 20
+_KEPT_S: Final = 2.0
 _PAUSE_S: Final = 0.2
 _TURN_S: Final = 1.0
 """How long others wait for cells that one client's request has loaded."""
@@ -43,8 +48,75 @@ _MOST_CELLS: Final = 100_000
 _NAMED: Final = 3
 _REUSED_BYTES: Final = 16 << 20
 _LAYOUTS: Final = 64
-
 Log = Callable[[str], None]
+
+
+def sensible(area: Any) -> AutowareSquare | None:
+    """Return the square that an ``AreaInfo`` means; None where only `touches` knows."""
+    x, y, radius = area.center_x, area.center_y, area.radius
+    if not all(map(math.isfinite, (x, y, radius))) or radius < 0:
+        return None
+    return AutowareSquare(x, y, radius)
+
+
+def touches(area: Any, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of ``boxes``, (N, 4) min_x min_y max_x max_y in metres, any ``AreaInfo`` touches, (N,).
+
+    Autoware's test (``cylinder_and_box_overlap_exists``) is a square of half-side ``radius`` with closed
+    borders, on float32 numbers in double arithmetic.  `shmmap.AutowareSquare` is that square for every area
+    that makes sense.  Autoware also answers the others: a negative radius shrinks each box, infinity takes
+    everything, and what is no number touches nothing.
+    """
+    place = np.array([area.center_x, area.center_y], np.float64)
+    radius = float(area.radius)
+    low, high = (boxes[:, part].astype(np.float32).astype(np.float64) for part in ([0, 1], [2, 3]))
+    with np.errstate(invalid="ignore"):
+        inside: NDArray[np.bool_] = np.all((low - radius <= place) & (place <= high + radius), axis=1)
+        # where x and radius are infinite and y is no number a corner is within the radius
+        for corner in (low, high, np.stack([low[:, 0], high[:, 1]], 1), np.stack([high[:, 0], low[:, 1]], 1)):
+            inside |= np.hypot(*(place - corner).T) <= radius
+    return inside
+
+
+class RecentCells:
+    """At most 64 MiB of cells that were answered with a moment ago.
+
+    Mapping a cell takes as long as sending it, and other clients ask for the same one.  Cells are kept until
+    there was no request for two seconds; then the daemon may evict them.
+    """
+
+    def __init__(self) -> None:
+        self._cells: OrderedDict[tuple[str, int], Cell] = OrderedDict()  # the newest last
+        self._bytes = 0
+        self._until_s = 0.0
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+    def kept(self, cells: Iterable[Cell]) -> list[Cell]:
+        """Keep these cells; returns them, those that were kept before with the arrays that they have made."""
+        found = []
+        for cell in cells:
+            key = cell.id, cell.version
+            one = self._cells.get(key)
+            if one is None:
+                one = self._cells[key] = cell
+                self._bytes += cell.nbytes
+            else:
+                self._cells.move_to_end(key)
+            found.append(one)
+        while self._bytes > _MAX_RECENT_BYTES:
+            self._bytes -= self._cells.popitem(last=False)[1].nbytes
+        self._until_s = time.monotonic() + _KEPT_S
+        return found
+
+    def release_idle(self) -> bool:
+        """Release all cells if there was no request for two seconds; returns whether that is so."""
+        if not self._cells or time.monotonic() < self._until_s:
+            return False
+        self._cells.clear()
+        self._bytes = 0
+        return True
 
 
 class MapAnswers:
@@ -61,7 +133,7 @@ class MapAnswers:
     wait_s
         How long the daemon may take to load what is not in memory; what is missing then is left out.
     log
-        Told what is left out.
+        Takes a line about what is left out.
     """
 
     def __init__(
@@ -106,7 +178,7 @@ class MapAnswers:
                 cells = self._selected(self._touched(message.area))
         else:
             cells = self._selected(self._known(message.cell_ids))
-        return self._reply(message, cells), _nothing
+        return self._reply(message, cells), no_followup
 
     def empty(self, message: Any) -> Content:
         """Return the reply that has nothing, for a request that the daemon refuses."""
@@ -177,9 +249,9 @@ class MapAnswers:
             self._log(f"left out of an answer: {'; '.join(missing[:_NAMED])}{more}")
         return cells
 
-    def let_go(self) -> None:
-        """Let go of cells that nobody has asked for lately."""
-        if self._recent.let_go():
+    def release_idle(self) -> None:
+        """Release cells that no client has asked for lately."""
+        if self._recent.release_idle():
             self._client.release()
 
     def _reply(self, message: Any, cells: Iterable[Cell], removed: Collection[str] | None = None) -> Content:
@@ -233,7 +305,3 @@ def _slices(ids: Sequence[str]) -> Iterator[Sequence[str]]:
             begin, nbytes = at, 4 * len(one)
     if begin < len(ids):
         yield ids[begin:]
-
-
-def _nothing() -> None:
-    """Nothing has to be remembered of an answer that says all."""

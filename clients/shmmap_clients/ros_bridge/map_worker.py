@@ -10,22 +10,94 @@ from typing import Any, Final
 
 from cyclonedds.pub import DataWriter
 
-from shmmap import BadRequest, Client
+from shmmap import BadRequest, CellInfo, Client, LoadFailed
 from shmmap_clients.ros_bridge.catalogue import Catalogue
-from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.listening import Listening
+from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.map_answers import MapAnswers
 from shmmap_clients.ros_bridge.messages.autoware import MapMetaData
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
 from shmmap_clients.ros_bridge.messages.wire import ready_made
+from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, fill_rows, write_cloud_head
 from shmmap_clients.ros_bridge.requesters import Requesters
-from shmmap_clients.ros_bridge.service_server import Request
-from shmmap_clients.ros_bridge.whole_map import whole_map
+from shmmap_clients.ros_bridge.service_server import Listening, Request
 from shmmap_clients.ros_bridge.worker import Answer, Worker
 
 __all__ = ["MapWorker"]
 
+_HEAD_BYTES: Final = 4096
 _EVERY_S: Final = 1.0
+
+
+def _whole_map(
+    client: Client, cells: Collection[CellInfo], stamp_ns: int, *, most_bytes: int = MOST_BYTES, wait_s: float
+) -> Content:
+    """Return all points of the map as a ``PointCloud2`` in the map's frame, for ``/map/pointcloud_map``.
+
+    Each cell is released before the next one is asked for, so the daemon's budget need not hold the map.  The
+    bytes themselves are held twice for a moment, and once by DDS as long as the bridge runs: it is for small
+    maps.
+
+    The fields are those of the first cell that has points. Another cell's that it does not have are left out,
+    and are zero where it lacks one; Autoware puts the bytes one after another, whatever they mean.
+
+    Parameters
+    ----------
+    client
+        Of the daemon.
+    cells
+        All of the map, in the order in which their points come.
+    stamp_ns
+        Time in the header.
+    most_bytes
+        Size of the message at most.
+    wait_s
+        How long a cell may take to load.
+
+    Raises
+    ------
+    BadRequest
+        The map has more points than that; the message says how many bytes it takes, about.
+    LoadFailed
+        A cell cannot be loaded: a map with a hole would not be the whole one.
+    """
+    layout: CloudLayout | None = None
+    points, data = 0, bytearray()
+    most = min(most_bytes, MOST_BYTES) - _HEAD_BYTES
+    read_bytes = 0
+    for info in cells:
+        found = client.selected([info.id], wait=wait_s, strict=None).raise_for_failures()
+        if not found.complete or not found:
+            raise LoadFailed(f"{info.id}: not loaded after {wait_s:g} s", cell_id=info.id, layer="points")
+        read_bytes += info.source_bytes
+        cell = found[0]
+        if not cell.points:
+            continue
+        layout = layout or cloud_layout(cell.columns)
+        nbytes = cell.points * layout.point_step
+        place = len(data)
+        if place + nbytes > most:
+            whole_bytes = (place + nbytes) / max(read_bytes, 1) * sum(one.source_bytes for one in cells)
+            raise BadRequest(
+                f"the whole map takes about {whole_bytes / 1e9:.3g} GB as a PointCloud2, and"
+                f" {most_bytes / 1e9:.3g} GB is the most",
+                hint="leave out --whole-map: clients get the cells that they need from the services",
+            )
+        data.extend(bytes(nbytes))
+        with memoryview(data) as whole, whole[place:] as rows:
+            fill_rows(rows, cell.columns, cell.origin, layout)
+        points += cell.points
+    layout = layout or cloud_layout({})
+    writer = CdrWriter()
+    write_cloud_head(writer, layout, points, client.welcome.frame_id, stamp_ns)
+    writer.uint32(len(data))
+    if data:
+        writer.blob(len(data), lambda to: _copy(to, data))
+    writer.boolean(True)
+    return writer.content()
+
+
+def _copy(place: memoryview, data: bytearray) -> None:
+    place[:] = data
 
 
 class MapWorker(Worker):
@@ -34,7 +106,7 @@ class MapWorker(Worker):
     Parameters
     ----------
     client
-        Of the daemon, used by nobody else.
+        Of the daemon; only this worker uses it.
     metadata, whole
         Writers of the two topics; ``whole`` is None where the whole map is not published.
     listening
@@ -42,7 +114,7 @@ class MapWorker(Worker):
     wait_s
         How long cells may take to load.
     whole_bytes
-        The whole map may take so many.
+        Size of the whole map at most.
 
     Attributes
     ----------
@@ -105,7 +177,7 @@ class MapWorker(Worker):
         """Publish again if the map has changed; forget clients that have gone."""
         if self.alive is not None:
             self._requesters.keep_only(self.alive)
-        self._answers.let_go()
+        self._answers.release_idle()
         self._catalogue.refresh(self._client)
         if self._published == self._catalogue.map_version:
             return
@@ -120,7 +192,7 @@ class MapWorker(Worker):
         content = self._catalogue.message(self._client.welcome.frame_id, now_ns)
         self._metadata.write(ready_made(MapMetaData, content))
         if self._whole is not None:
-            cloud = whole_map(
+            cloud = _whole_map(
                 self._client,
                 self._catalogue.cells.values(),
                 now_ns,

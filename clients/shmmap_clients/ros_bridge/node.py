@@ -11,7 +11,7 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Final, TypeVar
@@ -23,9 +23,7 @@ from cyclonedds.topic import Topic
 from shmmap import Client, LiveMap
 from shmmap_clients.ros_bridge import names
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES
-from shmmap_clients.ros_bridge.listening import Listening
-from shmmap_clients.ros_bridge.live_voxels import LIVE_SERVICES
-from shmmap_clients.ros_bridge.live_worker import LiveWorker
+from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
 from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, MapMetaData
 from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
@@ -33,9 +31,8 @@ from shmmap_clients.ros_bridge.messages.standard import PointCloud2
 from shmmap_clients.ros_bridge.messages.wire import ServiceKind
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import close, endpoint_qos, open_participant
-from shmmap_clients.ros_bridge.service_server import ServiceServer
+from shmmap_clients.ros_bridge.service_server import Listening, Requester, ServiceServer
 from shmmap_clients.ros_bridge.status_file import StatusFile
-from shmmap_clients.ros_bridge.strangers import Strangers
 from shmmap_clients.ros_bridge.worker import Worker
 
 __all__ = ["NAMES", "BridgeSettings", "RosBridge"]
@@ -51,6 +48,8 @@ NAMES: Final[Mapping[str, str]] = {
 """What services and topics are called in the node's namespace, where `BridgeSettings.names` does not say."""
 _KINDS: Final = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 _LOOK_S: Final = 1.0
+_ADVICE: Final = "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+_MAX_LISTED: Final = 32
 
 _Self = TypeVar("_Self", bound="RosBridge")
 
@@ -69,7 +68,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
     wait_s
         How long cells may take to load.
     whole_map, whole_bytes
-        Publish the whole map; it may take so many bytes.
+        Publish the whole map; its size at most.
     voxels_every_s
         How often voxels are published at most.
     """
@@ -98,7 +97,7 @@ class RosBridge:
     settings
         How it appears.
     log
-        Told what goes wrong.
+        Takes a line about what goes wrong.
     live
         A live map of another client, to be served, too.
 
@@ -111,7 +110,7 @@ class RosBridge:
     CannotStart
         CycloneDDS does not start.
     DaemonUnreachable
-        Nobody answers.
+        The daemon does not answer.
     """
 
     def __init__(
@@ -126,7 +125,7 @@ class RosBridge:
         self._stop = threading.Event()
         self._ids = 0
         self._id = secrets.token_bytes(12)
-        self._strangers = Strangers(log)
+        self._incompatible = _IncompatiblePeers(log)
         with contextlib.ExitStack() as undo:
             own = names.resolved(names.node_name(settings.node), settings.namespace)
             services = {one: settings.name(one) for one in NAMES}
@@ -277,7 +276,7 @@ class RosBridge:
         """See which clients there are."""
         clients = [(server, one) for server in self._servers for one in server.requesters()]
         self._map.alive = frozenset(one.name for _, one in clients)
-        self._strangers.look(clients)
+        self._incompatible.look(clients)
         self._tell(len({one.name for _, one in clients}))
 
     def _tell(self, clients: int = 0) -> None:
@@ -287,6 +286,42 @@ class RosBridge:
                 "node": names.resolved(self._settings.node, self._settings.namespace),
                 "clients": clients,
                 "remembered": self._map.requesters,
-                "strangers": self._strangers.now,
+                "strangers": self._incompatible.now,
             }
         )
+
+
+class _IncompatiblePeers:
+    """Clients that would wait without end, because their ROS is not that of CycloneDDS.
+
+    Parameters
+    ----------
+    log
+        Takes a line about each, once.
+    """
+
+    def __init__(self, log: Callable[[str], None]) -> None:
+        self._log = log
+        self._logged: dict[str, None] = {}
+        self._now: list[dict[str, str]] = []
+
+    @property
+    def now(self) -> list[dict[str, str]]:
+        """Those there are, at most 32: ``service``, and ``vendor`` of their DDS, which may be empty."""
+        return self._now
+
+    def look(self, clients: Iterable[tuple[ServiceServer, Requester]]) -> None:
+        """Take in which clients there are."""
+        found = [(server, one) for server, one in clients if one.incompatible]
+        for server, one in found:
+            if one.name in self._logged:
+                continue
+            self._logged[one.name] = None
+            whose = f", speaks {one.vendor}" if one.vendor else ""
+            self._log(
+                f"a client of {server.name} is no node of rmw_cyclonedds_cpp{whose}, and may wait for ever:"
+                f" {_ADVICE}"
+            )
+        while len(self._logged) > 8 * _MAX_LISTED:
+            del self._logged[next(iter(self._logged))]
+        self._now = [{"service": server.name, "vendor": one.vendor} for server, one in found[:_MAX_LISTED]]

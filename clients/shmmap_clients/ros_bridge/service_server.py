@@ -8,7 +8,7 @@ would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does; 
 asks until a second after it was found, for on a busy machine its two ends may be found apart.
 
 Other implementations of ROS send no ``clientid=``. They carry the number of a request outside of the message,
-where neither can read the other's, and their clients wait for ever: they are `strangers`.
+where neither can read the other's, and their clients wait without end: they are incompatible peers.
 """
 
 from __future__ import annotations
@@ -16,23 +16,32 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from cyclonedds.core import DDSException, InstanceState, ReadCondition, SampleState, ViewState
+from cyclonedds.core import (
+    DDSException,
+    GuardCondition,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from cyclonedds.util import duration
 
 from shmmap_clients.ros_bridge.cdr import Content
 from shmmap_clients.ros_bridge.messages.wire import Damaged, ServiceKind, ready_made
 from shmmap_clients.ros_bridge.names import reply_topic, request_topic
 from shmmap_clients.ros_bridge.participant import endpoint_qos
 
-__all__ = ["Request", "Requester", "ServiceServer", "Tries"]
+__all__ = ["Listening", "Request", "Requester", "ServiceServer", "Tries"]
 
 _KNOWN_AT_FIRST_S: Final = 1.0
 _KNOWN_WITHIN_S: Final = 0.1
@@ -54,16 +63,16 @@ class Requester:
     ----------
     name
         Its ``clientid``, or the key of the writer where it has none.
-    stranger
+    incompatible
         It has none.
     vendor
-        Whose DDS it speaks; empty where that cannot be told.
+        Whose DDS it speaks; empty where that is unknown.
     found_s
         When it was found, on the clock of `time.monotonic`.
     """
 
     name: str
-    stranger: bool
+    incompatible: bool
     vendor: str
     found_s: float = field(default=0.0, compare=False)
 
@@ -176,24 +185,24 @@ class ServiceServer:
         another participant.
         """
         requester = request.requester
-        owner = requester.name[:_PARTICIPANT_HEX] if requester.stranger else requester.name
+        owner = requester.name[:_PARTICIPANT_HEX] if requester.incompatible else requester.name
         with self._lock:
             if owner in self._readers.values():
                 return True
         until_s = requester.found_s + _KNOWN_AT_FIRST_S
-        if not requester.stranger:
+        if not requester.incompatible:
             until_s = max(time.monotonic() + _KNOWN_WITHIN_S, until_s)
         while not self._has_reader(owner):
             if self.gone(request):
                 return False
             if time.monotonic() >= until_s:
-                return requester.stranger
+                return requester.incompatible
             time.sleep(_LOOK_EVERY_S)
         return True
 
     def gone(self, request: Request) -> bool:
-        """Whether nobody waits for the reply any more."""
-        return self._requester(request.handle, anew=True) is None
+        """Whether the client that asked is gone."""
+        return self._requester(request.handle, afresh=True) is None
 
     def reply(self, content: Content) -> str:
         """Send a reply; returns why it cannot be sent, empty when it was."""
@@ -211,12 +220,12 @@ class ServiceServer:
             return str(error)
         return ""
 
-    def _requester(self, handle: int, *, anew: bool = False) -> Requester | None:
-        """Who writes there; None when it is gone.  ``anew``: what was known before does not count."""
+    def _requester(self, handle: int, *, afresh: bool = False) -> Requester | None:
+        """Who writes there; None when it is gone.  ``afresh``: what was known before does not count."""
         with self._lock:
             known = self._requesters.get(handle)
             if known is not None and (
-                not anew or handle in _unsigned(self._reader.get_matched_publications())
+                not afresh or handle in _unsigned(self._reader.get_matched_publications())
             ):
                 return known
             found = None if known is not None else self._reader.get_matched_publication_data(handle)
@@ -249,3 +258,49 @@ def _client_id(endpoint: Any) -> str:
 def _unsigned(handles: Iterable[int]) -> set[int]:
     """Numbers of DDS as they are: some of the package's calls take them for signed ones."""
     return {one & (2**64 - 1) for one in handles}
+
+
+class Listening:
+    """Some services of a participant, whose requests one thread takes: it sleeps until one has come.
+
+    Parameters
+    ----------
+    participant
+        In whose domain.
+    log
+        Takes a line about what came and was no request.
+
+    Attributes
+    ----------
+    servers
+        The services.
+    """
+
+    def __init__(self, participant: DomainParticipant, log: Callable[[str], None]) -> None:
+        self.servers: list[ServiceServer] = []
+        self._log = log
+        self._waitset = WaitSet(participant)
+        self._wake = GuardCondition(participant)
+        self._waitset.attach(self._wake)
+
+    def add(self, server: ServiceServer) -> None:
+        """Listen to one service more."""
+        self.servers.append(server)
+        self._waitset.attach(server.condition)
+
+    def wait(self, timeout_s: float) -> None:
+        """Sleep until a request has come, or `wake` is called; at most so long."""
+        self._waitset.wait(duration(nanoseconds=max(int(timeout_s * 1e9), 0)))
+
+    def wake(self) -> None:
+        """End the sleep of `wait`, and every later one at once."""
+        self._wake.set(True)
+
+    def take(self) -> Iterator[Request]:
+        """Take all requests that have come."""
+        for server in self.servers:
+            for one in server.take():
+                if isinstance(one, Damaged):
+                    self._log(f"{server.name}: a request was no message: {one.reason}")
+                else:
+                    yield one

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What answers requests that need the daemon: in a thread of its own, and clients take turns.
 
-A ROS client waits for ever. So while the daemon is away a request is kept, and answered when it is back,
+A ROS client waits without end. So while the daemon is away a request is kept, and answered when it is back,
 unless the client has gone meanwhile. One that takes long, or fails while others succeed, waits behind those
 of other clients, and is given up after some tries. What the daemon refuses is answered with nothing, and
 logged; what is too large is not answered at all, because an answer without cells would be taken for one.
@@ -12,24 +12,83 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, Final
 
 from shmmap import BadRequest, Busy, DaemonUnreachable, LiveInterrupted, NoSession, ShmmapError, StaleHandle
 from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.listening import Listening
-from shmmap_clients.ros_bridge.service_server import Request, Tries
-from shmmap_clients.ros_bridge.waiting import WaitingRequests
+from shmmap_clients.ros_bridge.service_server import Listening, Request, Tries
 
-__all__ = ["StillLoading", "TooLarge", "Worker"]
+__all__ = [
+    "MOST_OF_ONE",
+    "MOST_WAITING",
+    "StillLoading",
+    "TooLarge",
+    "WaitingRequests",
+    "Worker",
+    "no_followup",
+]
 
+MOST_OF_ONE: Final = 4
+"""Of one client: rclcpp nodes have one under way."""
+MOST_WAITING: Final = 1024
 LATER: Final = (DaemonUnreachable, NoSession, Busy, LiveInterrupted, StaleHandle)
 """What passes by itself."""
 _AGAIN_S: Final = 0.2
 _MOST_FAILED: Final = 5
 """Tries of one request that fail while the daemon answers others."""
-
 Answer = tuple[Content, Callable[[], None]]
+
+
+class WaitingRequests:
+    """A queue, for one thread.  Each round has one request of each client that waits."""
+
+    def __init__(self) -> None:
+        self._queue: OrderedDict[int, tuple[int, Request]] = OrderedDict()  # by number, with the round
+        self._of: dict[str, list[int]] = {}  # numbers by client, the oldest first
+        self._next = self._round = 0
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def put(self, request: Request) -> bool:
+        """Append a request; False if there are too many.  Of one client's the oldest then makes room."""
+        mine = self._of.get(request.requester.name, ())
+        if len(mine) >= MOST_OF_ONE:
+            self._forget(mine[0])
+        if len(self._queue) >= MOST_WAITING:
+            return False
+        last = self._queue[mine[-1]][0] + 1 if mine else self._round
+        self._append(max(last, self._round), request)
+        return True
+
+    def again(self, request: Request) -> None:
+        """Put back what could not be answered yet: every other client comes first."""
+        self._append(self._round + 1, request)
+
+    def get(self) -> Request:
+        """Take the request whose turn it is; there has to be one."""
+        number = min(self._queue, key=lambda one: (self._queue[one][0], one))
+        self._round = self._queue[number][0]
+        return self._forget(number)
+
+    def _append(self, turn: int, request: Request) -> None:
+        self._next += 1
+        self._queue[self._next] = turn, request
+        self._of.setdefault(request.requester.name, []).append(self._next)
+
+    def _forget(self, number: int) -> Request:
+        _, request = self._queue.pop(number)
+        name = request.requester.name
+        self._of[name].remove(number)
+        if not self._of[name]:
+            del self._of[name]
+        return request
+
+
+def no_followup() -> None:
+    """Do nothing after an answer was sent: nothing has to be remembered of it."""
 
 
 class StillLoading(Exception):
@@ -46,13 +105,13 @@ class Worker(ABC):
     Parameters
     ----------
     listening
-        Where requests come; to nobody else.
+        Where requests come, for this worker only.
     stop
         Set when the program ends.
     every_s
         How often `tick` is called.
     log
-        Told what goes wrong, and when it is right again.
+        Takes a line about what goes wrong, and when it is right again.
     """
 
     def __init__(
@@ -120,7 +179,7 @@ class Worker(ABC):
             return
         except (ShmmapError, ValueError) as error:
             self._log(f"{server.name}: answered with nothing: {error}")
-            content, done = self.empty(request.message), _nothing
+            content, done = self.empty(request.message), no_followup
         if server.present(request):
             why = server.reply(content)
             if why:
@@ -158,7 +217,3 @@ class Worker(ABC):
         if self._away:
             self._away = ""
             self._log("requests are answered again")
-
-
-def _nothing() -> None:
-    """Nothing has to be remembered of an answer that has nothing."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import MapDataError, MapMissing
+from shmmap import BadRequest, MapDataError, MapMissing
 from shmmap_clients.scans.scan_file import SCAN_SUFFIXES, ScanReader
 from shmmap_clients.scans.scan_names import in_order, pair_with_poses, stem
 from shmmap_clients.scans.trajectory import Trajectory
@@ -53,6 +53,19 @@ class Scan:
     def xyz(self) -> NDArray[Any]:
         """Points, (N, 3), sensor frame, metres."""
         return self.columns["xyz"]
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """Where it was taken: ``T_map_sensor``.
+
+        Raises
+        ------
+        BadRequest
+            That is not known.
+        """
+        if self.T_map_sensor is None:
+            raise BadRequest(f"scan {self.name} has no pose", hint="give poses with --poses FILE")
+        return self.T_map_sensor
 
 
 class ScanSequence:

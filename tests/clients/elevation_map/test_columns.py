@@ -4,15 +4,11 @@
 from __future__ import annotations
 
 import itertools
-import json
-import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.elevation_map.checkpoint import Checkpoint, Journal
 from shmmap_clients.elevation_map.grid import FILLED, MEASURED, NOTHING, ElevationGrid
 from shmmap_clients.elevation_map.holes import fill_holes
 from shmmap_clients.elevation_map.rule import ElevationRule
@@ -214,35 +210,3 @@ def test_blocks_fill_as_the_whole_does(tmp_path: Path) -> None:
     plain, kind = grid.filled(5, 9, 0.0)
     assert np.array_equal(plain, heights[5:9], equal_nan=True)
     assert FILLED not in kind
-
-
-def test_a_checkpoint_brings_back_what_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    boxes = np.array([(0, 0, 5, 5), (4, 0, 9, 5), (8, 0, 12, 5)])
-
-    def rows(*i: int) -> Columns:
-        values: NDArray[Any] = np.array([[n, 0.5, 1.5] for n in i], np.float32)
-        return Columns(np.array(i), np.full(len(i), 2), values)
-
-    seams, journal = Seams(boxes), Journal(tmp_path)
-    assert journal.read(seams) is None
-    (tmp_path / "heights").touch()
-    seams.add(0, rows(1, 4))
-    journal.write(Checkpoint(1, 2, 0), seams)
-    seams.add(1, rows(4, 8))
-    forced = []
-
-    def fsync(fd: int) -> None:
-        assert json.loads((tmp_path / "state.json").read_text())["done"] == 1  # the state comes last
-        forced.append(Path(os.readlink(f"/proc/self/fd/{fd}")).name)
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    journal.write(Checkpoint(2, 4, 1), seams)
-    assert sorted(forced) == ["heights", "seams-2.npz"]
-    again = Seams(boxes)
-    assert journal.read(again) == Checkpoint(2, 4, 1)
-    assert sorted(path.name for path in tmp_path.glob("seams-*")) == ["seams-2.npz"]
-    released = again.add(2, rows(8, 11))
-    assert released is not None
-    assert sorted(released.values[:, 0].tolist()) == [8, 8, 11]
-    (tmp_path / "seams-2.npz").write_bytes(b"torn")
-    assert journal.read(Seams(boxes)) is None

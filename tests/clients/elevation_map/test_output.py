@@ -13,9 +13,8 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 from shmmap_clients.elevation_map.grid import ElevationGrid
-from shmmap_clients.elevation_map.hillshade import hillshade
 from shmmap_clients.elevation_map.holes import fill_holes
-from shmmap_clients.elevation_map.output import write_elevation, write_hillshade
+from shmmap_clients.elevation_map.output import hillshade, write_elevation, write_hillshade
 
 from shmmap import BadRequest
 
@@ -130,3 +129,44 @@ def test_an_empty_grid_and_what_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(BadRequest):
         ElevationGrid.create(tmp_path / "endless", 1e-6, (0, 0), (3, 20_000_000))
     assert [path.name for path in tmp_path.glob("*.tmp")] == []
+
+
+def test_what_no_cell_covers_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two small parts of a map at two corners: heights as without boxes, and few columns are read."""
+    rng = np.random.default_rng(0)
+    side = 900
+    boxes = np.array([(100, 200, 160, 250), (900, 1000, 990, 1060), (130, 240, 200, 300)], np.int64)
+    grids = [
+        ElevationGrid(tmp_path / "grid", 0.3, (100, 200), (side, side), which) for which in (None, boxes)
+    ]
+    ElevationGrid.create(tmp_path / "grid", 0.3, (100, 200), (side, side))
+    for i0, j0, i1, j1 in boxes.tolist():
+        i, j = np.meshgrid(np.arange(i0, i1), np.arange(j0, j1))
+        some = rng.random(i.shape) < 0.6
+        grids[0].put(i[some], j[some], rng.uniform(0, 3, int(some.sum())))
+    read = 0
+    rows = ElevationGrid.rows
+
+    def counted(self: ElevationGrid, *where: int) -> NDArray[np.float32]:
+        nonlocal read
+        found = rows(self, *where)
+        read += found.size
+        return found
+
+    monkeypatch.setattr(ElevationGrid, "rows", counted)
+    for margin in (0, 1):
+        every, few = (
+            [(begin, heights.copy(), kind.copy()) for begin, heights, kind in grid.blocks(1.0, margin=margin)]
+            for grid in grids
+        )
+        for (a, heights, kind), (b, others, kinds) in zip(every, few, strict=True):
+            assert a == b
+            assert np.array_equal(heights, others, equal_nan=True)
+            assert np.array_equal(kind, kinds)
+    read = 0
+    for _ in grids[1].blocks(1.0):
+        pass
+    assert 0 < read < side * side // 10
+    write_elevation(tmp_path / "few.tif", grids[1], 1.0, {})
+    write_elevation(tmp_path / "every.tif", grids[0], 1.0, {})
+    assert (tmp_path / "few.tif").read_bytes() == (tmp_path / "every.tif").read_bytes()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import math
@@ -18,14 +17,13 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.decimation import KEPT
+from shmmap_clients.command_line import complain
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, frame_document
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.drive.frame_json import frame_document
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
 from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher, decode_pose
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
@@ -36,6 +34,7 @@ from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
 from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.scans.thinning import thinned
 from shmmap_clients.scans.trajectory import Trajectory
+from shmmap_clients.spread import KEPT
 
 import shmmap
 
@@ -306,12 +305,17 @@ def test_addresses_that_make_no_sense_are_refused() -> None:
 
 
 def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    args = argparse.Namespace(tum=None, json_lines=None, quiet=False, allow_empty=False, relocalize=None)
+    def say(text: str, hint: str = "") -> None:
+        complain("shmmap-ndt", text, hint)
+
+    drive: Any = SimpleNamespace(say=say)
     client: Any = SimpleNamespace(welcome=SimpleNamespace(bounds=(0.0, -1.5, 20.0, 30.25)))
+    matcher: Any = SimpleNamespace(trust=TrustLimits(nvtl=2.3), fault=None)
+    maps: Any = SimpleNamespace(too_slow=1)
+    report = FollowReport(drive, client, matcher, maps, None, "--relocalize searches for it")
     named = dataclasses.replace(frame(0, np.eye(4), None), name="\x1b[2Jscan\n")
-    with FollowReport(args) as report:
-        report.frame(named, client, TrustLimits(nvtl=2.3), 1, None)
-        report.frame(named, client, TrustLimits(nvtl=2.3), 1, None)
+    report.add(named)
+    report.add(named)
     said = capsys.readouterr().err
     assert said.splitlines() == [
         (

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from shmmap_clients.pose_initializer import InitializerRules, RoughPose
-from shmmap_clients.pose_initializer.parzen import ParzenEstimator
+from shmmap_clients.pose_initializer.candidates import ParzenEstimator
 
 import shmmap
 

@@ -8,8 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from shmmap_clients.rolling_map.live_section import LiveSettings, live_section
-from shmmap_clients.rolling_map.parameters import Parameters, Shown, read_parameters
+from shmmap_clients.rolling_map.parameters import (
+    LiveSettings,
+    Parameters,
+    Shown,
+    live_section,
+    read_parameters,
+)
 
 from shmmap import BadRequest, ConfigError, MapMissing, Occupancy, ScanFilter
 

@@ -15,13 +15,12 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import names
-from shmmap_clients.ros_bridge.areas import sensible, touches
+from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
-from shmmap_clients.ros_bridge.recent_cells import RecentCells
 from shmmap_clients.ros_bridge.requesters import Requesters
 from shmmap_clients.ros_bridge.service_server import Request, Requester
-from shmmap_clients.ros_bridge.waiting import MOST_OF_ONE, MOST_WAITING, WaitingRequests
+from shmmap_clients.ros_bridge.worker import MOST_OF_ONE, MOST_WAITING, WaitingRequests
 
 import shmmap
 
@@ -83,7 +82,7 @@ def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
 
 def request(who: str, number: int = 0) -> Request:
     server: Any = None
-    return Request(server, number, Requester(who, stranger=False, vendor=""), 0)
+    return Request(server, number, Requester(who, incompatible=False, vendor=""), 0)
 
 
 def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
@@ -204,7 +203,7 @@ def cell(name: str, version: int, nbytes: int = 1) -> Any:
 
 def test_cells_are_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = [100.0]
-    monkeypatch.setattr("shmmap_clients.ros_bridge.recent_cells.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("shmmap_clients.ros_bridge.map_answers.time.monotonic", lambda: now_s[0])
     recent = RecentCells()
     first, second = cell("a", 1), cell("b", 1)
     assert recent.kept([first, second]) == [first, second]
@@ -212,12 +211,12 @@ def test_cells_are_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     assert again[0] is again[2] is first, "as it was kept"
     assert again[1].version == 2
     now_s[0] += 1.9
-    assert not recent.let_go()
+    assert not recent.release_idle()
     recent.kept([second])
     now_s[0] += 1.9
-    assert (recent.let_go(), len(recent)) == (False, 3), "somebody has asked"
+    assert (recent.release_idle(), len(recent)) == (False, 3), "somebody has asked"
     now_s[0] += 0.2
-    assert (recent.let_go(), len(recent), recent.let_go()) == (True, 0, False)
+    assert (recent.release_idle(), len(recent), recent.release_idle()) == (True, 0, False)
     assert recent.kept([cell("a", 1)])[0] is not first
 
 

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses from files, scans from directories, scans over sockets."""
+"""Poses and routes from files, scans from directories, scans over sockets."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.scans import scan_stream
-from shmmap_clients.scans.scan_file import ScanReader, read_scan
+from shmmap_clients.scans.scan_file import read_scan
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
-from shmmap_clients.scans.scan_source import open_scans
 from shmmap_clients.scans.scan_stream import ScanPublisher, ScanSubscriber, decode_scan, encode_scan
-from shmmap_clients.scans.trajectory import matrix_of, quaternion_of, read_trajectory, tum_line
+from shmmap_clients.scans.trajectory import (
+    matrix_of,
+    quaternion_of,
+    read_route,
+    read_trajectory,
+    tum_line,
+)
 
 from shmmap import BadRequest, MapDataError, MapMissing
 
@@ -67,6 +71,51 @@ def test_trajectory_refusals(tmp_path: Path) -> None:
         read_trajectory(tmp_path / "binary")
     with pytest.raises(BadRequest):
         matrix_of((0, 0, 0), (0, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("way.tum", "# t x y z q\n1.0 1.5 -2 7 0 0 0 1\n2.0 3 4e1 7 0 0 0.7071068 0.7071068\n"),
+        ("way.csv", "1.5,-2\n3,4e1\n"),
+        ("way.CSV", "\ufeffx,y,z\n1.5,-2,7\n\n3, 40,\n"),
+        ("way.csv", '# planned\n"z","y","x"\n7,-2,1.5 # here it begins\n7,40,3,\n'),
+    ],
+)
+def test_places_of_a_route(tmp_path: Path, name: str, text: str) -> None:
+    file = tmp_path / name
+    file.write_text(text, encoding="utf-8")
+    assert read_route(file).tolist() == [[1.5, -2.0], [3.0, 40.0]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no places"),
+        ("x,y\n", "no places"),
+        ("1,2\n3\n", "line 2: not `x,y`"),
+        ("x,y\n1,2\n\n3,nan\n", "line 4: not `x,y`"),
+        ("east,north\n1,2\n", "line 1: not `x,y`"),
+        ("1 2\n", "line 1: not `x,y`"),
+    ],
+)
+def test_what_is_no_route_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(text)
+    with pytest.raises(MapDataError, match=said) as refused:
+        read_route(file)
+    assert str(file) in str(refused.value)
+
+
+def test_routes_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(MapMissing, match=r"way\.csv"):
+        read_route(tmp_path / "way.csv")
+    (tmp_path / "way.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(MapDataError, match="not a text file"):
+        read_route(tmp_path / "way.csv")
+    (tmp_path / "folder.csv").mkdir()
+    with pytest.raises(MapDataError, match="directory"):
+        read_route(tmp_path / "folder.csv")
 
 
 def write_scans(directory: Path, names: list[str]) -> None:
@@ -210,25 +259,3 @@ def test_nobody_who_does_not_read_holds_up_the_end(tmp_path: Path, monkeypatch: 
     with ScanSubscriber(endpoint), ScanPublisher(endpoint) as publisher:
         assert publisher.wait_for_listener(30.0)
         publisher.send(None)  # and closes, the reader still there
-
-
-def test_scans_as_an_option_names_them(tmp_path: Path) -> None:
-    write_scans(tmp_path / "a", ["s_0", "s_1"])
-    poses = tmp_path / "poses.txt"
-    poses.write_text("\n".join(tum_line(n, matrix_of((n, 0, 0), (0, 0, 0, 1))) for n in range(2)))
-    endpoint = f"ipc://{tmp_path}/scans"
-    with ExitStack() as stack:
-        assert [scan.T_map_sensor for scan in open_scans(str(tmp_path / "a"), None, stack, ScanReader())] == [
-            None,
-            None,
-        ]
-        posed = list(open_scans(str(tmp_path / "a"), str(poses), stack, ScanReader()))
-        assert [scan.stamp_s for scan in posed] == [0.0, 1.0]
-        with pytest.raises(BadRequest, match="publisher"):
-            open_scans(endpoint, str(poses), stack, ScanReader())
-        publisher = stack.enter_context(ScanPublisher(endpoint))
-        heard = open_scans(endpoint, None, stack, ScanReader())
-        assert publisher.wait_for_listener(30.0)
-        for scan in (*posed, None):
-            publisher.send(scan)
-        assert [scan.stamp_s for scan in heard] == [0.0, 1.0]

@@ -104,8 +104,7 @@ def run(args: argparse.Namespace) -> int:
         left_out = f"; left out: {reader.left_out}" if reader.left_out else ""
         print(f"{len(scan.xyz)} points, {kept} kept, {milliseconds:.1f} ms{left_out}")
     if comparison.no_map:
-        x, y = T[:2, 3]
-        where = f"{extent_text(compare.bounds)}, the pose is at ({x:.3f}, {y:.3f})"
+        where = extent_text(compare.bounds, T[:2, 3])
         return nothing_found(args, f"no map around the scan: {where}", name="shmmap-compare")
     if not kept:
         why = "the map explains all of them" if len(scan.xyz) else f"{args.scan} has none"

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
@@ -13,22 +11,26 @@ from shmmap_clients.command_line import (
     add_daemon_options,
     add_json_option,
     add_verb,
-    announce_scans,
     connect,
     not_negative,
     nothing_found,
     output_file,
     print_json,
-    print_line,
     seconds,
     write_text,
     writing_errors,
 )
 from shmmap_clients.compare_map_filter.cli.rule_options import add_rule_options, rule_from
-from shmmap_clients.shared_options import add_quiet_option, add_radius_option, add_scans_option, reader_from
+from shmmap_clients.shared_options import (
+    add_json_lines_option,
+    add_poses_option,
+    add_quiet_option,
+    add_radius_option,
+    add_scans_option,
+)
 
 if TYPE_CHECKING:
-    from shmmap_clients.compare_map_filter.statistics import DriveStatistics
+    from shmmap_clients.compare_map_filter.drive import DriveStatistics
 
 __all__ = ["add_parser", "run"]
 
@@ -62,12 +64,7 @@ def add_parser(subparsers: Any) -> None:
         epilog=_EPILOG,
     )
     add_scans_option(parser)
-    parser.add_argument(
-        "--poses",
-        metavar="FILE",
-        help="poses of the frame that the points are in, for the scans of a directory, TUM format; a"
-        " publisher's scans bring theirs",
-    )
+    add_poses_option(parser)
     add_rule_options(parser)
     window = parser.add_argument_group("map around the vehicle")
     add_radius_option(window)
@@ -96,9 +93,7 @@ def add_parser(subparsers: Any) -> None:
     out.add_argument(
         "--picture", type=output_file, metavar="FILE", help="write an SVG of kept and removed points"
     )
-    out.add_argument(
-        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
-    )
+    add_json_lines_option(out)
     add_quiet_option(out)
     add_allow_empty(parser)
     add_json_option(parser)
@@ -110,56 +105,45 @@ def run(args: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from shmmap import MapWindow
-    from shmmap_clients.compare_map_filter.drive import compare_drive
+    from shmmap_clients.compare_map_filter.drive import ComparedScan, DriveStatistics, ScanComparer
     from shmmap_clients.compare_map_filter.filter import CompareMapFilter
     from shmmap_clients.compare_map_filter.numpy_path import to_map
     from shmmap_clients.compare_map_filter.output import open_output
     from shmmap_clients.compare_map_filter.picture import TopView
-    from shmmap_clients.compare_map_filter.statistics import DriveStatistics
     from shmmap_clients.map_extent import map_extent
-    from shmmap_clients.scans.scan_source import open_scans
+    from shmmap_clients.scan_drive import ScanDrive
+    from shmmap_clients.scans.scan_sequence import Scan
     from shmmap_clients.streams import is_endpoint
 
     rule = rule_from(args)
-    compare = CompareMapFilter(rule, backend=args.backend)  # compiles before anybody waits
+    compare = CompareMapFilter(rule, backend=args.backend)  # compiles before any scan waits
     statistics, view = DriveStatistics(), TopView()
     wait_s = args.wait if args.wait is not None else (None if is_endpoint(args.scans) else 30.0)
-    code = 0
-    reader = reader_from(args, _NAME)
     with ExitStack() as stack:
-        scans = open_scans(args.scans, args.poses, stack, reader)
+        drive = ScanDrive(args, _NAME, args.poses, stack)
         client = stack.enter_context(connect(args, _NAME))
         window = stack.enter_context(
             MapWindow(client, args.map_radius, layers=rule.layer, update_distance=args.update_distance)
         )
-        output = lines = None
-        if args.json_lines == "-":
-            lines = sys.stdout
-        elif args.json_lines:
-            stack.enter_context(writing_errors(args.json_lines))
-            lines = stack.enter_context(open(args.json_lines, "w", encoding="utf-8"))
+        comparer = ScanComparer(window, compare, first_wait_s=30.0, wait_s=wait_s)
+        output = None
         if args.out:
             stack.enter_context(writing_errors(args.out))
             output = open_output(args.out, mask=args.mask, wait_s=30.0)
             stack.callback(output.close)
-        announce_scans(args)
-        for compared in compare_drive(scans, window, compare, first_wait_s=30.0, wait_s=wait_s):
-            statistics.add(compared)
+
+        def step(scan: Scan) -> ComparedScan:
+            compared = comparer(scan)
+            x, y = scan.pose[:2, 3].tolist()
             if output is not None:
                 output.write(compared)
-            T = compared.scan.T_map_sensor
-            if args.picture and T is not None:
-                position = (float(T[0, 3]), float(T[1, 3]))
-                view.add(to_map(compared.scan.xyz, T), compared.comparison.kept, position)
-            if lines is not None:
-                lines.write(json.dumps(statistics.document(compared), allow_nan=False) + "\n")
-                lines.flush()
-            if compared.comparison.no_map and statistics.no_map == 1 and T is not None:
-                x, y = T[:2, 3]
-                where = f"{map_extent(client)}, the pose is at ({x:.3f}, {y:.3f})"
-                code = nothing_found(args, f"no map around scan {compared.scan.name}: {where}", name=_NAME)
-            if not args.quiet:
-                print_line(statistics.line(compared), file=sys.stderr)
+            if args.picture:
+                view.add(to_map(scan.xyz, scan.pose), compared.comparison.kept, (x, y))
+            if compared.comparison.no_map and not statistics.no_map:
+                drive.say(f"no map around scan {scan.name}: {map_extent(client, (x, y))}")
+            return compared
+
+        drive.run(step, statistics, statistics.document)
         compare.use_cells(())
     if args.picture:
         note = (
@@ -168,10 +152,12 @@ def run(args: argparse.Namespace) -> int:
         )
         write_text(args.picture, view.svg(_NAME, note))
     if args.json:
-        print_json({**statistics.summary(), **reader.counts})
+        print_json({**statistics.summary(), **drive.reader.counts})
     else:
-        _print(statistics, reader.left_out)
-    return max(code, _exit_code(args, statistics))
+        _print(statistics, drive.reader.left_out)
+    if not statistics.scans:
+        return drive.no_scans()
+    return _exit_code(args, statistics)
 
 
 def _print(statistics: DriveStatistics, left_out: str) -> None:
@@ -185,9 +171,7 @@ def _print(statistics: DriveStatistics, left_out: str) -> None:
 
 
 def _exit_code(args: argparse.Namespace, statistics: DriveStatistics) -> int:
-    code = 1 if statistics.incomplete else 0
-    if not statistics.scans:
-        return nothing_found(args, f"no scan came from {args.scans}", name=_NAME)
+    code = 1 if statistics.incomplete or (statistics.no_map and not args.allow_empty) else 0
     if not statistics.kept:
         explained = f"the map explains all {statistics.points} points"
         return max(code, nothing_found(args, f"no point was kept: {explained}", name=_NAME))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
+    ProgressLine,
     add_allow_empty,
     add_daemon_options,
     add_json_option,
@@ -156,7 +157,8 @@ def run(args: argparse.Namespace) -> int:
     if args.hillshade and Path(args.hillshade).suffix.lower() != ".png":
         raise BadRequest(f"{args.hillshade}: a hillshade is written as .png")
     fill_reach(args.fill_radius / rule.resolution)
-    with _ProgressLine("points" if args.rule == "surface" else "columns", quiet=args.quiet) as progress:
+    with ProgressLine(quiet=args.quiet, written_over=sys.stderr.isatty()) as line:
+        progress = _Progress(line, "points" if args.rule == "surface" else "columns")
         with connect(args, _NAME) as client:
             for attempt in range(_ATTEMPTS):
                 try:
@@ -176,11 +178,11 @@ def run(args: argparse.Namespace) -> int:
             "fill_radius": args.fill_radius,
         }
         for path in files:
-            progress.say(f"writing {path}")
+            line.show(f"writing {path}")
             with writing_errors(str(path)):
                 write_elevation(path, grid, args.fill_radius, document, epsg=args.epsg)
         if args.hillshade:
-            progress.say(f"writing {args.hillshade}")
+            line.show(f"writing {args.hillshade}")
             with writing_errors(str(args.hillshade)):
                 write_hillshade(args.hillshade, grid, args.fill_radius)
         counts = np.zeros(3, np.int64)
@@ -254,35 +256,16 @@ def _cache(named: str | None) -> Path:
     return (Path(base) if base.startswith("/") else Path.home() / ".cache") / "shmmap" / "elevation"
 
 
-class _ProgressLine:
-    """One line that is written over on a terminal, and a line now and then elsewhere."""
+class _Progress:
+    """Shows how far a build is, now and then: cells come faster than anything can be read."""
 
-    def __init__(self, rows: str, *, quiet: bool) -> None:
+    def __init__(self, line: ProgressLine, rows: str) -> None:
+        self._line = line
         self._rows = rows
-        self._quiet = quiet
-        self._terminal = sys.stderr.isatty()
         self._next_s = 0.0
-        self._shown = ""
-
-    def __enter__(self) -> _ProgressLine:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._terminal and self._shown:
-            print(file=sys.stderr)
 
     def __call__(self, progress: BuildProgress) -> None:
         now_s = time.monotonic()
         if now_s >= self._next_s or progress.done == progress.cells:
-            self._next_s = now_s + (_EVERY_S if self._terminal else 10 * _EVERY_S)
-            self.say(f"{progress.done} of {progress.cells} cells, {progress.rows} {self._rows}")
-
-    def say(self, text: str) -> None:
-        """Show what is being done."""
-        if self._quiet:
-            return
-        if self._terminal:
-            print("\r" + text.ljust(len(self._shown)), end="", file=sys.stderr, flush=True)
-        else:
-            print(text, file=sys.stderr, flush=True)
-        self._shown = text
+            self._next_s = now_s + (_EVERY_S if self._line.written_over else 10 * _EVERY_S)
+            self._line.show(f"{progress.done} of {progress.cells} cells, {progress.rows} {self._rows}")

@@ -17,8 +17,13 @@ from shmmap_clients.command_line import (
 )
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options, matcher_from
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
-from shmmap_clients.shared_options import add_leaf_option, add_scan_option, add_thin_option, reader_from
-from shmmap_clients.trust_options import FAILED_LIMITS
+from shmmap_clients.shared_options import (
+    FAILED_LIMITS,
+    add_leaf_option,
+    add_scan_option,
+    add_thin_option,
+    reader_from,
+)
 
 __all__ = ["add_parser", "run"]
 
@@ -134,10 +139,9 @@ def run(args: argparse.Namespace) -> int:
     if not len(scan):
         return nothing_found(args, f"{args.scan} has no points", name="shmmap-ndt")
     if result.no_map:
-        x, y, z = result.T_map_base[:3, 3]
         bounds = [*cloud[:, :2].min(axis=0), *cloud[:, :2].max(axis=0)] if len(cloud) else None
-        where = f"the pose is at ({x:.3f}, {y:.3f}, {z:.3f})"
-        found = f"no voxel of the map near any point of the scan: {extent_text(bounds)}, {where}"
+        where = extent_text(bounds, result.T_map_base[:3, 3])
+        found = f"no voxel of the map near any point of the scan: {where}"
         return nothing_found(args, found, name="shmmap-ndt")
     return 0 if result.converged else 1
 

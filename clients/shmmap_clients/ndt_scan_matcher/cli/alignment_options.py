@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.backend_options import add_scoring_options, scoring_settings
 from shmmap_clients.command_line import at_least, positive
-from shmmap_clients.trust_options import add_trust_options, trust_from
+from shmmap_clients.shared_options import add_scoring_options, add_trust_options, scoring_settings, trust_from
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher

@@ -5,17 +5,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from shmmap_clients.backend_options import scoring_settings
-from shmmap_clients.command_line import add_verb, announce_scans, connect, print_json, write_text
+from shmmap_clients.command_line import add_verb, connect, print_json, write_text
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from
 from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
-from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.pose_option import pose_from
-from shmmap_clients.shared_options import reader_from
-from shmmap_clients.trust_options import trust_from
+from shmmap_clients.shared_options import scoring_settings, trust_from
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,19 +42,19 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Follow, then print the summary."""
+    from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
     from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
-    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
-    from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
+    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import frame_document
+    from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
     from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
-    from shmmap_clients.scans.route_file import read_route
-    from shmmap_clients.scans.scan_source import open_scans
+    from shmmap_clients.scan_drive import ScanDrive
+    from shmmap_clients.scans.trajectory import read_route, tum_line
     from shmmap_clients.streams import is_endpoint
 
-    statistics, plot = DriveStatistics(), DrivePlot()
+    plot = DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
-    reader = reader_from(args, "shmmap-ndt")
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: who waits for this program's subscription finds it
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
@@ -65,17 +62,15 @@ def run(args: argparse.Namespace) -> int:
         if args.odometry is not None and is_endpoint(args.odometry):
             listener = OdometryListener(args.odometry)
             stack.callback(listener.close)
-        source = open_scans(args.scans, args.truth, stack, reader)
-        scans = iter(_paced(source, args.rate) if args.rate and not is_endpoint(args.scans) else source)
+        drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
+        tum = drive.open_text(str(args.tum)) if args.tum else None
         if publisher is not None and args.listener_wait > 0:
             publisher.wait_for_listener(args.listener_wait)
-        report = stack.enter_context(FollowReport(args))
-        announce_scans(args)
-        first = next(scans, None)
+        first = drive.first()
         if first is None:
-            return report.no_scans()
+            return drive.no_scans()
         T_first, known = _start(args, first)
-        prediction = _prediction(args, T_first, listener, source)
+        prediction = _prediction(args, T_first, listener, drive.scans)
         matcher = stack.enter_context(matcher_from(args))
         rules = MapRules(
             args.update_distance,
@@ -101,28 +96,32 @@ def run(args: argparse.Namespace) -> int:
             tracking=Tracking(args.lost_after, lost=not known),
             relocalize=relocalizer,
         )
-        scan: Scan | None = first
-        while scan is not None and (args.frames is None or statistics.frames < args.frames):
+        asked = relocalizer is not None or args.relocalize is False
+        hint = "" if asked else "--relocalize searches for it"
+        report = FollowReport(drive, client, matcher, maps, relocalizer, hint)
+
+        def step(scan: Scan) -> Frame:
             if listener is not None and args.odometry_wait > 0:
                 listener.wait_until(scan.stamp_s, args.odometry_wait)
             frame = follower.follow(scan)
-            statistics.add(frame)
             if args.plot:
                 plot.add(frame)
             if publisher is not None:
                 publisher.send(frame)
-            report.frame(frame, client, matcher.trust, maps.too_slow, relocalizer)
-            report.fault(frame, matcher)
-            scan = next(scans, None)
-    summary = statistics.summary(
+            if tum is not None:
+                tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
+            return frame
+
+        drive.run(step, report, frame_document, max_scans=args.frames)
+    summary = report.statistics.summary(
         maps.statistics, maps.too_slow, matcher.trust, backend=matcher.backend_name, fault=matcher.fault
     )
     if args.plot:
         write_text(args.plot, plot.svg())
     if args.json:
-        print_json({**summary.as_document(), **reader.counts})
+        print_json({**summary.as_document(), **drive.reader.counts})
     else:
-        print_summary(summary, reader.left_out)
+        print_summary(summary, drive.reader.left_out)
     allowed = summary.no_map if args.allow_empty else 0
     return 0 if summary.trustworthy + allowed == summary.frames and not summary.too_slow else 1
 
@@ -184,12 +183,3 @@ def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Reloc
         return stack.enter_context(made)
 
     return Relocalizer(initializer, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
-
-
-def _paced(scans: Iterable[Scan], rate: float) -> Iterator[Scan]:
-    import time
-
-    begin = time.monotonic()
-    for number, scan in enumerate(scans):
-        time.sleep(max(0.0, begin + number / rate - time.monotonic()))
-        yield scan

@@ -19,6 +19,7 @@ from shmmap_clients.command_line import (
 from shmmap_clients.ndt_scan_matcher.cli.alignment_options import add_alignment_options
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option
 from shmmap_clients.shared_options import (
+    FAILED_LIMITS,
     add_height_option,
     add_leaf_option,
     add_quiet_option,
@@ -27,7 +28,6 @@ from shmmap_clients.shared_options import (
     add_sigma_options,
     add_thin_option,
 )
-from shmmap_clients.trust_options import FAILED_LIMITS
 
 __all__ = ["EPILOG", "add_options"]
 

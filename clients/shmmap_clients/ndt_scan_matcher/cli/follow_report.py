@@ -1,169 +1,100 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap-ndt follow`` tells while it runs, and its summary in words."""
+"""What ``shmmap-ndt follow`` says while it runs, and its summary in words."""
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import json
-import sys
-from types import TracebackType
-from typing import TYPE_CHECKING, TextIO
-
-from shmmap_clients.command_line import complain, nothing_found, printable, writing_errors
-
-if TYPE_CHECKING:
-    from shmmap import Client
-    from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveSummary
-    from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
-    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
-    from shmmap_clients.pose_initializer import Relocalizer
+from shmmap import Client
+from shmmap_clients.map_extent import map_extent
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, DriveSummary
+from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
+from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
+from shmmap_clients.pose_initializer import Relocalizer
+from shmmap_clients.scan_drive import ScanDrive
 
 __all__ = ["FollowReport", "print_summary"]
 
-_NAME: str = "shmmap-ndt"
-
 
 class FollowReport:
-    """Writes ``--tum`` and ``--json-lines``, and says on stderr what a reader has to know.
+    """Counts the frames of a drive, and says on stderr what a reader has to know.
 
     Parameters
     ----------
-    args
-        Of the program.
+    drive
+        Whose scans they are; says it.
+    client, matcher, maps, relocalizer
+        What the drive works with.
+    hint
+        What finds a lost vehicle where nothing searches for it; said once.
     """
 
-    def __init__(self, args: argparse.Namespace) -> None:
-        self._args = args
-        self._stack = contextlib.ExitStack()
-        self._tum: TextIO | None = None
-        self._lines: TextIO | None = None
-        self._terminal = sys.stderr.isatty() and not args.quiet
-        self._frames = 0
+    def __init__(
+        self,
+        drive: ScanDrive,
+        client: Client,
+        matcher: NdtMatcher,
+        maps: MapUpdater,
+        relocalizer: Relocalizer | None,
+        hint: str = "",
+    ) -> None:
+        self.statistics = DriveStatistics()
+        self._say = drive.say
+        self._client = client
+        self._matcher = matcher
+        self._maps = maps
+        self._relocalizer = relocalizer
+        self._hint = hint
         self._too_slow = 0
         self._state = ""
-        self._no_map_told = False
-        self._hinted = False
-        self._error_told = ""
-        self._fault_told = False
-        self._jump_told = False
+        self._error = ""
+        self._has_fault = False
         self._last_stamp_s = 0.0
 
-    def __enter__(self) -> FollowReport:
-        args = self._args
-        if args.tum:
-            self._tum = self._opened(str(args.tum))
-        if args.json_lines == "-":
-            self._lines = sys.stdout
-        elif args.json_lines:
-            self._lines = self._opened(args.json_lines)
-        return self
-
-    def _opened(self, path: str) -> TextIO:
-        """Open a file to write; until this report is closed, what cannot be written is `CannotWrite`."""
-        with writing_errors(path):
-            file = open(path, "w", encoding="utf-8")  # noqa: SIM115
-        self._stack.enter_context(writing_errors(path))
-        return self._stack.enter_context(file)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._terminal and self._frames:
-            print(file=sys.stderr)
-        self._stack.__exit__(kind, error, trace)
-
-    def no_scans(self) -> int:
-        """Say that there was no scan; returns the exit code."""
-        return nothing_found(self._args, f"no scan came from {self._args.scans}", name=_NAME)
-
-    def frame(
-        self,
-        frame: Frame,
-        client: Client,
-        trust: TrustLimits,
-        too_slow: int,
-        relocalizer: Relocalizer | None,
-    ) -> None:
-        """Tell of the next frame."""
-        from shmmap_clients.ndt_scan_matcher.drive.frame_json import frame_document
-        from shmmap_clients.scans.trajectory import tum_line
-
-        self._frames += 1
-        if self._tum is not None:
-            self._tum.write(tum_line(frame.stamp_s, frame.result.T_map_base) + "\n")
-        if self._lines is not None:
-            self._lines.write(json.dumps(frame_document(frame), allow_nan=False) + "\n")
-            self._lines.flush()
-        if frame.result.no_map and not self._no_map_told:
-            self._no_map_told = True
-            self._say_no_map(frame, client)
-        if too_slow > self._too_slow:
-            self._too_slow = too_slow
+    def add(self, frame: Frame) -> None:
+        """Count the next frame, and say what is new with it."""
+        statistics, where = self.statistics, f"at scan {frame.name}"
+        statistics.add(frame)
+        if frame.result.no_map and statistics.no_map == 1:
+            self._say(f"no map {where}: {map_extent(self._client, frame.result.T_map_base[:2, 3])}")
+        if self._maps.too_slow > self._too_slow:
+            self._too_slow = self._maps.too_slow
             self._say(f"the map did not keep up with the vehicle: scan {frame.name} waited for it")
-        if frame.clock_jumped and not self._jump_told:
-            self._jump_told = True
+        if frame.clock_jumped and statistics.clock_jumps == 1:
             step_s = frame.stamp_s - self._last_stamp_s
-            self._say(
-                f"the clock jumped at scan {frame.name}, {step_s:+.6g} s: no motion is predicted there"
-                " (said once)"
-            )
+            self._say(f"the clock jumped {where}, {step_s:+.6g} s: no motion is predicted there (said once)")
         self._last_stamp_s = frame.stamp_s
-        self._tell_state(frame, trust, relocalizer)
-        self._progress(frame)
+        self._say_state(frame, where)
+        if self._matcher.fault is not None and not self._has_fault:
+            self._has_fault = True
+            why = self._matcher.fault.message
+            self._say(f"the device failed {where}, {self._matcher.backend_name} goes on: {why}")
 
-    def fault(self, frame: Frame, matcher: NdtMatcher) -> None:
-        """Say, once, that another backend goes on."""
-        if matcher.fault is not None and not self._fault_told:
-            self._fault_told = True
-            why = matcher.fault.message
-            self._say(f"the device failed at scan {frame.name}, {matcher.backend_name} goes on: {why}")
-
-    def _say_no_map(self, frame: Frame, client: Client) -> None:
-        from shmmap_clients.map_extent import map_extent
-
-        x, y = frame.result.T_map_base[:2, 3]
-        self._say(f"no map at scan {frame.name}: {map_extent(client)}, the pose is at ({x:.3f}, {y:.3f})")
-
-    def _tell_state(self, frame: Frame, trust: TrustLimits, relocalizer: Relocalizer | None) -> None:
-        """Say when the vehicle gets lost or is found again."""
+    def _say_state(self, frame: Frame, where: str) -> None:
+        """Say when the vehicle gets lost or is found again, and once what finds it where nothing searches."""
         before, self._state = self._state, frame.state
-        where = f"at scan {frame.name}"
         if frame.relocalized:
             x, y = frame.result.T_map_base[:2, 3]
             self._say(f"relocalized {where}: ({x:.2f}, {y:.2f})")
         elif frame.state == "lost" and before != "lost":
-            failed = ", ".join(trust.describe(name) for name in frame.result.failed_limits)
-            self._say(f"lost {where}: {failed}", self._lost_hint(relocalizer))
+            failed = ", ".join(self._matcher.trust.describe(name) for name in frame.result.failed_limits)
+            self._say(f"lost {where}: {failed}", self._hint)
+            self._hint = ""
         elif frame.state == "tracking" and before == "lost":
             self._say(f"tracking again {where}")
-        error = "" if relocalizer is None or relocalizer.error is None else str(relocalizer.error)
-        if error and not self._error_told:
-            self._say(f"relocalization failed {where}: {error}")
-        self._error_told = error
+        error = self._relocalizer.error if self._relocalizer is not None else None
+        text = "" if error is None else str(error)
+        if text and not self._error:
+            self._say(f"relocalization failed {where}: {text}")
+        self._error = text
 
-    def _lost_hint(self, relocalizer: Relocalizer | None) -> str:
-        """Say, once, what finds a lost vehicle again, where nothing searches and nothing forbids it."""
-        if relocalizer is not None or self._args.relocalize is False or self._hinted:
-            return ""
-        self._hinted = True
-        return "--relocalize searches for it"
-
-    def _say(self, text: str, hint: str = "") -> None:
-        if self._terminal and self._frames > 1:
-            print(file=sys.stderr)  # the progress stands there
-        complain(_NAME, text, hint)
-
-    def _progress(self, frame: Frame) -> None:
-        if self._terminal:
-            x, y = frame.result.T_map_base[:2, 3]
-            line = (
-                f"\r{self._frames:6} {printable(frame.name):20.20} ({x:9.2f}, {y:9.2f})"
-                f" NVTL {frame.result.nvtl:5.2f} {frame.result.iterations:3} iterations"
-                f" {frame.latency_s * 1e3:7.1f} ms {frame.state:9}"
-            )
-            print(line, end="", file=sys.stderr, flush=True)
+    def line(self, frame: Frame) -> str:
+        """Return the progress after a frame."""
+        x, y = frame.result.T_map_base[:2, 3]
+        return (
+            f"{self.statistics.frames:6} {frame.name:20.20} ({x:9.2f}, {y:9.2f})"
+            f" NVTL {frame.result.nvtl:5.2f} {frame.result.iterations:3} iterations"
+            f" {frame.latency_s * 1e3:7.1f} ms {frame.state:9}"
+        )
 
 
 def print_summary(summary: DriveSummary, left_out: str = "") -> None:

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.decimation import Decimated
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
+from shmmap_clients.spread import Decimated
 
 __all__ = ["DrivePlot"]
 

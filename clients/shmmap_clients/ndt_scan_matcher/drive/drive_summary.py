@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a whole drive was like: errors, scores, latencies, and what the map's updates cost."""
+"""One scan's result as JSON, and what a whole drive was like: errors, scores, latencies, costs of the map."""
 
 from __future__ import annotations
 
@@ -11,12 +11,17 @@ from typing import Any
 
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import RunningErrors, TrajectoryErrors
+from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
+    RunningErrors,
+    TrajectoryErrors,
+    pose_errors,
+)
 from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+from shmmap_clients.scans.trajectory import quaternion_of
 from shmmap_clients.spread import RunningSpread, Spread
 
-__all__ = ["DriveStatistics", "DriveSummary"]
+__all__ = ["DriveStatistics", "DriveSummary", "frame_document"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +116,8 @@ class DriveStatistics:
     """Sums up frame after frame; its size does not depend on how many."""
 
     def __init__(self) -> None:
-        self.frames = self.trustworthy = self.no_map = 0
+        self.frames = self.trustworthy = self.no_map = self.clock_jumps = 0
         self._converged = self._waited = self._cut = self._lost = self._relocalized = 0
-        self._clock_jumps = 0
         self._failed_limits: Counter[str] = Counter()
         self._cut_by: Counter[str] = Counter()
         self._errors = RunningErrors()
@@ -133,7 +137,7 @@ class DriveStatistics:
         self._cut_by.update(result.cut.by)
         self._lost += frame.state == "lost"
         self._relocalized += frame.relocalized
-        self._clock_jumps += frame.clock_jumped
+        self.clock_jumps += frame.clock_jumped
         if frame.T_truth is not None:
             self._errors.add(result.T_map_base, frame.T_truth)
         for name, running in self._results.items():
@@ -159,7 +163,7 @@ class DriveStatistics:
             no_map=self.no_map,
             lost=self._lost,
             relocalized=self._relocalized,
-            clock_jumps=self._clock_jumps,
+            clock_jumps=self.clock_jumps,
             failed_limits=dict(self._failed_limits),
             trust=trust,
             waited=self._waited,
@@ -193,3 +197,43 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _without_nan(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def frame_document(frame: Frame) -> dict[str, Any]:
+    """Return what ``shmmap-ndt follow --json-lines`` writes about one scan.
+
+    Returns
+    -------
+    dict
+        ``name``; ``stamp_s``; ``pose``: x, y, z (metres, map frame) and the quaternion qx, qy, qz, qw;
+        ``converged``, ``trustworthy``, and ``failed_limits``: why not, see `TrustLimits.failed`;
+        ``no_map``; ``state``: ``tracking``, ``uncertain`` or ``lost``; ``relocalized``; ``clock_jumped``;
+        ``iterations``, ``transform_probability``, ``nvtl``; ``waited``: for the map;
+        ``latency_ms``: from having the scan to having the pose; ``error_m`` and ``error_deg``: distance
+        and angle to the true pose, null where the scan has none.
+    """
+    result = frame.result
+    T = result.T_map_base
+    error_m = error_deg = None
+    if frame.T_truth is not None:
+        metres, degrees = pose_errors(T[None], frame.T_truth[None])
+        error_m, error_deg = float(metres[0]), float(degrees[0])
+    return {
+        "name": frame.name,
+        "stamp_s": frame.stamp_s,
+        "pose": [*T[:3, 3].tolist(), *quaternion_of(T[:3, :3])],
+        "converged": result.converged,
+        "trustworthy": result.trustworthy,
+        "failed_limits": list(result.failed_limits),
+        "no_map": result.no_map,
+        "state": frame.state,
+        "relocalized": frame.relocalized,
+        "clock_jumped": frame.clock_jumped,
+        "iterations": result.iterations,
+        "transform_probability": result.transform_probability,
+        "nvtl": result.nvtl,
+        "waited": frame.waited,
+        "latency_ms": frame.latency_s * 1e3,
+        "error_m": error_m,
+        "error_deg": error_deg,
+    }

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
-from shmmap_clients.backend_options import add_scoring_options, scoring_settings
 from shmmap_clients.command_line import (
     add_allow_empty,
     add_daemon_options,
@@ -22,15 +21,19 @@ from shmmap_clients.command_line import (
 )
 from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 from shmmap_clients.shared_options import (
+    FAILED_LIMITS,
     add_height_option,
     add_leaf_option,
     add_radius_option,
     add_scan_option,
+    add_scoring_options,
     add_sigma_options,
     add_thin_option,
+    add_trust_options,
     reader_from,
+    scoring_settings,
+    trust_from,
 )
-from shmmap_clients.trust_options import FAILED_LIMITS, add_trust_options, trust_from
 
 if TYPE_CHECKING:
     from shmmap_clients.pose_initializer import InitialPose

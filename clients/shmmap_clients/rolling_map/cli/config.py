@@ -42,8 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, and print or write."""
     import msgspec
 
-    from shmmap_clients.rolling_map.live_section import live_section
-    from shmmap_clients.rolling_map.parameters import read_parameters
+    from shmmap_clients.rolling_map.parameters import live_section, read_parameters
 
     parameters = read_parameters(args.params)
     settings = parameters.live

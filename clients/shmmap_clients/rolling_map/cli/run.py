@@ -7,41 +7,45 @@ import argparse
 import contextlib
 import sys
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
+from shmmap import BadRequest, ConfigError
 from shmmap_clients.command_line import (
     add_allow_empty,
     add_daemon_options,
     add_json_option,
     add_verb,
-    announce_scans,
     complain,
     connect,
+    finite,
+    not_negative,
     nothing_found,
     output_file,
+    positive,
     print_json,
     print_line,
     seconds,
     write_text,
 )
-from shmmap_clients.rolling_map.cli.map_options import (
-    add_filter_options,
-    add_params_option,
-    add_show_option,
-    parameters_from,
-    scan_filter_from,
-    shown_from,
+from shmmap_clients.shared_options import (
+    add_poses_option,
+    add_quiet_option,
+    add_scans_option,
+    reader_from,
 )
-from shmmap_clients.shared_options import add_quiet_option, add_scans_option, reader_from
 
 if TYPE_CHECKING:
-    from shmmap import LiveMap, LiveMapper
+    from shmmap import LiveMap, LiveMapper, ScanFilter
+    from shmmap_clients.rolling_map.drive import DriveStatistics
     from shmmap_clients.rolling_map.parameters import Parameters, Shown
-    from shmmap_clients.rolling_map.statistics import DriveStatistics
+    from shmmap_clients.scan_drive import ScanDrive
 
 __all__ = ["add_parser", "run"]
 
 _NAME: Final = "shmmap-rolling"
+_PARTS: Final = ("occupied", "free", "chunks", "usage")
+_LIMITS: Final = ("min_range", "max_range", "min_z", "max_z")
 _EPILOG: Final = """\
 JSON (fields may be added, none is removed):
   {"map", "scans", "points",
@@ -71,13 +75,13 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--live", required=True, metavar="NAME", help="name of the live map")
     add_scans_option(parser, min_range=False)
+    add_poses_option(parser)
     parser.add_argument(
-        "--poses",
+        "--params",
         metavar="FILE",
-        help="poses of the frame that the points are in, for the scans of a directory, TUM format; a"
-        " publisher's scans bring theirs",
+        help="Rolling-Bonxai's parameter file (YAML, version 1): ranges, z band, and what is shown; what it"
+        " says of the map must be as the map is (see `shmmap-rolling config`)",
     )
-    add_params_option(parser)
     parser.add_argument(
         "--mapper",
         default=_NAME,
@@ -96,7 +100,7 @@ def add_parser(subparsers: Any) -> None:
         help="frame of the poses: another one than the map's is refused (default: as --params says, else the"
         " map's)",
     )
-    add_filter_options(parser)
+    _add_filter_options(parser)
     out = parser.add_argument_group("output")
     out.add_argument(
         "--picture",
@@ -104,7 +108,14 @@ def add_parser(subparsers: Any) -> None:
         metavar="FILE",
         help="write an SVG of the map at the end",
     )
-    add_show_option(out)
+    out.add_argument(
+        "--show",
+        type=_parts,
+        metavar="LIST",
+        help="what the picture shows, of occupied,free,chunks,usage with commas between them; usage: active"
+        " cells and bytes, in the lines of progress, too (default: as --params says, else"
+        " occupied,chunks,usage)",
+    )
     out.add_argument(
         "--wait",
         type=seconds,
@@ -118,52 +129,122 @@ def add_parser(subparsers: Any) -> None:
     add_daemon_options(parser, json=False)
 
 
+def _add_filter_options(parser: argparse.ArgumentParser) -> None:
+    """Add the limits of the points that count."""
+    group = parser.add_argument_group(
+        "points that count", "In the sensor's frame; what is given here counts before what --params says."
+    )
+    group.add_argument(
+        "--min-range", type=not_negative, metavar="M", help="nearer points are left out (default: 0.5)"
+    )
+    group.add_argument(
+        "--max-range",
+        type=positive,
+        metavar="M",
+        help="rays to further points are cut there, and end in nothing (default: 5)",
+    )
+    group.add_argument("--min-z", type=finite, metavar="M", help="lower points are left out (default: -2)")
+    group.add_argument("--max-z", type=finite, metavar="M", help="higher points are left out (default: 2)")
+
+
+def _parts(text: str) -> frozenset[str]:
+    parts = frozenset(text.split(","))
+    if not parts <= set(_PARTS):
+        raise argparse.ArgumentTypeError(f"expected some of {','.join(_PARTS)}, not {text!r}")
+    return parts
+
+
+def _parameters_from(args: argparse.Namespace) -> Parameters | None:
+    """Read the parameter file, if one is given, and say what of it has no effect."""
+    if args.params is None:
+        return None
+    from shmmap_clients.rolling_map.parameters import read_parameters
+
+    parameters = read_parameters(args.params)
+    if parameters.warning:
+        complain(_NAME, f"warning: {args.params}: {parameters.warning}")
+    return parameters
+
+
+def _scan_filter_from(args: argparse.Namespace, parameters: Parameters | None) -> ScanFilter:
+    """Return which points count.
+
+    Raises
+    ------
+    BadRequest
+        The options leave no point.
+    """
+    import msgspec
+
+    from shmmap import ScanFilter
+
+    base = parameters.scan_filter if parameters is not None else ScanFilter()
+    given = {name: getattr(args, name) for name in _LIMITS if getattr(args, name) is not None}
+    try:
+        return ScanFilter(**{**msgspec.structs.asdict(base), **given})
+    except ConfigError as error:
+        said = error.message
+        for name in _LIMITS:
+            said = said.replace(f"{name} = ", f"--{name.replace('_', '-')} ")
+        raise BadRequest(said) from None
+
+
+def _shown_from(args: argparse.Namespace, parameters: Parameters | None) -> Shown:
+    """Return what is shown."""
+    from shmmap_clients.rolling_map.parameters import Shown
+
+    if args.show is not None:
+        return Shown(*(part in args.show for part in _PARTS))
+    return parameters.shown if parameters is not None else Shown(usage=True)
+
+
 def run(args: argparse.Namespace) -> int:
     """Map the scans to their end."""
-    from shmmap import BadRequest
-    from shmmap_clients.rolling_map.drive import map_drive
-    from shmmap_clients.rolling_map.statistics import DriveStatistics
-    from shmmap_clients.scans.scan_sequence import ScanSequence
-    from shmmap_clients.scans.scan_source import open_scans
+    from shmmap_clients.rolling_map.drive import DriveStatistics, map_scan
+    from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.streams import is_endpoint
 
-    parameters = parameters_from(args)
-    shown = shown_from(args, parameters)
-    scan_filter = scan_filter_from(args, parameters)
+    parameters = _parameters_from(args)
+    shown = _shown_from(args, parameters)
+    scan_filter = _scan_filter_from(args, parameters)
     if args.resume and is_endpoint(args.scans):
         raise BadRequest(
             "--resume is for a directory of scans",
             hint="leave it out: a publisher's scans count as they come",
         )
-    statistics = DriveStatistics()
     with contextlib.ExitStack() as stack:
         # the map's own limits leave out points and count them
-        scans = open_scans(args.scans, args.poses, stack, reader_from(args, _NAME, min_range=None))
+        drive = ScanDrive(args, _NAME, args.poses, stack, reader=reader_from(args, _NAME, min_range=None))
         client = stack.enter_context(connect(args, _NAME))
         live = client.live(args.live, frame_id=_frame(args, parameters))
         if parameters is not None:
             parameters.check_map(live)
         mapper = stack.enter_context(live.mapper(args.mapper, scan_filter, resume=args.resume))
-        if isinstance(scans, ScanSequence) and args.resume:
-            if mapper.applied > len(scans):
-                raise BadRequest(
-                    f"{args.scans} has {len(scans)} scans, but {mapper.applied} of mapper {args.mapper} are"
-                    " in the map",
-                    hint="--resume is for the same directory as in the run before; leave it out for another",
-                )
-            scans.leave_out(mapper.applied)
-            print_line(f"{mapper.applied} scans are in the map, {len(scans)} are left", file=sys.stderr)
-        announce_scans(args)
-        for mapped in map_drive(scans, mapper):
-            statistics.add(mapped)
-            if not args.quiet:
-                usage = f"; {_usage_now(live)}" if shown.usage else ""
-                print_line(statistics.line(mapped) + usage, file=sys.stderr)
-        code = _settled(args, mapper, statistics)
+        if args.resume:
+            _leave_out_mapped(args, drive, mapper)
+        statistics = DriveStatistics(live if shown.usage else None)
+        drive.run(lambda scan: map_scan(scan, mapper), statistics)
+        code = _settled(args, drive, mapper, statistics)
         if args.picture:
             _draw(args, live, shown, statistics)
         _report(args, live, mapper, statistics)
     return code
+
+
+def _leave_out_mapped(args: argparse.Namespace, drive: ScanDrive, mapper: LiveMapper) -> None:
+    """Begin after the scans of the directory that are in the map."""
+    from shmmap_clients.scans.scan_sequence import ScanSequence
+
+    scans = drive.scans
+    assert isinstance(scans, ScanSequence)  # noqa: S101  # --resume is for a directory
+    if mapper.applied > len(scans):
+        raise BadRequest(
+            f"{args.scans} has {len(scans)} scans, but {mapper.applied} of mapper {args.mapper} are"
+            " in the map",
+            hint="--resume is for the same directory as in the run before; leave it out for another",
+        )
+    scans.leave_out(mapper.applied)
+    print_line(f"{mapper.applied} scans are in the map, {len(scans)} are left", file=sys.stderr)
 
 
 def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
@@ -175,29 +256,20 @@ def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
     return ""
 
 
-def _usage_now(live: LiveMap) -> str:
-    """What the map takes; a daemon that is away keeps no scan from being read."""
-    from shmmap import DaemonUnreachable, LiveInterrupted
-    from shmmap_clients.rolling_map.statistics import usage_text
-
-    try:
-        return usage_text(live.status())
-    except (DaemonUnreachable, LiveInterrupted):
-        return "the daemon does not answer"
-
-
-def _settled(args: argparse.Namespace, mapper: LiveMapper, statistics: DriveStatistics) -> int:
+def _settled(
+    args: argparse.Namespace, drive: ScanDrive, mapper: LiveMapper, statistics: DriveStatistics
+) -> int:
     """Wait until everything is in memory and on the disk; returns the exit code."""
     from shmmap import NoAnswer
 
     last = statistics.last
     if last is None and args.resume and mapper.applied:
-        return 0  # an earlier run had come to the end
+        return 0  # the run before had come to the end
     if last is None:
-        return nothing_found(args, f"no scan came from {args.scans}", name=_NAME)
+        return drive.no_scans()
     if args.wait > 0:
         end_s = time.monotonic() + args.wait
-        with contextlib.suppress(NoAnswer):  # what is missing is told below
+        with contextlib.suppress(NoAnswer):  # what is missing is said below
             mapper.wait_applied(args.wait)
             mapper.wait_durable(max(0.1, end_s - time.monotonic()))
         if mapper.durable < last:
@@ -213,8 +285,8 @@ def _settled(args: argparse.Namespace, mapper: LiveMapper, statistics: DriveStat
 def _draw(args: argparse.Namespace, live: LiveMap, shown: Shown, statistics: DriveStatistics) -> None:
     import numpy as np
 
+    from shmmap_clients.rolling_map.drive import usage_text
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
-    from shmmap_clients.rolling_map.statistics import usage_text
     from shmmap_clients.rolling_map.voxel_parts import all_voxels
 
     nothing = np.empty((0, 3))
@@ -231,9 +303,7 @@ def _draw(args: argparse.Namespace, live: LiveMap, shown: Shown, statistics: Dri
 
 
 def _report(args: argparse.Namespace, live: LiveMap, mapper: LiveMapper, statistics: DriveStatistics) -> None:
-    from collections import Counter
-
-    from shmmap_clients.rolling_map.statistics import states_text, usage_text
+    from shmmap_clients.rolling_map.drive import states_text, usage_text
 
     usage, chunks = live.status(), live.chunks(saved=True)
     summary = statistics.summary(applied=mapper.applied, durable=mapper.durable)

@@ -6,12 +6,11 @@ from __future__ import annotations
 import pickle
 
 import numpy as np
-from shmmap_clients.compare_map_filter.drive import ComparedScan
+from shmmap_clients.compare_map_filter.drive import ComparedScan, DriveStatistics
 from shmmap_clients.compare_map_filter.filter import Comparison
 from shmmap_clients.compare_map_filter.picture import TopView
-from shmmap_clients.compare_map_filter.statistics import DriveStatistics
-from shmmap_clients.decimation import KEPT
 from shmmap_clients.scans.scan_sequence import Scan
+from shmmap_clients.spread import KEPT
 
 
 def compared(number: int) -> ComparedScan:

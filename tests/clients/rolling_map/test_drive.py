@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import numpy as np
-from shmmap_clients.decimation import KEPT
-from shmmap_clients.rolling_map.drive import MappedScan
-from shmmap_clients.rolling_map.statistics import DriveStatistics
+from shmmap_clients.rolling_map.drive import DriveStatistics, MappedScan
 from shmmap_clients.scans.scan_sequence import Scan
+from shmmap_clients.spread import KEPT
 
 from shmmap import Counts
 

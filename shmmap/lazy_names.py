@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Public names of a package that are loaded when they are first used (PEP 562).
+
+So importing a package costs next to nothing, and a command line starts, and can say which package is missing,
+where not all are installed.  The package imports its public names under ``if TYPE_CHECKING:``, for type
+checkers; the same imports say where a name comes from when it is first used, so that there is no second list.
+"""
+
+from __future__ import annotations
+
+import _ast  # `ast` itself takes a millisecond to load
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["lazy_names"]
+
+
+def lazy_names(package: str) -> Callable[[str], Any]:
+    """Return a package's ``__getattr__``, which loads what the package imports under ``if TYPE_CHECKING:``.
+
+    Parameters
+    ----------
+    package
+        Its ``__name__``.
+    """
+    modules: dict[str, str] = {}
+
+    def load(name: str) -> Any:
+        if not modules:
+            modules.update(_imported_for_types(package))
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(modules[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return load
+
+
+def _imported_for_types(package: str) -> dict[str, str]:
+    """Return the module of each name that a package imports under ``if TYPE_CHECKING:``.
+
+    Raises
+    ------
+    ImportError
+        The package is installed without its source.
+    """
+    spec: Any = sys.modules[package].__spec__
+    source = spec.loader.get_source(package)
+    if source is None:
+        raise ImportError(f"{package} is installed without its source", name=package)
+    tree: Any = compile(source, spec.origin, "exec", _ast.PyCF_ONLY_AST)
+    return {
+        alias.name: statement.module
+        for block in tree.body
+        if isinstance(block, _ast.If) and getattr(block.test, "id", "") == "TYPE_CHECKING"
+        for statement in block.body
+        if isinstance(statement, _ast.ImportFrom) and statement.module is not None
+        for alias in statement.names
+    }
