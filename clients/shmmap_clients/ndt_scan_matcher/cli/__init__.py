@@ -1,6 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program ``shmmap-ndt``."""
+"""The program ``shmmap-ndt``: ``align`` files, ``follow`` a drive, and what concerns the machine."""
 
-from shmmap_clients.ndt_scan_matcher.cli.entry import main
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from shmmap_clients.command_line import run_program
+from shmmap_clients.ndt_scan_matcher.cli import align, follow, machine
 
 __all__ = ["main"]
+
+_VERBS: Final = (align, follow, machine)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    return run_program(
+        "shmmap-ndt",
+        "Find where LiDAR scans were taken in a point-cloud map, by the normal distributions transform.",
+        _VERBS,
+        argv,
+    )

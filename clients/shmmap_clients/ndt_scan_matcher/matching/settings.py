@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
-from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule
 from shmmap_clients.ndt_scan_matcher.matching.variants import Variant

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting for a device, but not for ever: commands are polled, so that a device that hangs holds nobody."""
+"""Waiting for a device, with a limit: commands are polled, so that a device that hangs blocks no program."""
 
 from __future__ import annotations
 
@@ -74,5 +74,5 @@ def _ended(event: Any) -> bool:
 
 
 def _never_free(event: Any) -> None:
-    """Keep an event for ever: who frees one of a hung device waits for it, even when the process ends."""
+    """Keep an event: to free one of a hung device is to wait for it, even when the process ends."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))
