@@ -282,7 +282,7 @@ def test_a_map_is_written_in_advance_and_the_old_one_stays(
     how = Scoring("radius", "autoware")
     there.prepare(first, how)
     before = worth(there, NEAR, how)
-    for last in (second, first, second):
+    for last in (second, VoxelMap(first.cells), VoxelMap(second.cells)):
         written, writes = there.uploads.written_bytes, there.uploads.writes
         there.prepare(last, how)
         needed = sum(cell.map_bytes for cell in last.cells.values())
@@ -405,7 +405,7 @@ def test_a_write_that_fails_leaves_nothing_behind(
     used = there.maps.used_bytes
     voxel_map = map_of(points, 2.0)
 
-    def fails(parts: object) -> None:
+    def fails(*arguments: object) -> None:
         raise DeviceError("it fails")
 
     with monkeypatch.context() as patch:

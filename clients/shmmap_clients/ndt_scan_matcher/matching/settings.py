@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Settings`: how to align, and who computes."""
+"""`Settings`: how to align, and what computes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Settings:
     steady
         Steps that never swing, see `StepRule`; default: not in ``"single"``, which equals the originals.
     backend
-        Who computes: ``"numba"``, ``"numpy"`` or ``"opencl"``.
+        What computes: ``"numba"``, ``"numpy"`` or ``"opencl"``.
     device
         For backends that compute on a device: which one, and how.
     fallback
