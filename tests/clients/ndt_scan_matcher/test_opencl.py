@@ -27,6 +27,7 @@ from shmmap_clients.ndt_scan_matcher import (
 from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend, build_kernel
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 from tests.clients.ndt_scan_matcher.references import clouds, reference_rows, settings_of, target
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street, worth
@@ -95,7 +96,7 @@ def same_bits(a: Evaluation, b: Evaluation) -> bool:
     ("memory", "neighbors"), [("copy", "direct1"), ("copy", "direct7"), ("copy", "radius"), ("svm", "radius")]
 )
 def test_sums_and_counts_are_those_of_the_compiled_backend(
-    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, memory: str, neighbors: str
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, memory: str, neighbors: Neighbors
 ) -> None:
     # cells of 7 m with voxels of 2 m: most borders cut voxels, and both halves count
     voxel_map = map_of(points, 2.0, edge=7.0)

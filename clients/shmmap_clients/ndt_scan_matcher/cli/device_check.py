@@ -377,7 +377,8 @@ def _voxels(points: NDArray[np.float64], leaf: float) -> VoxelMap:
         mean = np.stack([np.bincount(row, axis, voxels) for axis in near.T], axis=1) / count[:, None]
         off = near - mean[row]
         products = [off[:, a] * off[:, b] for a, b in zip(*np.triu_indices(3), strict=True)]
-        scatter = np.stack([np.bincount(row, product, voxels) for product in products], axis=1)
+        sums = [np.bincount(row, product, voxels) for product in products]
+        scatter = np.asarray(np.stack(sums, axis=1), np.float64)
         used = count >= _LEAST_POINTS
         lattice = np.full(index.max(axis=0) - first + 1, -1, np.int32)
         lattice[tuple((index[used] - first).T)] = np.arange(used.sum())

@@ -242,8 +242,8 @@ class MapBuffers:
         table[:, 9] = table[:, 11] * table[:, 12]
         tables, lead, squares = _tables(voxel_map, table)
         arrays += tables
-        lengths = [-(-array.nbytes // _ALIGNMENT) * _ALIGNMENT for array in arrays]
-        ends = half.used_bytes + np.cumsum(lengths)
+        lengths = np.array([-(-array.nbytes // _ALIGNMENT) * _ALIGNMENT for array in arrays], np.int64)
+        ends: NDArray[np.int64] = half.used_bytes + np.cumsum(lengths)
         if ends[-1] > self._map_bytes:
             return False
         offsets = ends - lengths
