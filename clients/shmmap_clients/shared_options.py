@@ -272,7 +272,7 @@ def add_device_options(parser: Parser) -> None:
         "--memory",
         choices=("auto", "svm", "copy"),
         default="auto",
-        help="where the map lies for a device: svm reads shared memory in place, copy copies each cell once;"
+        help="where the map lies for a device: svm reads shared memory in place, copy copies each map;"
         " auto: in place where the device says that it can (default: auto)",
     )
 

@@ -6,9 +6,10 @@
 A generated map of 60 000 voxels of 2 m in 400 cells of 20 m, on the first device; a step of a vehicle
 brings 6 cells and takes 16, as Autoware's window did when it was measured.  Printed are the least of all
 repeats, the median, and the median of CPU time.  Limits, for PoCL on this class of machine: the whole map
-3 ms, a step 2 ms and 200 kB, in place 64 kB of private memory more, with the first evaluation; taking a
-prepared map 0.1 ms; the first evaluation of a fresh process 0.3 s once its program is in the driver's cache,
-and 40 MB of its own memory (64 MB of the driver's files are shared by all processes).
+3 ms, and so a step, which writes all of the next map beside the one in use; in place 64 kB of private memory
+more, with the first evaluation; taking a prepared map 0.1 ms; the first evaluation of a fresh process 0.3 s
+once its program is in the driver's cache, and 40 MB of its own memory (64 MB of the driver's files are shared
+by all processes).
 """
 
 from __future__ import annotations
@@ -22,16 +23,15 @@ import time
 from collections.abc import Callable
 from functools import partial
 from statistics import median
-from typing import Any
 
 import numpy as np
-from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, VoxelCell, VoxelMap, voxel_cell
+from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, Scoring, VoxelCell, VoxelMap, voxel_cell
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import choose_device
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
 
 from tests.support.process_costs import anonymous_bytes
 
-HOW: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+HOW = Scoring("radius", "autoware")
 _ACROSS = 20  # cells
 _NEW, _GONE = 6, 16  # cells of a step
 _EDGE_M = 20.0
@@ -45,10 +45,10 @@ from tests.support.process_costs import anonymous_bytes
 before = anonymous_bytes(os.getpid())
 begin = time.perf_counter()
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
-from shmmap_clients.ndt_scan_matcher import Limits, VoxelMap
+from shmmap_clients.ndt_scan_matcher import Limits, Scoring
 backend = backend_named("opencl", Limits())
 backend.set_source(np.zeros((1500, 3)))
-backend.evaluate(np.zeros(6), neighbors="radius", covariance="autoware")
+backend.evaluate(np.zeros((1, 6)), Scoring("radius", "autoware"))
 print(time.perf_counter() - begin, anonymous_bytes(os.getpid()) - before)
 """
 
@@ -70,9 +70,9 @@ def ready(memory: str, some: VoxelMap) -> OpenclBackend:
     """Return a backend that has evaluated: its program is built, the driver's threads have started."""
     backend = OpenclBackend(Limits(), options=DeviceOptions(memory=memory))  # type: ignore[arg-type]
     backend.set_source(np.random.default_rng(2).uniform(-40, 40, (1500, 3)))
-    backend.prepare(some, **HOW)
+    backend.prepare(some, HOW)
     backend.set_map(some)
-    backend.evaluate(_POSE, **HOW)
+    backend.evaluate(_POSE[None], HOW)
     return backend
 
 
@@ -102,9 +102,9 @@ def measure(memory: str, made: dict[str, VoxelCell], repeats: int) -> None:
     backend = ready(memory, some)
     gc.collect()
     private, written = anonymous_bytes(os.getpid()), backend.uploads.written_bytes
-    backend.prepare(here, **HOW)
+    backend.prepare(here, HOW)
     backend.set_map(here)
-    backend.evaluate(_POSE, **HOW)
+    backend.evaluate(_POSE[None], HOW)
     private = anonymous_bytes(os.getpid()) - private
     written = backend.uploads.written_bytes - written
     backend.close()
@@ -112,7 +112,7 @@ def measure(memory: str, made: dict[str, VoxelCell], repeats: int) -> None:
     for _ in range(repeats):
         backend = ready(memory, some)
         last = VoxelMap(here.cells)
-        fresh.take(partial(backend.prepare, last, **HOW))
+        fresh.take(partial(backend.prepare, last, HOW))
         backend.close()
     backend = ready(memory, some)
     sizes: list[int] = []
@@ -120,20 +120,20 @@ def measure(memory: str, made: dict[str, VoxelCell], repeats: int) -> None:
         if number % 2 == 0:
             # everything is given up, then the whole map comes at once
             nothing = VoxelMap({})
-            backend.prepare(nothing, **HOW)
+            backend.prepare(nothing, HOW)
             backend.set_map(nothing)
-            backend.evaluate(_POSE, **HOW)
-            backend.prepare(VoxelMap({}), **HOW)
+            backend.evaluate(_POSE[None], HOW)
+            backend.prepare(VoxelMap({}), HOW)
             last = VoxelMap(here.cells)
-            whole.take(partial(backend.prepare, last, **HOW))
+            whole.take(partial(backend.prepare, last, HOW))
         else:
             # as the updater makes the next map: beside the last one
             before = backend.uploads.written_bytes
             last = VoxelMap(ahead.cells, previous=last)
-            step.take(partial(backend.prepare, last, **HOW))
+            step.take(partial(backend.prepare, last, HOW))
             sizes.append(backend.uploads.written_bytes - before)
         taking.take(partial(backend.set_map, last))
-        backend.evaluate(_POSE, **HOW)
+        backend.evaluate(_POSE[None], HOW)
     print(
         f"{memory}: {here.voxels} voxels in {len(here.cells)} cells; {written / 1e6:.2f} MB written, private"
         f" memory grows by {private / 1e3:.0f} kB\n"

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings
-from shmmap_clients.ndt_scan_matcher.cli.warmup import warmup_alignment
+from shmmap_clients.ndt_scan_matcher.cli.machine import warmup_alignment
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
 from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import Odometry

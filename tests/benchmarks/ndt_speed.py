@@ -57,7 +57,7 @@ FIRST = """
 import time
 began = time.perf_counter()
 import sys, numpy as np
-from shmmap_clients.ndt_scan_matcher.cli.warmup import warmup_alignment
+from shmmap_clients.ndt_scan_matcher.cli.machine import warmup_alignment
 warmup_alignment()
 print(time.perf_counter() - began)
 """

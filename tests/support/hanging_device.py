@@ -21,7 +21,6 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
 )
 from shmmap_clients.ndt_scan_matcher.backends import opencl_backend
-from shmmap_clients.ndt_scan_matcher.backends.opencl import program
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street
@@ -33,9 +32,9 @@ _SPIN = "    volatile int spin = points;\n    while (spin > 0) spin = spin | 1;\
 
 def hang() -> None:
     """Let every program that is built from now on never end."""
-    source = program.kernel_source()
+    source = opencl_backend.kernel_source()
     assert source.count(_BEGIN) == 1
-    program.kernel_source = lambda: source.replace(_BEGIN, _SPIN + _BEGIN)
+    opencl_backend.kernel_source = lambda: source.replace(_BEGIN, _SPIN + _BEGIN)
 
 
 def align(deadline_s: float, fallback: str | None) -> None:

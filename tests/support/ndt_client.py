@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.cli.warmup import warmup_alignment
+from shmmap_clients.ndt_scan_matcher.cli.machine import warmup_alignment
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.scans.scan_file import read_scan

@@ -19,17 +19,19 @@ from typing import TYPE_CHECKING
 from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
-    from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+    from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceOptions
     from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
     from shmmap_clients.ndt_scan_matcher.backends.registry import BACKENDS
     from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
     from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
-    from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
-    from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
+    from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
+        Evaluation,
+        Scoring,
+        matrix_from_pose,
+        pose_from_matrix,
+    )
     from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
-    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
-    from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Regularization
     from shmmap_clients.ndt_scan_matcher.matching.result import Result
     from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
     from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
@@ -45,6 +47,7 @@ __all__ = [
     "NdtMatcher",
     "Regularization",
     "Result",
+    "Scoring",
     "Settings",
     "TrustLimits",
     "VoxelCell",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import Settings, VoxelMap, matrix_from_pose, voxel_cell
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 from shmmap import read_cloud
 

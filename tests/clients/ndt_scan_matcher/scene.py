@@ -5,7 +5,15 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from shmmap_clients.ndt_scan_matcher import VoxelCell, VoxelMap, matrix_from_pose, voxel_cell
+from shmmap_clients.ndt_scan_matcher import (
+    Backend,
+    Evaluation,
+    Scoring,
+    VoxelCell,
+    VoxelMap,
+    matrix_from_pose,
+    voxel_cell,
+)
 
 Points = NDArray[np.float64]
 
@@ -50,3 +58,9 @@ def scan_from(points: Points, pose: NDArray[np.float64], count: int, seed: int =
     chosen = near[rng.choice(len(near), count, replace=False)]
     T = np.linalg.inv(matrix_from_pose(pose))
     return np.asarray(chosen @ T[:3, :3].T + T[:3, 3], np.float64)
+
+
+def worth(backend: Backend, pose: NDArray[np.float64], scoring: Scoring) -> Evaluation:
+    """The evaluation of one pose."""
+    (at,) = backend.evaluate(pose[None], scoring)
+    return at

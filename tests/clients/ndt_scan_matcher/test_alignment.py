@@ -18,8 +18,8 @@ from shmmap_clients.ndt_scan_matcher import (
     pose_from_matrix,
 )
 from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule, ascend
-from shmmap_clients.ndt_scan_matcher.matching.result import covariance_of, oscillations
 from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_time_bound
+from shmmap_clients.ndt_scan_matcher.matching.trust import covariance_of, oscillations
 from shmmap_clients.ndt_scan_matcher.matching.variants import variant_named
 
 import shmmap

@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.command_line import complain
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
+from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, frame_document

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
     Evaluation,
     Limits,
+    Scoring,
     VoxelMap,
     matrix_from_pose,
     pose_from_matrix,
@@ -18,6 +19,7 @@ from shmmap_clients.ndt_scan_matcher import (
 )
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 from tests.clients.ndt_scan_matcher.brute_force import rotation, score
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
@@ -42,12 +44,13 @@ def evaluated(
     *,
     limits: Limits | None = None,
     threads: int = 1,
-    **settings: Any,
+    neighbors: Neighbors = "radius",
+    covariance: Covariance = "autoware",
 ) -> Evaluation:
     computer = backend_named(backend, limits or Limits(source_points=4096), threads)
     computer.set_map(voxel_map)
     computer.set_source(scan)
-    result = computer.evaluate(pose, **settings)
+    (result,) = computer.evaluate(pose[None], Scoring(neighbors, covariance))
     computer.close()
     return result
 
@@ -110,7 +113,7 @@ def test_derivatives_are_those_of_the_score(points: NDArray[np.float64], backend
 
     def at(pose: NDArray[np.float64]) -> Evaluation:
         # own lattice place only, and steps far smaller than the distance to its faces
-        return computer.evaluate(pose, neighbors="direct1", covariance="autoware")
+        return computer.evaluate(pose[None], Scoring("direct1", "autoware"))[0]
 
     here, h = at(NEAR), 1e-7
     for axis in range(6):
@@ -157,9 +160,9 @@ def test_points_beyond_the_cap_are_left_out_evenly(points: NDArray[np.float64]) 
         computer = backend_named(backend, Limits(source_points=300))
         computer.set_map(map_of(points, 2.0))
         assert computer.set_source(scan) == 700
-        some = computer.evaluate(NEAR, neighbors="radius", covariance="autoware")
+        (some,) = computer.evaluate(NEAR[None], Scoring("radius", "autoware"))
         assert computer.set_source(scan[np.arange(300) * 1000 // 300]) == 0
-        same = computer.evaluate(NEAR, neighbors="radius", covariance="autoware")
+        (same,) = computer.evaluate(NEAR[None], Scoring("radius", "autoware"))
         assert some.score == same.score
 
 

@@ -17,28 +17,30 @@ from shmmap_clients.ndt_scan_matcher import (
     Cut,
     Limits,
     NdtMatcher,
+    Scoring,
     Settings,
     TrustLimits,
     VoxelMap,
     matrix_from_pose,
 )
+from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import derive
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.matching import matcher as matcher_module
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives
+from shmmap_clients.ndt_scan_matcher.matching import newton
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import derivatives_of_poses, matrices_from_poses
 from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_time_bound
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street, worth
 from tests.support.opencl_device import need_device
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
-HOW: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+HOW = Scoring("radius", "autoware")
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +109,8 @@ def test_no_evaluation_begins_after_the_deadline(
         matcher.set_map(matcher.prepare(voxel_map))
         matcher.align(scan, GUESS)
         ticks = itertools.count(start=int(time.monotonic()) + 1000)
-        monkeypatch.setattr(matcher_module, "time", Clock)
+        for module in (matcher_module, newton):
+            monkeypatch.setattr(module, "time", Clock)
         result = matcher.align(scan, GUESS)
         three = matcher.align_many(scan, [GUESS, GUESS, np.eye(4)])
     assert result.cut.by == ("deadline",)
@@ -128,12 +131,12 @@ def test_more_poses_than_the_limit_are_refused_at_once_and_split_by_the_matcher(
     one.set_map(map_of(points, 2.0))
     one.set_source(scan)
     with pytest.raises(shmmap.BadRequest, match="7 poses at once, the limit on poses is 3"):
-        one.evaluate_many(poses, **HOW)
+        one.evaluate(poses, HOW)
     with NdtMatcher(Settings(backend=backend), limits=limits) as matcher:
         matcher.set_map(map_of(points, 2.0))
         together = matcher.evaluate(scan, poses)
     for pose, found in zip(poses, together, strict=True):
-        alone = one.evaluate(pose, **HOW)
+        alone = worth(one, pose, HOW)
         assert found.score == alone.score
         assert (found.gradient == alone.gradient).all()
         assert (found.hessian == alone.hessian).all()
@@ -212,12 +215,16 @@ def test_the_program_says_what_limits_left_out(
     assert "the deadline ended it" in capsys.readouterr().out
 
 
-def test_many_poses_have_the_same_matrices_and_derivatives_as_one() -> None:
+def test_many_poses_have_the_same_matrices_and_derivatives_as_one_and_as_the_compiled_backend() -> None:
     poses = np.random.default_rng(2).uniform(-3, 3, (50, 6))
     poses[::7, 3:] = 0.0
     poses[1::7, 4] = 5e-5
+    compiled_T, compiled_M = np.zeros((50, 4, 4)), np.zeros((50, 9, 3, 3))
     for sign in (-1.0, 1.0):
-        derivatives = derivatives_of_poses(poses, sign)
-        for pose, T, M in zip(poses, matrices_from_poses(poses), derivatives, strict=True):
+        matrices, derivatives = matrices_from_poses(poses), derivatives_of_poses(poses, sign)
+        for pose, T, M in zip(poses, matrices, derivatives, strict=True):
             np.testing.assert_array_equal(T, matrix_from_pose(pose))
-            np.testing.assert_array_equal(M, euler_derivatives(pose, sign))
+            np.testing.assert_array_equal(M, derivatives_of_poses(pose[None], sign)[0])
+        derive(poses, sign, compiled_T, compiled_M)
+        np.testing.assert_allclose(compiled_T, matrices, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(compiled_M, derivatives, rtol=0, atol=1e-15)

@@ -18,18 +18,19 @@ from shmmap_clients.ndt_scan_matcher import (
     Limits,
     NdtMatcher,
     Result,
+    Scoring,
     Settings,
     VoxelMap,
     matrix_from_pose,
     voxel_cell,
 )
 from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
-from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
-from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
+from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend, build_kernel
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 from tests.clients.ndt_scan_matcher.references import clouds, reference_rows, settings_of, target
-from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street, worth
 from tests.support.opencl_device import as_if, need_device
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
@@ -95,7 +96,7 @@ def same_bits(a: Evaluation, b: Evaluation) -> bool:
     ("memory", "neighbors"), [("copy", "direct1"), ("copy", "direct7"), ("copy", "radius"), ("svm", "radius")]
 )
 def test_sums_and_counts_are_those_of_the_compiled_backend(
-    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, memory: str, neighbors: str
+    points: NDArray[np.float64], scan: NDArray[np.float64], kind: str, memory: str, neighbors: Neighbors
 ) -> None:
     # cells of 7 m with voxels of 2 m: most borders cut voxels, and both halves count
     voxel_map = map_of(points, 2.0, edge=7.0)
@@ -105,8 +106,8 @@ def test_sums_and_counts_are_those_of_the_compiled_backend(
         there = ready("opencl", voxel_map, scan, limits=limits, options=replace(COPY, memory=memory))  # type: ignore[arg-type]
         for covariance in ("autoware", "pclomp", "pcl"):
             for sign in (-1.0, 1.0):
-                how: dict[str, Any] = {"neighbors": neighbors, "covariance": covariance, "pitch_sign": sign}
-                wanted, found = here.evaluate(NEAR, **how), there.evaluate(NEAR, **how)
+                how = Scoring(neighbors, covariance, sign)
+                wanted, found = worth(here, NEAR, how), worth(there, NEAR, how)
                 assert counts(found) == counts(wanted), (most, covariance)
                 assert off(found, wanted) <= 1e-12, (most, covariance)
                 if most == 1:
@@ -124,8 +125,8 @@ def test_floats_are_as_good_far_from_the_origin(
     there = ready("opencl", voxel_map, scan, options=FLOAT)
     for neighbors in ("direct1", "direct7", "radius"):
         for covariance in ("autoware", "pcl"):
-            how: dict[str, Any] = {"neighbors": neighbors, "covariance": covariance}
-            assert off(there.evaluate(pose, **how), here.evaluate(pose, **how)) < 1e-4
+            how = Scoring(neighbors, covariance)
+            assert off(worth(there, pose, how), worth(here, pose, how)) < 1e-4
 
 
 @pytest.mark.parametrize("options", [COPY, SVM, FLOAT])
@@ -136,21 +137,15 @@ def test_repeats_and_poses_in_a_batch_have_the_same_bits(
     there = ready("opencl", map_of(points, 2.0), scan, options=options)
     assert isinstance(there, OpenclBackend)
     there._most_rows = 40
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    how = Scoring("radius", "autoware")
     poses = NEAR + np.random.default_rng(4).normal(0.0, 0.3, (17, 6)) * [1, 1, 0.2, 0.05, 0.05, 0.3]
-    batch = there.evaluate_many(poses, **how)
+    batch = there.evaluate(poses, how)
     assert len(batch) == len(poses)
     for pose, among_others in zip(poses, batch, strict=True):
-        assert same_bits(there.evaluate(pose, **how), among_others)
-    first = there.evaluate(NEAR, **how)
-    assert all(same_bits(there.evaluate(NEAR, **how), first) for _ in range(20))
-    assert there.evaluate_many(poses[:0], **how) == []
-
-
-def test_a_pose_may_come_with_its_matrix(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
-    there = ready("opencl", map_of(points, 2.0), scan)
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
-    assert same_bits(there.evaluate(NEAR, T=matrix_from_pose(NEAR), **how), there.evaluate(NEAR, **how))
+        assert same_bits(worth(there, pose, how), among_others)
+    first = worth(there, NEAR, how)
+    assert all(same_bits(worth(there, NEAR, how), first) for _ in range(20))
+    assert there.evaluate(poses[:0], how) == []
 
 
 @pytest.mark.parametrize("options", [COPY, SVM, FLOAT])
@@ -160,16 +155,16 @@ def test_points_that_are_nowhere_find_nothing(
     nowhere = np.array(
         [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 1e300], [1e9, 0, 0], [0, -5e8, 0], [0, 0, 1e12]]
     )
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    how = Scoring("radius", "autoware")
     voxel_map = map_of(points, 2.0)
-    alone = ready("opencl", voxel_map, scan[:100], options=options).evaluate(NEAR, **how)
+    alone = worth(ready("opencl", voxel_map, scan[:100], options=options), NEAR, how)
     with_them = ready("opencl", voxel_map, np.concatenate([scan[:100], nowhere]), options=options)
-    assert same_bits(with_them.evaluate(NEAR, **how), alone)
+    assert same_bits(worth(with_them, NEAR, how), alone)
     for empty in (
         ready("opencl", VoxelMap({}), scan, options=options),
         ready("opencl", voxel_map, scan[:0], options=options),
     ):
-        none = empty.evaluate(NEAR, **how)
+        none = worth(empty, NEAR, how)
         assert (none.score, none.found, none.nvtl) == (0.0, 0, 0.0)
 
 
@@ -276,7 +271,7 @@ def test_many_guesses_are_aligned_as_one_by_one(
                 assert matcher.align_many(scan, []) == []
 
 
-def test_cells_are_written_once_and_the_old_map_stays(
+def test_a_map_is_written_in_advance_and_the_old_one_stays(
     points: NDArray[np.float64], scan: NDArray[np.float64], kind: str
 ) -> None:
     cells = cells_of(points, 2.0, edge=10.0)
@@ -285,26 +280,39 @@ def test_cells_are_written_once_and_the_old_map_stays(
     second = VoxelMap({name: cells[name] for name in names[2:]}, previous=first)
     there = ready("opencl", first, scan, options=COPY)
     assert isinstance(there, OpenclBackend)
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
-    there.prepare(first, **how)
-    before = there.evaluate(NEAR, **how)
-    statistics = there.pool.statistics
-    written = statistics.written_bytes
-    assert written >= sum(cell.map_bytes for cell in first.cells.values())
-    there.prepare(second, **how)
-    new = [cells[name] for name in names[-4:]]
-    tables = second.private_bytes + 104 * len(second.cells) + 64 * (len(new) + 4)
-    assert 0 < statistics.written_bytes - written <= sum(cell.map_bytes for cell in new) + tables
-    assert same_bits(there.evaluate(NEAR, **how), before), "the map in use is untouched"
-    writes = statistics.writes
-    there.set_map(second)
-    after = there.evaluate(NEAR, **how)
-    assert statistics.writes == writes, "all was done in advance"
-    assert off(after, ready("numba", second, scan).evaluate(NEAR, **how)) <= 1e-12
-    # one step back: the map that was given up is written anew, and nothing has been left behind
-    there.prepare(first, **how)
-    there.set_map(first)
-    assert same_bits(there.evaluate(NEAR, **how), before)
+    how = Scoring("radius", "autoware")
+    there.prepare(first, how)
+    before = worth(there, NEAR, how)
+    for last in (second, VoxelMap(first.cells), VoxelMap(second.cells)):
+        written, writes = there.uploads.written_bytes, there.uploads.writes
+        there.prepare(last, how)
+        needed = sum(cell.map_bytes for cell in last.cells.values())
+        tables = last.private_bytes + 104 * len(last.cells) + 64 * (3 * len(last.cells) + 4)
+        assert needed <= there.uploads.written_bytes - written <= needed + tables
+        assert there.uploads.writes == writes + 1
+        assert same_bits(worth(there, NEAR, how), before), "the map in use is untouched"
+        there.set_map(last)
+        before = worth(there, NEAR, how)
+        assert there.uploads.writes == writes + 1, "all was done in advance"
+        assert off(before, worth(ready("numba", last, scan), NEAR, how)) <= 1e-12
+    assert there.uploads.laid_out_anew == 0
+
+
+def test_a_map_that_another_was_prepared_in_place_of_is_written_again(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
+    how = Scoring("radius", "autoware")
+    maps = [map_of(points, 2.0, edge=edge) for edge in (20.0, 10.0, 5.0)]
+    there = ready("opencl", maps[0], scan, options=COPY)
+    wanted = [worth(ready("numba", one, scan), NEAR, how) for one in maps]
+    worth(there, NEAR, how)
+    for one in maps[1:]:
+        there.prepare(one, how)
+    writes = there.uploads.writes
+    for one, at in zip(maps[1:], wanted[1:], strict=True):
+        there.set_map(one)
+        assert off(worth(there, NEAR, how), at) <= 1e-12
+    assert there.uploads.writes == writes + 1, "only the one that had lost its place"
 
 
 @pytest.mark.parametrize("options", [COPY, FLOAT])
@@ -314,102 +322,102 @@ def test_another_kind_of_covariance_is_written_beside_the_first(
     voxel_map = map_of(points, 2.0)
     there = ready("opencl", VoxelMap({}), scan, options=options)
     assert isinstance(there, OpenclBackend)
-    there.evaluate(NEAR, neighbors="radius", covariance="autoware")
-    nothing = there.pool.used_bytes
-    there.prepare(voxel_map, neighbors="radius", covariance="autoware")
-    written, used = there.uploads.written_bytes, there.pool.used_bytes
-    there.prepare(voxel_map, neighbors="radius", covariance="pcl")
+    worth(there, NEAR, Scoring("radius", "autoware"))
+    nothing = there.maps.used_bytes
+    there.prepare(voxel_map, Scoring("radius", "autoware"))
+    written, used = there.uploads.written_bytes, there.maps.used_bytes
+    there.prepare(voxel_map, Scoring("radius", "pcl"))
     inverses = sum(cell.inverse.nbytes for cell in voxel_map.cells.values())
     tables = voxel_map.private_bytes + 104 * len(voxel_map.cells) + 64 * (len(voxel_map.cells) + 4)
     assert there.uploads.written_bytes - written <= inverses + tables
     there.set_map(voxel_map)
     for covariance in ("autoware", "pcl"):
-        how: dict[str, Any] = {"neighbors": "radius", "covariance": covariance}
-        wanted = ready("numba", voxel_map, scan).evaluate(NEAR, **how)
-        assert off(there.evaluate(NEAR, **how), wanted) <= (1e-12 if options is COPY else 1e-4)
+        how = Scoring("radius", covariance)
+        wanted = worth(ready("numba", voxel_map, scan), NEAR, how)
+        assert off(worth(there, NEAR, how), wanted) <= (1e-12 if options is COPY else 1e-4)
     assert there.uploads.written_bytes - written <= inverses + tables, "nothing more"
-    assert used < there.pool.used_bytes
+    assert used < there.maps.used_bytes
     # all comes back, of both kinds
     empty = VoxelMap({})
     there.set_map(empty)
-    there.evaluate(NEAR, neighbors="radius", covariance="autoware")
-    there.prepare(VoxelMap({}), neighbors="radius", covariance="autoware")
-    assert there.pool.used_bytes <= 2 * nothing
+    worth(there, NEAR, Scoring("radius", "autoware"))
+    there.prepare(VoxelMap({}), Scoring("radius", "autoware"))
+    assert there.maps.used_bytes <= 2 * nothing
 
 
 @pytest.mark.parametrize("options", [COPY, SVM])
 def test_a_map_may_have_a_cell_twice(
     points: NDArray[np.float64], scan: NDArray[np.float64], options: DeviceOptions
 ) -> None:
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    how = Scoring("radius", "autoware")
     cells = cells_of(points, 2.0)
     twice = VoxelMap({**cells, "again": next(iter(cells.values()))})
     there = ready("opencl", twice, scan, options=options)
-    there.evaluate(NEAR, **how)
-    used = there.pool.used_bytes  # type: ignore[attr-defined]
+    worth(there, NEAR, how)
+    used = there.maps.used_bytes  # type: ignore[attr-defined]
     for voxel_map in (VoxelMap(cells), VoxelMap({}), twice, VoxelMap({}), twice):
-        there.prepare(voxel_map, **how)
+        there.prepare(voxel_map, how)
         there.set_map(voxel_map)
-        found, wanted = there.evaluate(NEAR, **how), ready("numba", voxel_map, scan).evaluate(NEAR, **how)
+        found, wanted = worth(there, NEAR, how), worth(ready("numba", voxel_map, scan), NEAR, how)
         assert counts(found) == counts(wanted)
         if voxel_map.cells:
             assert off(found, wanted) <= 1e-12
-    assert there.pool.used_bytes <= used + 4096, "nothing is lost"  # type: ignore[attr-defined]
+    assert there.maps.used_bytes <= used + 4096, "nothing is lost"  # type: ignore[attr-defined]
 
 
 def test_a_cell_without_voxels_does_no_harm(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
     cells = cells_of(points, 2.0)
     empty = voxel_cell(points[:3], 2.0)
     assert len(empty.count) == 0
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    how = Scoring("radius", "autoware")
     for options in (COPY, SVM, FLOAT):
         there = ready("opencl", VoxelMap(cells), scan, options=options)
-        without = there.evaluate(NEAR, **how)
+        without = worth(there, NEAR, how)
         for some in ({"empty": empty, **cells}, {**cells, "empty": empty}, {"empty": empty}):
             voxel_map = VoxelMap(some)
-            there.prepare(voxel_map, **how)
+            there.prepare(voxel_map, how)
             there.set_map(voxel_map)
-            found = there.evaluate(NEAR, **how)
+            found = worth(there, NEAR, how)
             assert same_bits(found, without) if len(some) > 1 else found.found == 0
 
 
 def test_a_map_in_place_stays_while_it_is_in_use_beside_the_next_ones(
     points: NDArray[np.float64], scan: NDArray[np.float64]
 ) -> None:
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    how = Scoring("radius", "autoware")
     there = ready("opencl", map_of(points, 2.0), scan, options=SVM)
-    before = there.evaluate(NEAR, **how)
+    before = worth(there, NEAR, how)
     for number in range(20):
         last = map_of(points, 2.0, edge=5.0 + number % 4)
-        there.prepare(last, **how)
+        there.prepare(last, how)
         gc.collect()  # tables that nobody kept would be overwritten by the next map's
-        assert same_bits(there.evaluate(NEAR, **how), before)
+        assert same_bits(worth(there, NEAR, how), before)
     there.set_map(last)
-    assert off(there.evaluate(NEAR, **how), ready("numba", last, scan).evaluate(NEAR, **how)) <= 1e-12
+    assert off(worth(there, NEAR, how), worth(ready("numba", last, scan), NEAR, how)) <= 1e-12
 
 
 def test_a_write_that_fails_leaves_nothing_behind(
     points: NDArray[np.float64], scan: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    how: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+    how = Scoring("radius", "autoware")
     there = ready("opencl", VoxelMap({}), scan, options=COPY)
     assert isinstance(there, OpenclBackend)
-    there.evaluate(NEAR, **how)
-    used = there.pool.used_bytes
+    worth(there, NEAR, how)
+    used = there.maps.used_bytes
     voxel_map = map_of(points, 2.0)
 
-    def fails(parts: object) -> None:
+    def fails(*arguments: object) -> None:
         raise DeviceError("it fails")
 
     with monkeypatch.context() as patch:
-        patch.setattr(there.pool, "_write", fails)
+        patch.setattr(there.maps, "_write", fails)
         with pytest.raises(DeviceError):
-            there.prepare(voxel_map, **how)
-    assert there.pool.used_bytes == used
+            there.prepare(voxel_map, how)
+    assert there.maps.used_bytes == used
     assert there.uploads.laid_out_anew == 0
-    there.prepare(voxel_map, **how)
+    there.prepare(voxel_map, how)
     there.set_map(voxel_map)
-    assert off(there.evaluate(NEAR, **how), ready("numba", voxel_map, scan).evaluate(NEAR, **how)) <= 1e-12
+    assert off(worth(there, NEAR, how), worth(ready("numba", voxel_map, scan), NEAR, how)) <= 1e-12
 
 
 def test_a_map_in_place_is_not_copied(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
@@ -419,7 +427,7 @@ def test_a_map_in_place_is_not_copied(points: NDArray[np.float64], scan: NDArray
             array.flags.writeable = False
     there = ready("opencl", voxel_map, scan, options=SVM)
     assert isinstance(there, OpenclBackend)
-    at = there.evaluate(NEAR, neighbors="radius", covariance="autoware")
+    at = worth(there, NEAR, Scoring("radius", "autoware"))
     assert at.found > 0
-    assert (there.uploads.writes, there.uploads.written_bytes, there.pool.used_bytes) == (0, 0, 0)
+    assert (there.uploads.writes, there.uploads.written_bytes, there.maps.used_bytes) == (0, 0, 0)
     assert voxel_map.private_bytes < 16_384, "tables, of which the device reads the only copy"

@@ -14,12 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, NdtMatcher, Settings, VoxelMap, voxel_cell
+from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, NdtMatcher, Scoring, Settings, VoxelMap
+from shmmap_clients.ndt_scan_matcher.backends import opencl_backend
 from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
-from shmmap_clients.ndt_scan_matcher.backends.fallback_backend import FallbackBackend
-from shmmap_clients.ndt_scan_matcher.backends.opencl import devices, program
-from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import choose_device, list_devices
-from shmmap_clients.ndt_scan_matcher.backends.opencl.drivers import vendors_with_nvidia
+from shmmap_clients.ndt_scan_matcher.backends.opencl import devices
+from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import (
+    choose_device,
+    list_devices,
+    vendors_with_nvidia,
+)
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
     DeviceError,
     DeviceHung,
@@ -27,19 +30,18 @@ from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
     KernelBuildFailed,
     NoDevice,
 )
-from shmmap_clients.ndt_scan_matcher.backends.opencl.free_list import FreeList, rounded
-from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool
-from shmmap_clients.ndt_scan_matcher.backends.opencl.pool_memory import in_large_pages
+from shmmap_clients.ndt_scan_matcher.backends.opencl.map_memory import MapBuffers, in_large_pages
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend
+from shmmap_clients.ndt_scan_matcher.backends.registry import FallbackBackend
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street, worth
 from tests.support.opencl_device import need_device
 from tests.support.process_costs import anonymous_bytes, descriptors
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
-HOW: dict[str, Any] = {"neighbors": "radius", "covariance": "autoware"}
+HOW = Scoring("radius", "autoware")
 COPY = DeviceOptions(memory="copy")
 ROOT = Path(__file__).parents[3]
 
@@ -149,10 +151,12 @@ def test_a_cache_of_pyopencl_that_cannot_be_written_does_no_harm(tmp_path: Path)
 
 
 def test_a_program_that_does_not_build_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program, "kernel_source", lambda: "__kernel void evaluate() { no_such_function(1); }")
+    monkeypatch.setattr(
+        opencl_backend, "kernel_source", lambda: "__kernel void evaluate() { no_such_function(1); }"
+    )
     backend = OpenclBackend(Limits())
     with pytest.raises(KernelBuildFailed) as failed:
-        backend.prepare(VoxelMap({}), **HOW)
+        backend.prepare(VoxelMap({}), HOW)
     assert "\n" not in str(failed.value)
     assert failed.value.exit_code == 69
 
@@ -160,7 +164,7 @@ def test_a_program_that_does_not_build_is_one_line(monkeypatch: pytest.MonkeyPat
 def test_memory_that_a_device_has_not_is_an_error() -> None:
     backend = OpenclBackend(Limits(source_points=100))
     with pytest.raises(DeviceMemory, match="not enough memory"):
-        MapPool(backend._context, backend.device, backend.device.info.most_bytes * 4)
+        MapBuffers(backend._context, backend.device, backend.device.info.most_bytes * 4)
 
 
 def test_a_small_device_lowers_the_limit_on_the_map(
@@ -184,52 +188,29 @@ def test_a_small_device_lowers_the_limit_on_the_map(
         OpenclBackend(Limits(), options=COPY)
 
 
-def test_maps_that_do_not_fit_side_by_side_take_turns(points: NDArray[np.float64]) -> None:
+def test_kinds_of_covariance_that_do_not_fit_side_by_side_take_turns(points: NDArray[np.float64]) -> None:
     scan = scan_from(points, TRUTH, 300)
-    cells = cells_of(points, 2.0, edge=10.0)
-    backend = OpenclBackend(Limits(source_points=300), options=COPY)
-    a, b = VoxelMap(cells), VoxelMap(cells_of(points + 0.01, 2.0, edge=10.0))
-    size = sum(cell.map_bytes for cell in a.cells.values()) + a.private_bytes
-    backend.pool = MapPool(backend._context, backend.device, int(1.5 * size))
-    backend.set_source(scan)
+    voxel_map = map_of(points, 2.0)
     free = OpenclBackend(Limits(source_points=300), options=COPY)
-    free.set_source(scan)
-    for voxel_map in (a, b, a, b):
-        writes = backend.pool.statistics.writes
-        backend.prepare(voxel_map, **HOW)
-        # beside another one there is no room: it is written when that is given up
-        assert (backend.pool.statistics.writes > writes) == (writes == 0)
-        for one in (backend, free):
-            one.set_map(voxel_map)
-        assert backend.evaluate(TRUTH, **HOW).score == free.evaluate(TRUTH, **HOW).score
-        assert backend.pool.statistics.writes > writes
-    backend.pool = MapPool(backend._context, backend.device, size // 2)
-    with pytest.raises(DeviceMemory, match="max-map-bytes"):
-        backend.evaluate(TRUTH, **HOW)
-
-
-def test_a_pool_in_pieces_is_laid_out_anew(points: NDArray[np.float64]) -> None:
-    scan = scan_from(points, TRUTH, 300)
-    cells = sorted(cells_of(points, 2.0, edge=5.0).items(), key=lambda item: item[1].map_bytes)
-    a, b, large = cells[-3:]
-    # one voxel: less than any piece of another cell, or a map's tables, would go where it was
-    small = voxel_cell(np.random.default_rng(1).normal(1.0, 0.1, (50, 3)), 2.0)
-    first, second = VoxelMap(dict([a, ("small", small), b])), VoxelMap(dict([a, b, large]))
-    free = OpenclBackend(Limits(source_points=300), options=COPY)
-    free.prepare(second, **HOW)
-    needed = free.pool.used_bytes
+    free.prepare(voxel_map, HOW)
     backend = OpenclBackend(Limits(source_points=300), options=COPY)
-    # the second map fits exactly, but not where the small cell was, with the others in their places
-    backend.pool = MapPool(backend._context, backend.device, needed)
+    backend.maps = MapBuffers(backend._context, backend.device, free.maps.used_bytes)
     for one in (backend, free):
         one.set_source(scan)
-    for voxel_map in (first, second, first):
-        for one in (backend, free):
-            one.prepare(voxel_map, **HOW)
-            one.set_map(voxel_map)
-        assert backend.evaluate(TRUTH, **HOW).score == free.evaluate(TRUTH, **HOW).score
-    assert backend.pool.statistics.laid_out_anew == 1
-    assert free.pool.statistics.laid_out_anew == 0
+        one.set_map(voxel_map)
+    kinds = (HOW, Scoring("radius", "pcl"))
+    backend.prepare(voxel_map, kinds[0])
+    backend.prepare(voxel_map, kinds[1])
+    assert backend.uploads.writes == 1
+    for how in (*kinds, *kinds):
+        assert worth(backend, TRUTH, how).score == worth(free, TRUTH, how).score
+    assert backend.uploads.laid_out_anew == 3
+    assert free.uploads.laid_out_anew == 0
+    backend.maps = MapBuffers(backend._context, backend.device, free.maps.used_bytes // 4)
+    backend.prepare(voxel_map, HOW)
+    assert backend.maps.used_bytes == 0
+    with pytest.raises(DeviceMemory, match="max-map-bytes"):
+        worth(backend, TRUTH, HOW)
 
 
 def test_ten_thousand_evaluations_grow_nothing(points: NDArray[np.float64]) -> None:
@@ -241,25 +222,25 @@ def test_ten_thousand_evaluations_grow_nothing(points: NDArray[np.float64]) -> N
     def work(rounds: int) -> None:
         for number in range(rounds):
             voxel_map = second if number % 2 else first
-            backend.prepare(voxel_map, **HOW)
+            backend.prepare(voxel_map, HOW)
             backend.set_map(voxel_map)
             backend.set_source(scan)
             for _ in range(30):
-                backend.evaluate(TRUTH, **HOW)
-            backend.evaluate_many(poses, **HOW)
+                worth(backend, TRUTH, HOW)
+            backend.evaluate(poses, HOW)
 
     work(20)
     gc.collect()
     before, files, used = (
         anonymous_bytes(os.getpid()),
         descriptors(os.getpid()),
-        backend.pool.used_bytes,
+        backend.maps.used_bytes,
     )
     work(200)
     gc.collect()
     assert anonymous_bytes(os.getpid()) - before < 2_000_000
     assert descriptors(os.getpid()) == files
-    assert backend.pool.used_bytes == used
+    assert backend.maps.used_bytes == used
 
 
 @pytest.mark.parametrize("fallback", [None, "numba"])
@@ -315,14 +296,14 @@ def test_wherever_a_device_fails_the_fallback_goes_on(points: NDArray[np.float64
     assert backend.most_map_bytes == 1_000
     plain = NumpyBackend(limits)
     voxel_map, scan = map_of(points, 2.0), scan_from(points, TRUTH, 400)
-    backend.prepare(voxel_map, **HOW)
+    backend.prepare(voxel_map, HOW)
     for one in (backend, plain):
         one.set_map(voxel_map)
         assert one.set_source(scan) == 100
     for _ in range(2):
-        assert backend.evaluate(TRUTH, **HOW).score == plain.evaluate(TRUTH, **HOW).score
-    (many,) = backend.evaluate_many(TRUTH[None], **HOW)
-    assert many.score == plain.evaluate(TRUTH, **HOW).score
+        assert worth(backend, TRUTH, HOW).score == worth(plain, TRUTH, HOW).score
+    (many,) = backend.evaluate(TRUTH[None], HOW)
+    assert many.score == worth(plain, TRUTH, HOW).score
     failed = calls < 6
     assert (backend.fault is not None) == failed
     assert (backend.name, backend.on_device) == (("numpy", False) if failed else ("opencl", True))
@@ -355,32 +336,6 @@ def test_nvidias_driver_is_found_without_its_file(tmp_path: Path) -> None:
     only = vendors_with_nvidia(tmp_path / "nowhere", [folder])
     assert only is not None
     assert [file.name for file in only.iterdir()] == ["nvidia.icd"]
-
-
-def test_blocks_never_overlap_and_all_come_back() -> None:
-    rng = np.random.default_rng(6)
-    free = FreeList(100_000)
-    total = free.free_bytes
-    taken: dict[int, int] = {}
-    for _ in range(3000):
-        if taken and rng.random() < 0.5:
-            offset = int(rng.choice(list(taken)))
-            free.give(offset, taken.pop(offset))
-        else:
-            nbytes = int(rng.integers(0, 9000))
-            offset_or_none = free.take(nbytes)
-            if offset_or_none is not None:
-                assert offset_or_none % 64 == 0
-                taken[offset_or_none] = nbytes
-        ends = 0
-        for offset in sorted(taken):
-            assert offset >= ends
-            ends = offset + rounded(taken[offset])
-        assert ends <= 100_000
-        assert free.free_bytes == total - sum(map(rounded, taken.values()))
-    for offset, nbytes in taken.items():
-        free.give(offset, nbytes)
-    assert free.take(total) == 0
 
 
 def test_memory_in_large_pages_is_memory() -> None:

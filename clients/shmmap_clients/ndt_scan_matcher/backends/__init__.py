@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who evaluates scores and derivatives."""
+"""What evaluates scores and derivatives."""

@@ -1,20 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Backend`: what computes score and derivatives, one small contract for several kinds of hardware."""
+"""`Backend`: what computes score and derivatives, one small contract for several kinds of hardware.
+
+Beside it stands what backends have in common: the scan's buffer, the options of a device, and the count of
+what was written to one.
+"""
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation
+from shmmap import BadRequest
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Scoring
 
-__all__ = ["Backend", "Neighbors"]
+__all__ = [
+    "Backend",
+    "DeviceOptions",
+    "MapMemory",
+    "Precision",
+    "ScanBuffer",
+    "UploadStatistics",
+    "check_batch",
+]
 
-Neighbors = Literal["direct1", "direct7", "radius"]
+Precision = Literal["auto", "double", "float"]
+MapMemory = Literal["auto", "svm", "copy"]
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceOptions:
+    """For backends that compute on a device; the others ignore it.
+
+    Attributes
+    ----------
+    device
+        Index or part of the name, as ``shmmap-ndt devices`` lists them; None: what the variable
+        ``SHMMAP_OPENCL_DEVICE`` says, or the first GPU, else the first device.
+    precision
+        ``"auto"``: double where the device has it.
+    memory
+        ``"svm"``: shared segments are read where they lie; ``"copy"``: each map is copied to the device;
+        ``"auto"``: the first where the device says that it can (``CL_DEVICE_SVM_FINE_GRAIN_SYSTEM``).
+    """
+
+    device: str | None = None
+    precision: Precision = "auto"
+    memory: MapMemory = "auto"
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("precision", self.precision, get_args(Precision)),
+            ("memory", self.memory, get_args(MapMemory)),
+        ):
+            if value not in known:
+                raise BadRequest(f"unknown {name} {value!r}", hint=f"it is {', '.join(known)}")
+
+
+@dataclass(slots=True)
+class UploadStatistics:
+    """What was written to a device for maps; all zero where maps are read where they lie.
+
+    Attributes
+    ----------
+    written_bytes
+        With the gaps between arrays.
+    writes
+        One for each map and kind of covariance.
+    laid_out_anew
+        Maps that were written again because two kinds of covariance had no room side by side.
+    """
+
+    written_bytes: int = 0
+    writes: int = 0
+    laid_out_anew: int = 0
 
 
 class Backend(Protocol):
@@ -32,6 +95,10 @@ class Backend(Protocol):
     def on_device(self) -> bool:
         """Whether the work is done elsewhere than in the threads of this process."""
 
+    @property
+    def fault(self) -> DeviceError | None:
+        """Why another backend than the one that was asked for computes; None if it does not."""
+
     most_map_bytes: int
     """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
 
@@ -39,7 +106,7 @@ class Backend(Protocol):
     def uploads(self) -> UploadStatistics:
         """What `prepare` and evaluations wrote to a device for maps; one object, which goes on counting."""
 
-    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+    def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
         """Do in advance what evaluations with this map would have to wait for.
 
         It may be called in another thread, beside evaluations with the map in use.
@@ -51,39 +118,58 @@ class Backend(Protocol):
     def set_source(self, points: NDArray[np.floating]) -> int:
         """Take a scan, (N, 3), metres, sensor or base frame; returns how many points the limit left out."""
 
-    def evaluate(
-        self,
-        pose: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        T: NDArray[np.float64] | None = None,
-        deadline_s: float | None = None,
-    ) -> Evaluation:
-        """Return score, gradient and Hessian at a pose vector.
+    def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        """Return score, gradient and Hessian at each of (k, 6) pose vectors; k up to the limit.
 
-        Parameters
-        ----------
-        T
-            The pose's matrix, where that is known better.
-        deadline_s
-            Of `time.monotonic`: how long a device is waited for at most; then it is an error.
+        A pose has the same bits alone and among others.
+
+        Raises
+        ------
+        BadRequest
+            There are more poses than the limit.
+        DeviceError
+            A device failed, or has not answered at the scoring's deadline.
         """
 
-    def evaluate_many(
-        self,
-        poses: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        deadline_s: float | None = None,
-    ) -> list[Evaluation]:
-        """Return for each of (k, 6) poses what `evaluate` returns, to the last bit; k up to the limit."""
-
-    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+    def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
         """Return the step that an evaluation asks for: `upward_step` if steady, else `newton_step`."""
 
     def close(self) -> None:
         """Give back threads and memory; a hung device is not waited for."""
+
+
+def check_batch(poses: NDArray[np.float64], most: int) -> None:
+    """Refuse more poses than the limit that buffers were made for."""
+    if len(poses) > most:
+        raise BadRequest(f"{len(poses)} poses at once, the limit on poses is {most}")
+
+
+class ScanBuffer:
+    """Room for a scan of at most ``most`` points, as numbers of ``dtype``."""
+
+    def __init__(self, most: int, dtype: np.dtype[Any] | type = np.float64) -> None:
+        self._buffer: NDArray[Any] = np.empty((most, 3), dtype)
+        self._count = 0
+
+    @property
+    def points(self) -> NDArray[Any]:
+        """The scan, (N, 3), metres."""
+        return self._buffer[: self._count]
+
+    def take(self, points: NDArray[np.floating]) -> int:
+        """Take a scan; returns how many points were left out.
+
+        Point i of the kept m is floor(i n / m) of the given n: the same ones each time, and evenly over
+        the whole scan, whatever its order.  Points that are not finite find no neighbour.
+        """
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise BadRequest(f"a scan must have shape (N, 3), this one has {points.shape}")
+        given, most = len(points), len(self._buffer)
+        self._count = min(given, most)
+        if given <= most:
+            with np.errstate(over="ignore"):
+                self._buffer[:given] = points
+        else:
+            with np.errstate(over="ignore"):
+                np.copyto(self._buffer, points[np.arange(most) * given // most], casting="same_kind")
+        return given - self._count

@@ -10,20 +10,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
+from shmmap_clients.ndt_scan_matcher.backends.backend import ScanBuffer, UploadStatistics, check_batch
 from shmmap_clients.ndt_scan_matcher.backends.kernels import accumulate
 from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import CONTRACTED, contract, derive, step_into
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     CHUNK_POINTS,
     SUMS,
     Evaluation,
+    Scoring,
     gauss_for,
     search_columns,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
-from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 
 __all__ = ["NumbaBackend"]
 
@@ -39,6 +38,7 @@ class NumbaBackend:
 
     name = "numba"
     on_device = False
+    fault = None
 
     def __init__(self, limits: Limits, threads: int = 1) -> None:
         self._source = ScanBuffer(limits.source_points)
@@ -62,10 +62,9 @@ class NumbaBackend:
         if self._pool is not None:
             self._pool.shutdown()
 
-    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+    def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
         """Derive covariances and the table of addresses; nothing else is copied."""
-        del neighbors
-        voxel_map.table(covariance)
+        voxel_map.table(scoring.covariance)
 
     def set_map(self, voxel_map: VoxelMap) -> None:
         """Match against this map from now on."""
@@ -75,67 +74,34 @@ class NumbaBackend:
         """Take a scan; returns how many points the limit left out."""
         return self._source.take(points)
 
-    def evaluate(
-        self,
-        pose: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        T: NDArray[np.float64] | None = None,
-        deadline_s: float | None = None,
-    ) -> Evaluation:
-        """Return score, gradient and Hessian at a pose vector."""
-        del deadline_s
-        if T is not None:
-            self._T[0] = T
-        poses = np.asarray(pose, np.float64)[None]
-        return self._evaluated(poses, neighbors, covariance, pitch_sign, transforms=T is None)[0]
-
-    def evaluate_many(
-        self,
-        poses: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        deadline_s: float | None = None,
-    ) -> list[Evaluation]:
-        """Return the same as `evaluate` for each of (k, 6) poses; threads share all their chunks."""
-        del deadline_s
+    def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        """Return the evaluations of (k, 6) poses; threads share all their chunks."""
         check_batch(poses, self._most_poses)
+        chunks = -(-len(self._source.points) // CHUNK_POINTS)
+        each = max(self._most_rows // max(chunks, 1), 1)
         found: list[Evaluation] = []
-        each = max(self._most_rows // max(-(-len(self._source.points) // CHUNK_POINTS), 1), 1)
         for first in range(0, len(poses), each):
             part = np.ascontiguousarray(poses[first : first + each], np.float64)
-            found += self._evaluated(part, neighbors, covariance, pitch_sign)
+            found += self._evaluated(part, chunks, scoring)
         return found
 
-    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+    def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
         """Return the step that an evaluation asks for."""
         step = np.empty(6)
         step_into(np.ascontiguousarray(at.hessian), np.ascontiguousarray(at.gradient), steady, step)
         return step
 
-    def _evaluated(
-        self,
-        poses: NDArray[np.float64],
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float,
-        *,
-        transforms: bool = True,
-    ) -> list[Evaluation]:
-        derive(poses, pitch_sign, transforms, self._T, self._M)
+    def _evaluated(self, poses: NDArray[np.float64], chunks: int, scoring: Scoring) -> list[Evaluation]:
+        derive(poses, scoring.pitch_sign, self._T, self._M)
         source = self._source.points
-        chunks = -(-len(source) // CHUNK_POINTS)
         units = len(poses) * chunks
         threads = min(len(self._scratch), max(units, 1))
         voxel_map = self._map
         gauss = gauss_for(voxel_map.leaf)
         # one leaf: every neighbour in reach of the radius lies in the 27 cells around the point
-        radius2 = voxel_map.leaf**2 if neighbors == "radius" else math.inf
-        table = voxel_map.table(covariance)
+        radius2 = voxel_map.leaf**2 if scoring.neighbors == "radius" else math.inf
+        table = voxel_map.table(scoring.covariance)
+        columns = self._columns[scoring.neighbors]
 
         def run(part: int) -> None:
             accumulate(
@@ -152,7 +118,7 @@ class NumbaBackend:
                 voxel_map.box,
                 voxel_map.column_start,
                 voxel_map.column_cell,
-                self._columns[neighbors],
+                columns,
                 radius2,
                 gauss.d1,
                 gauss.d2,

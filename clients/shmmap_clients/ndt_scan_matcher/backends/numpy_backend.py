@@ -11,10 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
+from shmmap_clients.ndt_scan_matcher.backends.backend import ScanBuffer, UploadStatistics, check_batch
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     AX,
     BJ,
@@ -24,13 +22,18 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     A,
     B,
     Evaluation,
+    Neighbors,
+    Scoring,
     gauss_for,
     search_columns,
-    total,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
-from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
-from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
+    derivatives_of_poses,
+    evaluations_of,
+    matrices_from_poses,
+    numpy_step,
+)
 
 __all__ = ["NumpyBackend"]
 
@@ -78,6 +81,7 @@ class NumpyBackend:
 
     name = "numpy"
     on_device = False
+    fault = None
 
     def __init__(self, limits: Limits, threads: int = 1) -> None:  # noqa: ARG002
         self._source = ScanBuffer(limits.source_points)
@@ -90,12 +94,12 @@ class NumpyBackend:
     def close(self) -> None:
         """Nothing to give back."""
 
-    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:  # noqa: ARG002
+    def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
         """Gather the map's Gaussians."""
         prepared = self._prepared
         if prepared.map is not voxel_map:
             prepared = _Gaussians(voxel_map)
-        prepared.inverse(covariance)
+        prepared.inverse(scoring.covariance)
         self._prepared = prepared
 
     def set_map(self, voxel_map: VoxelMap) -> None:
@@ -107,43 +111,20 @@ class NumpyBackend:
         """Take a scan; returns how many points the limit left out."""
         return self._source.take(points)
 
-    def evaluate(
-        self,
-        pose: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        T: NDArray[np.float64] | None = None,
-        deadline_s: float | None = None,
-    ) -> Evaluation:
-        """Return score, gradient and Hessian at a pose vector."""
-        del deadline_s
-        matrix = matrix_from_pose(pose) if T is None else T
-        J = euler_derivatives(pose, pitch_sign)[:3]
+    def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        """Return the evaluations of (k, 6) poses, one after the other."""
+        check_batch(poses, self._most_poses)
         source = self._source.points
         blocks = [source[at : at + _BLOCK_POINTS] for at in range(0, len(source), _BLOCK_POINTS)]
-        rows = [self._sums(block, matrix, J, neighbors, covariance) for block in blocks]
-        return total(np.array(rows).reshape(-1, SUMS), pose, pitch_sign)
-
-    def evaluate_many(
-        self,
-        poses: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        deadline_s: float | None = None,
-    ) -> list[Evaluation]:
-        """Return the same as `evaluate` for each of (k, 6) poses."""
-        del deadline_s
-        check_batch(poses, self._most_poses)
-        return [
-            self.evaluate(pose, neighbors=neighbors, covariance=covariance, pitch_sign=pitch_sign)
-            for pose in poses
+        derivatives = derivatives_of_poses(poses, scoring.pitch_sign)
+        rows = [
+            self._sums(block, T, M[:3], scoring)
+            for T, M in zip(matrices_from_poses(poses), derivatives, strict=True)
+            for block in blocks
         ]
+        return evaluations_of(np.array(rows).reshape(len(poses), len(blocks), SUMS), derivatives)
 
-    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+    def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
         """Return the step that an evaluation asks for."""
         return numpy_step(at, steady)
 
@@ -196,15 +177,14 @@ class NumpyBackend:
         source: NDArray[np.float64],
         matrix: NDArray[np.float64],
         J: NDArray[np.float64],
-        neighbors: Neighbors,
-        covariance: Covariance,
+        scoring: Scoring,
     ) -> NDArray[np.float64]:
         sums = np.zeros(SUMS)
         gauss = gauss_for(self._gaussians.map.leaf)
-        inverse = self._gaussians.inverse(covariance)
+        inverse = self._gaussians.inverse(scoring.covariance)
         with np.errstate(invalid="ignore"):
             moved = source @ matrix[:3, :3].T + matrix[:3, 3]
-        point, voxel, cut_points, cut_neighbours = self._pairs(moved, neighbors, inverse)
+        point, voxel, cut_points, cut_neighbours = self._pairs(moved, scoring.neighbors, inverse)
         if not len(point):
             return sums
         near = inverse[voxel]

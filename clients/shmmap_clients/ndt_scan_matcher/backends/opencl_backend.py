@@ -8,41 +8,55 @@ launch.  All buffers are made once, as large as the limits allow.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from importlib import resources
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
-from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends import opencl
+from shmmap_clients.ndt_scan_matcher.backends.backend import (
+    DeviceOptions,
+    ScanBuffer,
+    UploadStatistics,
+    check_batch,
+)
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, choose_device
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceHung, DeviceMemory, device_errors
-from shmmap_clients.ndt_scan_matcher.backends.opencl.map_in_place import MapInPlace
-from shmmap_clients.ndt_scan_matcher.backends.opencl.map_pool import MapPool
-from shmmap_clients.ndt_scan_matcher.backends.opencl.placed_map import PlacedMap
-from shmmap_clients.ndt_scan_matcher.backends.opencl.program import build_kernel
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
+    DeviceHung,
+    DeviceMemory,
+    KernelBuildFailed,
+    device_errors,
+)
+from shmmap_clients.ndt_scan_matcher.backends.opencl.map_memory import MapBuffers, MapInPlace, PlacedMap
 from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import CHUNK_POINTS, SUMS, Evaluation, gauss_for
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits, check_batch
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
+    CHUNK_POINTS,
+    SUMS,
+    Evaluation,
+    Neighbors,
+    Scoring,
+    gauss_for,
+)
+from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
     derivatives_of_poses,
     evaluations_of,
     matrices_from_poses,
+    numpy_step,
 )
-from shmmap_clients.ndt_scan_matcher.matching.scan_buffer import ScanBuffer
-from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
 
-__all__ = ["OpenclBackend"]
+__all__ = ["OpenclBackend", "build_kernel", "kernel_source"]
 
 _POSE: Final = 40  # numbers of a pose in the kernel
 _LAUNCH_ROWS: Final = 4096  # chunks in a launch of many poses: 256 poses of 2048 points
-_TABLES_BYTES: Final = 18 << 20  # of one map, at most: VoxelMap's directory and the table of its cells
-
+_TABLES_BYTES: Final = 18 << 20  # of one map, at most: its directory and the table of its cells
+_SEARCH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
 
 _BUSY: Final[set[OpenclBackend]] = set()
-"""Whose devices did not answer in time: what these may still read has to stay, whoever forgets it."""
+"""Backends whose devices did not answer in time: what a device may still read has to stay."""
 
 
 class OpenclBackend:
@@ -65,6 +79,7 @@ class OpenclBackend:
 
     name = "opencl"
     on_device = True
+    fault = None
 
     def __init__(self, limits: Limits, threads: int = 1, options: DeviceOptions | None = None) -> None:
         del threads
@@ -102,27 +117,29 @@ class OpenclBackend:
                 self._context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=self._places
             )
             self._rows_buffer = cl.Buffer(self._context, flags.WRITE_ONLY, self._rows.nbytes)
-        self.pool: MapPool | MapInPlace
+        self.maps: MapBuffers | MapInPlace
         if device.in_place:
-            self.pool = MapInPlace(self._context)
+            self.maps = MapInPlace(self._context)
         else:
-            self.pool = MapPool(self._context, device, 2 * (_TABLES_BYTES + self.most_map_bytes))
+            # room for a map's second kind of covariance, too
+            self.maps = MapBuffers(self._context, device, 2 * (_TABLES_BYTES + self.most_map_bytes))
 
     @property
     def uploads(self) -> UploadStatistics:
         """What was written to the device for maps."""
-        return self.pool.statistics
+        return self.maps.statistics
 
     def _room_for_maps(self) -> int:
-        """Return the most bytes that a map may have: as limited, or half of the largest buffer."""
+        """Return the most bytes that a map may have: as limited, or what two buffers have room for."""
         wanted = self._limits.most_map_bytes
         if self.device.in_place:
             return wanted
-        room = self.device.info.most_bytes // 2 - _TABLES_BYTES
+        info = self.device.info
+        room = min(info.most_bytes, info.memory_bytes // 2) // 2 - _TABLES_BYTES
         if room <= 0:
             raise DeviceMemory(
-                f"device {self.device.info.name!r} allocates at most {self.device.info.most_bytes} bytes at"
-                " once, too little for a map"
+                f"device {info.name!r} allocates at most {info.most_bytes} bytes at once, and has"
+                f" {info.memory_bytes}: too little for a map"
             )
         return min(wanted, room)
 
@@ -134,7 +151,7 @@ class OpenclBackend:
         _BUSY.discard(self)
         self._kernels.clear()
         self._arguments.clear()
-        self.pool.close()
+        self.maps.close()
         for buffer in (
             self._source_buffer, self._poses_buffer, self._places_buffer, self._rows_buffer,
         ):  # fmt: skip
@@ -145,11 +162,10 @@ class OpenclBackend:
         self._map = voxel_map
         self._arguments.clear()
 
-    def prepare(self, voxel_map: VoxelMap, *, neighbors: Neighbors, covariance: Covariance) -> None:
+    def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
         """Write the map to the device beside the one in use, and build the program; from any thread."""
-        if neighbors not in self._kernels:
-            self._kernels.setdefault(neighbors, self._built(neighbors))
-        self.pool.prepare(voxel_map, covariance)
+        self._kernel(scoring.neighbors)
+        self.maps.prepare(voxel_map, scoring.covariance)
 
     def set_source(self, points: NDArray[np.floating]) -> int:
         """Take a scan; returns how many points the limit left out."""
@@ -158,60 +174,27 @@ class OpenclBackend:
         self._source_is_new = True
         return dropped
 
-    def evaluate(
-        self,
-        pose: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        T: NDArray[np.float64] | None = None,
-        deadline_s: float | None = None,
-    ) -> Evaluation:
-        """Return score, gradient and Hessian at a pose vector."""
-        poses = np.asarray(pose, np.float64)[None]
-        matrices = matrices_from_poses(poses) if T is None else np.asarray(T, np.float64)[None]
-        return self._evaluated(poses, matrices, neighbors, covariance, pitch_sign, deadline_s)[0]
-
-    def evaluate_many(
-        self,
-        poses: NDArray[np.float64],
-        *,
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float = -1.0,
-        deadline_s: float | None = None,
-    ) -> list[Evaluation]:
-        """Return the same as `evaluate` for each of (k, 6) poses, in one launch where memory allows."""
+    def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        """Return the evaluations of (k, 6) poses, in one launch where memory allows."""
         check_batch(poses, self._limits.poses)
         found: list[Evaluation] = []
         each = max(self._most_rows // max(-(-len(self._source.points) // CHUNK_POINTS), 1), 1)
         for first in range(0, len(poses), each):
-            part = np.asarray(poses[first : first + each], np.float64)
-            matrices = matrices_from_poses(part)
-            found += self._evaluated(part, matrices, neighbors, covariance, pitch_sign, deadline_s)
+            found += self._evaluated(np.asarray(poses[first : first + each], np.float64), scoring)
         return found
 
-    def step(self, at: Evaluation, *, steady: bool) -> NDArray[np.float64]:
+    def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
         """Return the step that an evaluation asks for; computed here, it is small."""
         return numpy_step(at, steady)
 
-    def _evaluated(
-        self,
-        poses: NDArray[np.float64],
-        matrices: NDArray[np.float64],
-        neighbors: Neighbors,
-        covariance: Covariance,
-        pitch_sign: float,
-        deadline_s: float | None,
-    ) -> list[Evaluation]:
-        derivatives = derivatives_of_poses(poses, pitch_sign)
+    def _evaluated(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        matrices, derivatives = matrices_from_poses(poses), derivatives_of_poses(poses, scoring.pitch_sign)
         points = len(self._source.points)
         chunks = -(-points // CHUNK_POINTS)
         if not points:
             return evaluations_of(np.empty((len(poses), 0, SUMS)), derivatives)
         self._check_idle()
-        kernel = self._kernel(neighbors, covariance)
+        kernel = self._ready_kernel(scoring)
         number = len(poses)
         records, places = self._poses[:number], self._places[:number]
         translation = matrices[:, :3, 3]
@@ -228,7 +211,7 @@ class OpenclBackend:
         rows = self._rows[: number * chunks]
         items = (chunks, number) if device.is_processor else (chunks * CHUNK_POINTS, number)
         with device_errors(device.info.name, "evaluate"):
-            # who lets go of a copy's event waits for it: they are kept until all is done
+            # to release a copy's event is to wait for it: they are kept until all is done
             inputs = [cl.enqueue_copy(queue, self._poses_buffer, records, is_blocking=False)]
             if self._source_is_new:
                 points_here = self._source.points
@@ -242,7 +225,7 @@ class OpenclBackend:
             self._running = cl.enqueue_copy(queue, rows, self._rows_buffer, is_blocking=False)
             queue.flush()
             try:
-                self._waiting.until(self._running, deadline_s)
+                self._waiting.until(self._running, scoring.deadline_s)
             except DeviceHung:
                 _BUSY.add(self)
                 raise
@@ -261,15 +244,17 @@ class OpenclBackend:
         self._running = None
         _BUSY.discard(self)
 
-    def _built(self, neighbors: Neighbors) -> Any:
-        return build_kernel(self._context, self.device, neighbors, self._limits.neighbors)
-
-    def _kernel(self, neighbors: Neighbors, covariance: Covariance) -> Any:
-        """Return the kernel with all its arguments: they are set once for a map and a scan."""
+    def _kernel(self, neighbors: Neighbors) -> Any:
         if neighbors not in self._kernels:
-            self._kernels.setdefault(neighbors, self._built(neighbors))
-        kernel = self._kernels[neighbors]
-        placed = self.pool.use(self._map, covariance)
+            built = build_kernel(self._context, self.device, neighbors, self._limits.neighbors)
+            self._kernels.setdefault(neighbors, built)
+        return self._kernels[neighbors]
+
+    def _ready_kernel(self, scoring: Scoring) -> Any:
+        """Return the kernel with all its arguments: they are set once for a map and a scan."""
+        neighbors = scoring.neighbors
+        kernel = self._kernel(neighbors)
+        placed = self.maps.use(self._map, scoring.covariance)
         points = len(self._source.points)
         if self._arguments.get(neighbors) == (placed, points):
             return kernel
@@ -282,7 +267,7 @@ class OpenclBackend:
             self._poses_buffer,
             self._places_buffer,
             self._rows_buffer,
-            self.pool.buffer,
+            placed.buffer,
             *(offset(at) for at in placed.places),
             *(integer(side) for side in (*box, *placed.lead, placed.squares)),
             real(leaf),
@@ -294,3 +279,53 @@ class OpenclBackend:
         )
         self._arguments[neighbors] = (placed, points)
         return kernel
+
+
+def kernel_source() -> str:
+    """Return the program's source, OpenCL C 1.2."""
+    return resources.files(opencl).joinpath("evaluate.cl").read_text(encoding="utf-8")
+
+
+def build_kernel(
+    context: Any, device: Device, neighbors: Neighbors, most: int, *, extra: Sequence[str] = ()
+) -> Any:
+    """Return the kernel for a device, a new one; drivers keep what they have built, and build once.
+
+    Parameters
+    ----------
+    context
+        Of the device.
+    device
+    neighbors
+        Which voxels a point is scored against.
+    most
+        And how many of them at most.
+    extra
+        More options for the driver's compiler.
+
+    Raises
+    ------
+    KernelBuildFailed
+        With the beginning of what the driver says.
+    """
+    import pyopencl as cl
+
+    macros = {
+        "DOUBLE": int(device.double),
+        "IN_PLACE": int(device.in_place),
+        "SEARCH": _SEARCH[neighbors],
+        "MOST": most,
+        "ITEM_PER_CHUNK": int(device.is_processor),
+    }
+    options = ["-cl-std=CL1.2", *(f"-D{name}={value}" for name, value in macros.items()), *extra]
+    try:
+        built = cl.Program(context, kernel_source()).build(options, devices=[device.handle])
+    except cl.Error as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        said = next((line for line in lines if "error" in line.lower() and "clBuild" not in line), lines[0])
+        raise KernelBuildFailed(
+            f"the driver of device {device.info.name!r} cannot build the program: {said[:200]}",
+            hint=f"is {device.info.platform} {device.info.driver} whole? another device: --device;"
+            " `--backend numba` needs none",
+        ) from None
+    return cl.Kernel(built, "evaluate")

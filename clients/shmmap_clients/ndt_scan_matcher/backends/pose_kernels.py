@@ -14,8 +14,7 @@ import numpy as np
 from numba import types
 
 from shmmap.compiling import compiled, read_only
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import SMALL_ANGLE
-from shmmap_clients.ndt_scan_matcher.matching.steps import FLAT, SINGULAR
+from shmmap_clients.ndt_scan_matcher.matching.pose_batch import FLAT, SINGULAR, SMALL_ANGLE
 
 __all__ = ["CONTRACTED", "contract", "derive", "step_into"]
 
@@ -27,7 +26,6 @@ _TINY: Final = float(np.finfo(np.float64).tiny)
 _DERIVE: Final = types.void(
     read_only(types.float64, 2),  # poses
     types.float64,  # pitch sign
-    types.boolean,  # whether the transforms are wanted, too
     types.float64[:, :, ::1],  # T
     types.float64[:, :, :, ::1],  # M
 )
@@ -46,24 +44,23 @@ _STEP: Final = types.void(
 
 
 @compiled(_DERIVE, boundscheck=False)
-def derive(poses: Any, pitch_sign: Any, transforms: Any, T: Any, M: Any) -> None:
-    """Write each pose's matrix, and what `euler_derivatives` returns, at the beginning of T and M."""
+def derive(poses: Any, pitch_sign: Any, T: Any, M: Any) -> None:
+    """Write each pose's matrix, and its `derivatives_of_poses`, at the beginning of T and M."""
     for pose in range(poses.shape[0]):
         roll, pitch, yaw = poses[pose, 3], poses[pose, 4], poses[pose, 5]
         cx, sx = math.cos(roll), math.sin(roll)
         cy, sy = math.cos(pitch), math.sin(pitch)
         cz, sz = math.cos(yaw), math.sin(yaw)
-        if transforms:
-            t = T[pose]
-            t[0, 0], t[0, 1], t[0, 2], t[0, 3] = cy * cz, -cy * sz, sy, poses[pose, 0]
-            t[1, 0], t[1, 1], t[1, 2], t[1, 3] = (
-                cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, poses[pose, 1],
-            )  # fmt: skip
-            t[2, 0], t[2, 1], t[2, 2], t[2, 3] = (
-                sx * sz - cx * sy * cz, cx * sy * sz + sx * cz, cx * cy, poses[pose, 2],
-            )  # fmt: skip
-            t[3, 0] = t[3, 1] = t[3, 2] = 0.0
-            t[3, 3] = 1.0
+        t = T[pose]
+        t[0, 0], t[0, 1], t[0, 2], t[0, 3] = cy * cz, -cy * sz, sy, poses[pose, 0]
+        t[1, 0], t[1, 1], t[1, 2], t[1, 3] = (
+            cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, poses[pose, 1],
+        )  # fmt: skip
+        t[2, 0], t[2, 1], t[2, 2], t[2, 3] = (
+            sx * sz - cx * sy * cz, cx * sy * sz + sx * cz, cx * cy, poses[pose, 2],
+        )  # fmt: skip
+        t[3, 0] = t[3, 1] = t[3, 2] = 0.0
+        t[3, 3] = 1.0
         if abs(roll) < SMALL_ANGLE:
             cx, sx = 1.0, 0.0
         if abs(pitch) < SMALL_ANGLE:
@@ -109,7 +106,7 @@ def derive(poses: Any, pitch_sign: Any, transforms: Any, T: Any, M: Any) -> None
 
 @compiled(_CONTRACT, boundscheck=False)
 def contract(rows: Any, chunks: Any, M: Any, found: Any) -> None:
-    """Add each pose's rows in their order, and write what they come to, see `total`."""
+    """Add each pose's rows in their order, and write what they come to, see `evaluations_of`."""
     sums = np.empty(39)
     rotation = np.empty(9)
     for pose in range(found.shape[0]):

@@ -1,17 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Backends by name; what one of them needs is imported when it is chosen."""
+"""Backends by name, and the one that goes on without its device.
+
+What a backend needs is imported when it is chosen.
+"""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap import BadRequest, needed_packages
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
-from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceOptions, UploadStatistics
+from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Scoring
 from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 
-__all__ = ["BACKENDS", "backend_named"]
+__all__ = ["BACKENDS", "FallbackBackend", "backend_named"]
+
+_T = TypeVar("_T")
 
 
 def _numba(limits: Limits, threads: int, options: DeviceOptions) -> Backend:
@@ -40,6 +51,99 @@ BACKENDS: Final[dict[str, Callable[[Limits, int, DeviceOptions], Backend]]] = {
     "numpy": _numpy,
     "opencl": _opencl,
 }
+
+
+class FallbackBackend:
+    """A backend on a device, and another one that computes for good from the device's first fault on.
+
+    Parameters
+    ----------
+    first
+        On a device.
+    second
+        Its buffers are allocated from the beginning, so that going on costs nothing but the work itself.
+
+    Attributes
+    ----------
+    fault
+        Why the second one computes, or None.
+    """
+
+    def __init__(self, first: Backend, second: Backend) -> None:
+        self._first, self._second = first, second
+        self._active = first
+        self._map: VoxelMap | None = None
+        self._points: NDArray[np.floating] | None = None
+        self._lock = threading.Lock()
+        self.most_map_bytes = min(first.most_map_bytes, second.most_map_bytes)
+        self.fault: DeviceError | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the one that computes."""
+        return self._active.name
+
+    @property
+    def on_device(self) -> bool:
+        """Of the one that computes."""
+        return self._active.on_device
+
+    @property
+    def uploads(self) -> UploadStatistics:
+        """Of the one on a device."""
+        return self._first.uploads
+
+    def close(self) -> None:
+        """Give back threads and memory."""
+        self._first.close()
+        self._second.close()
+
+    def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
+        """Do in advance what evaluations with this map would have to wait for; of both."""
+        self._second.prepare(voxel_map, scoring)
+        if self._active is self._first:
+            try:
+                self._first.prepare(voxel_map, scoring)
+            except DeviceError as error:
+                self._give_up(error)
+
+    def set_map(self, voxel_map: VoxelMap) -> None:
+        """Match against this map from now on."""
+        self._map = voxel_map
+        self._trying(lambda backend: backend.set_map(voxel_map))
+
+    def set_source(self, points: NDArray[np.floating]) -> int:
+        """Take a scan; returns how many points the limit left out."""
+        self._points = points
+        return self._trying(lambda backend: backend.set_source(points))
+
+    def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        """Return the evaluations of (k, 6) poses."""
+        return self._trying(lambda backend: backend.evaluate(poses, scoring))
+
+    def step(self, at: Evaluation, steady: bool, /) -> NDArray[np.float64]:
+        """Return the step that an evaluation asks for."""
+        return self._active.step(at, steady)
+
+    def _trying(self, work: Callable[[Backend], _T]) -> _T:
+        if self.fault is None:
+            try:
+                return work(self._first)
+            except DeviceError as error:
+                self._give_up(error)
+        if self._active is self._first:
+            # the first call since the fault: the second backend gets what the first one had
+            if self._map is not None:
+                self._second.set_map(self._map)
+            if self._points is not None:
+                self._second.set_source(self._points)
+            self._active = self._second
+        return work(self._second)
+
+    def _give_up(self, error: DeviceError) -> None:
+        with self._lock:
+            if self.fault is None:
+                self.fault = error
 
 
 def backend_named(
@@ -80,6 +184,4 @@ def backend_named(
     made = BACKENDS[name](limits, threads, options if options is not None else DeviceOptions())
     if fallback is None or not made.on_device:
         return made
-    from shmmap_clients.ndt_scan_matcher.backends.fallback_backend import FallbackBackend
-
     return FallbackBackend(made, backend_named(fallback, limits, threads, options))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The program ``shmmap-ndt``: ``align`` files, ``follow`` a drive, ``warmup`` kernels, check ``devices``."""
+"""The program ``shmmap-ndt``: ``align`` files, ``follow`` a drive, and what concerns the machine."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmmap_clients.command_line import run_program
-from shmmap_clients.ndt_scan_matcher.cli import align, device_check, devices, follow, warmup
+from shmmap_clients.ndt_scan_matcher.cli import align, follow, machine
 
 __all__ = ["main"]
 
-_VERBS: Final = (align, follow, warmup, devices, device_check)
+_VERBS: Final = (align, follow, machine)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

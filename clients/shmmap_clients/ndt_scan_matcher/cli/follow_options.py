@@ -59,7 +59,7 @@ JSON (fields may be added, none is removed).
    "map_prepare_ms": its part of the backend: spread each,
    "map_updates", "cells_added", "cells_removed", "map_private_bytes",
    "map_written_bytes", "map_writes": to a device,
-   "map_laid_out_anew": maps that did not fit beside the one in use}}
+   "map_laid_out_anew": maps written again for lack of room}}
   A spread is {{"mean", "variance", "p50", "p99", "max"}}; ate is the distance
   of the poses to the true ones in metres, or degrees.
 --json-lines writes a line for each scan, as soon as it is localized:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
+from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.spread import RunningSpread
 
 __all__ = ["UpdateStatistics"]

@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Score and derivatives of one pose, and the sums that every backend brings to them.
+"""Pose vectors, how they are scored, and what one is worth: score, gradient and Hessian.
+
+A pose vector is (x, y, z, roll, pitch, yaw), metres and radians, with R = Rx(roll) Ry(pitch) Rz(yaw), as
+PCL, ndt_omp and Autoware have it.
 
 For a neighbour with inverse covariance C and offset d = Rx + t - mean, q = C d and w = d1 d2 exp(-d2/2 d.q),
 gradient and Hessian need only A = sum w q and B = sum w (C - d2 q q^T) per point: the derivatives J of
 Rx + t follow from x alone, so that J^T A and J^T B J are formed once per point, and everything that is linear
-in x is contracted once per evaluation.  That is 33 sums instead of a 6 x 6 matrix per neighbour.
+in x is contracted once per evaluation.  That is 33 sums instead of a 6 x 6 matrix per neighbour; every
+backend brings these, see `SUMS`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from functools import lru_cache
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import euler_derivatives
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 
 __all__ = [
     "AX",
@@ -36,12 +41,17 @@ __all__ = [
     "B",
     "Evaluation",
     "Gauss",
+    "Neighbors",
+    "Scoring",
     "gauss_for",
+    "matrix_from_pose",
+    "pose_from_matrix",
     "search_columns",
-    "total",
 ]
 
-# Where what lies in a row of sums.
+Neighbors = Literal["direct1", "direct7", "radius"]
+
+# Where each sum lies in a row.
 SCORE: Final = 0
 NEAREST: Final = 1
 FOUND: Final = 2
@@ -62,6 +72,55 @@ _OUTLIER_RATIO: Final = 0.55
 
 
 @dataclass(frozen=True, slots=True)
+class Scoring:
+    """How poses are scored.
+
+    Attributes
+    ----------
+    neighbors
+        The voxels that a point is scored against: the one that it lies in (``"direct1"``), that and those at
+        its six faces (``"direct7"``), or all whose mean is within one leaf (``"radius"``).
+    covariance
+        How voxels' covariances come from their moments.
+    pitch_sign
+        Sign of the sine in the second derivative after pitch: -1 is right, +1 is what ndt_omp has.
+    deadline_s
+        Of `time.monotonic`: until when a device is waited for; after that, `DeviceHung` is raised.  None: no
+        limit but the backend's own.
+    """
+
+    neighbors: Neighbors
+    covariance: Covariance
+    pitch_sign: float = -1.0
+    deadline_s: float | None = None
+
+
+def matrix_from_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (4, 4) transform of a pose vector."""
+    x, y, z, roll, pitch, yaw = pose.tolist()
+    cx, sx = math.cos(roll), math.sin(roll)
+    cy, sy = math.cos(pitch), math.sin(pitch)
+    cz, sz = math.cos(yaw), math.sin(yaw)
+    return np.array(
+        [
+            [cy * cz, -cy * sz, sy, x],
+            [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy, y],
+            [sx * sz - cx * sy * cz, cx * sy * sz + sx * cz, cx * cy, z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def pose_from_matrix(T: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the pose vector of a (4, 4) transform; pitch lies within a quarter turn."""
+    matrix = np.asarray(T, np.float64)
+    roll = math.atan2(-matrix[1, 2], matrix[2, 2])
+    pitch = math.atan2(matrix[0, 2], math.hypot(matrix[0, 0], matrix[0, 1]))
+    yaw = math.atan2(-matrix[0, 1], matrix[0, 0])
+    return np.array([*matrix[:3, 3], roll, pitch, yaw])
+
+
+@dataclass(frozen=True, slots=True)
 class Gauss:
     """Constants d1 and d2 of the score, eq. 6.8 of Magnusson 2009."""
 
@@ -69,6 +128,7 @@ class Gauss:
     d2: float
 
 
+@lru_cache(maxsize=16)
 def gauss_for(leaf: float) -> Gauss:
     """Return the constants for a leaf size in metres, with the originals' outlier ratio of 0.55."""
     c1 = 10.0 * (1.0 - _OUTLIER_RATIO)
@@ -125,41 +185,3 @@ class Evaluation:
 
 NOTHING: Final = Evaluation(0.0, np.zeros(6), np.zeros((6, 6)), 0.0, 0, 0, 0, 0)
 """What a pose without any neighbour is worth."""
-
-
-def total(rows: NDArray[np.float64], pose: NDArray[np.float64], pitch_sign: float) -> Evaluation:
-    """Add rows of sums, in their order, and contract them to an evaluation.
-
-    Parameters
-    ----------
-    rows : (chunks, `SUMS`) float64
-    pose : (6,) float64
-    pitch_sign
-        As in `euler_derivatives`.
-    """
-    sums = np.add.accumulate(rows, axis=0)[-1] if len(rows) else np.zeros(SUMS)
-    contracted = (euler_derivatives(pose, pitch_sign).reshape(9, 9) @ sums[AX]).tolist()
-    a, b, bj, jbj = sums[A].tolist(), sums[B].tolist(), sums[BJ].tolist(), sums[JBJ].tolist()
-    gradient = np.array([*a, *contracted[:3]])
-    rotation = [value + second for value, second in zip(jbj, contracted[3:], strict=True)]
-    rr, rp, ry, pp, py, yy = rotation
-    hessian = np.array(
-        [
-            [b[0], b[1], b[2], bj[0], bj[1], bj[2]],
-            [b[1], b[3], b[4], bj[3], bj[4], bj[5]],
-            [b[2], b[4], b[5], bj[6], bj[7], bj[8]],
-            [bj[0], bj[3], bj[6], rr, rp, ry],
-            [bj[1], bj[4], bj[7], rp, pp, py],
-            [bj[2], bj[5], bj[8], ry, py, yy],
-        ]
-    )
-    return Evaluation(
-        score=float(sums[SCORE]),
-        gradient=gradient,
-        hessian=hessian,
-        nearest=float(sums[NEAREST]),
-        found=int(sums[FOUND]),
-        neighbours=int(sums[NEIGHBOURS]),
-        cut_points=int(sums[CUT_POINTS]),
-        cut_neighbours=int(sums[CUT_NEIGHBOURS]),
-    )

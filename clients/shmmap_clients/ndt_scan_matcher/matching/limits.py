@@ -7,12 +7,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from shmmap import BadRequest
 
-__all__ = ["VOXEL_BYTES", "Cut", "Limits", "check_batch"]
+__all__ = ["VOXEL_BYTES", "Cut", "Limits"]
 
 VOXEL_BYTES: Final = 96  # 72 for the Gaussian, the rest for the lattice of a street
 _MOST_POSES: Final = 65_536
@@ -65,12 +62,6 @@ class Limits:
     def most_map_bytes(self) -> int:
         """The limit ``map_bytes``, or what stands for it."""
         return VOXEL_BYTES * self.voxels if self.map_bytes is None else self.map_bytes
-
-
-def check_batch(poses: NDArray[np.float64], most: int) -> None:
-    """Refuse more poses than the limit that buffers were made for."""
-    if len(poses) > most:
-        raise BadRequest(f"{len(poses)} poses at once, the limit on poses is {most}")
 
 
 @dataclass(frozen=True, slots=True)

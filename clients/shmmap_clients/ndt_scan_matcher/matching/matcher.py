@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`NdtMatcher`: aligns scans with a map of Gaussians."""
+"""`NdtMatcher`: aligns scans with a map of Gaussians; and Autoware's `Regularization`."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Final
 
@@ -13,27 +14,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, Neighbors
-from shmmap_clients.ndt_scan_matcher.backends.fallback_backend import FallbackBackend
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, UploadStatistics
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
-from shmmap_clients.ndt_scan_matcher.backends.uploads import UploadStatistics
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, gauss_for
-from shmmap_clients.ndt_scan_matcher.matching.evidence import Extent, evidence_of, extent_of
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Neighbors, Scoring, gauss_for
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS
-from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, climb, started
-from shmmap_clients.ndt_scan_matcher.matching.regularization import Regularization
-from shmmap_clients.ndt_scan_matcher.matching.result import Result, covariance_of, oscillations
+from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, ascend, climb, started
+from shmmap_clients.ndt_scan_matcher.matching.result import Result
 from shmmap_clients.ndt_scan_matcher.matching.settings import Settings, rule_of
-from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
-from shmmap_clients.ndt_scan_matcher.matching.variants import VARIANTS, Variant, variant_named
+from shmmap_clients.ndt_scan_matcher.matching.trust import (
+    Extent,
+    TrustLimits,
+    covariance_of,
+    evidence_of,
+    extent_of,
+    oscillations,
+)
+from shmmap_clients.ndt_scan_matcher.matching.variants import VARIANTS, variant_named
 
-__all__ = ["NdtMatcher"]
+__all__ = ["NdtMatcher", "Regularization"]
 
 _REACH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
 _SHARED_PLACES: Final = 4  # at a corner of four cells each has its own voxel in one lattice place
+
+
+@dataclass(frozen=True, slots=True)
+class Regularization:
+    """A weak pull towards another estimate of where the vehicle is along its heading, as Autoware has it.
+
+    It adds -scale * neighbours * (longitudinal distance)^2 to the score.
+
+    Attributes
+    ----------
+    x, y
+        The other estimate (of GNSS, say), metres, map frame.
+    scale
+        ``regularization_scale_factor`` in Autoware, 0.01 by default there.
+    """
+
+    x: float
+    y: float
+    scale: float = 0.01
+
+    def applied(self, evaluation: Evaluation, pose: NDArray[np.float64]) -> Evaluation:
+        """Return the evaluation with the term added (multigrid_ndt_omp, computeDerivatives)."""
+        dx, dy = self.x - float(pose[0]), self.y - float(pose[1])
+        along = np.array([math.cos(pose[5]), math.sin(pose[5])])
+        distance = along[0] * dx + along[1] * dy
+        weight = self.scale * evaluation.neighbours
+        gradient, hessian = evaluation.gradient.copy(), evaluation.hessian.copy()
+        gradient[:2] += weight * 2.0 * distance * along
+        hessian[:2, :2] -= weight * 2.0 * np.outer(along, along)
+        return replace(
+            evaluation,
+            score=evaluation.score - weight * distance**2,
+            gradient=gradient,
+            hessian=hessian,
+        )
 
 
 class NdtMatcher:
@@ -72,6 +111,10 @@ class NdtMatcher:
         self._trust = trust if trust is not None else TrustLimits()
         self._variant = variant_named(self.settings.variant)
         self._rule = rule_of(self.settings, self._variant, self.limits)
+        self._rules = [self._rule]  # of the stages of an alignment
+        if self.settings.mode == "coarse_fine":
+            fine, epsilon = replace(VARIANTS["pcl"], stop="step"), self.settings.fine_epsilon
+            self._rules.append(replace(self._rule, variant=fine, epsilon=epsilon, line_search=False))
         self._neighbors: Neighbors = self.settings.neighbors or self._variant.neighbors
         if self._neighbors not in ("direct1", "direct7", "radius"):
             raise BadRequest(
@@ -113,7 +156,7 @@ class NdtMatcher:
     @property
     def fault(self) -> DeviceError | None:
         """Why the fallback computes; None as long as it does not."""
-        return self._backend.fault if isinstance(self._backend, FallbackBackend) else None
+        return self._backend.fault
 
     @property
     def uploads(self) -> UploadStatistics:
@@ -157,11 +200,8 @@ class NdtMatcher:
 
     def prepare(self, voxel_map: VoxelMap) -> VoxelMap:
         """Compute what alignments will need of a map, so that none of them waits for it; from any thread."""
-        covariances: list[Covariance] = [self._variant.covariance]
-        if self.settings.mode == "coarse_fine" and "pcl" not in covariances:
-            covariances.append("pcl")
-        for covariance in covariances:
-            self._backend.prepare(voxel_map, neighbors=self._neighbors, covariance=covariance)
+        for covariance in dict.fromkeys(rule.variant.covariance for rule in self._rules):
+            self._backend.prepare(voxel_map, Scoring(self._neighbors, covariance))
         return voxel_map
 
     def align(
@@ -208,34 +248,31 @@ class NdtMatcher:
             raise BadRequest("a guess is a (4, 4) matrix of finite numbers")
         dropped = self._backend.set_source(points)
         used = len(points) - dropped
-        coarse = self._climb(guesses, self._rule, regularization, deadline_s)
-        ways = [[way] for way in coarse]
-        if self.settings.mode == "coarse_fine":
-            fine = replace(
-                self._rule,
-                variant=replace(VARIANTS["pcl"], stop="step"),
-                epsilon=self.settings.fine_epsilon,
-                line_search=False,
-            )
-            on = [number for number, way in enumerate(coarse) if way.last.found and not way.time_is_up]
-            arrived = [coarse[number].transforms[-1] for number in on]
-            for number, way in zip(on, self._climb(arrived, fine, regularization, deadline_s), strict=True):
-                ways[number].append(way)
+        alignments: list[list[Ascent]] = [[] for _ in guesses]
+        going_on, starts = alignments, guesses
+        for rule in self._rules:
+            for stages, ascent in zip(
+                going_on, self._climb(starts, rule, regularization, deadline_s), strict=True
+            ):
+                stages.append(ascent)
+            going_on = [stages for stages in going_on if stages[-1].last.found and not stages[-1].time_is_up]
+            starts = [stages[-1].transforms[-1] for stages in going_on]
         extent = extent_of(points)
-        return [self._result(way, used, dropped, extent) for way in ways]
+        return [self._result(stages, used, dropped, extent) for stages in alignments]
 
     def evaluate(self, points: NDArray[np.floating], poses: NDArray[np.float64]) -> list[Evaluation]:
         """Score a scan at several pose vectors, (k, 6), without moving them; in batches of the limit."""
         self._backend.set_source(points)
-        found: list[Evaluation] = []
-        for first in range(0, len(poses), self.limits.poses):
-            found += self._backend.evaluate_many(
-                np.asarray(poses[first : first + self.limits.poses], np.float64),
-                neighbors=self._neighbors,
-                covariance=self._variant.covariance,
-                pitch_sign=self._variant.pitch_sign,
-            )
-        return found
+        variant = self._variant
+        return self._evaluate(poses, Scoring(self._neighbors, variant.covariance, variant.pitch_sign))
+
+    def _evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
+        most = self.limits.poses
+        return [
+            at
+            for first in range(0, len(poses), most)
+            for at in self._backend.evaluate(poses[first : first + most], scoring)
+        ]
 
     def _climb(
         self,
@@ -244,67 +281,60 @@ class NdtMatcher:
         regularization: Regularization | None,
         deadline_s: float | None,
     ) -> list[Ascent]:
-        """Climb from all guesses side by side."""
+        """Climb from each guess."""
+        # ndt_omp's line search ends with an evaluation that has the other sign
+        scorings = {
+            sign: Scoring(self._neighbors, rule.variant.covariance, sign, deadline_s) for sign in (-1.0, 1.0)
+        }
+        if len(guesses) != 1:
+            return self._climb_side_by_side(guesses, rule, scorings, regularization, deadline_s)
+
+        def evaluate(pose: NDArray[np.float64], pitch_sign: float) -> Evaluation:
+            at = self._backend.evaluate(pose[None], scorings[pitch_sign])[0]
+            return at if regularization is None else regularization.applied(at, pose)
+
+        return [ascend(guesses[0], evaluate, rule, self._backend.step, deadline_s=deadline_s)]
+
+    def _climb_side_by_side(
+        self,
+        guesses: Sequence[NDArray[np.float64]],
+        rule: StepRule,
+        scorings: Mapping[float, Scoring],
+        regularization: Regularization | None,
+        deadline_s: float | None,
+    ) -> list[Ascent]:
+        """Climb from all guesses at once: the next evaluation of each goes into one batch."""
         ascents = [started(T_guess) for T_guess in guesses]
-        climbs = [climb(ascent, rule, self._step) for ascent in ascents]
-        # who still climbs, with the pose and the pitch sign that it wants evaluated next
+        climbs = [climb(ascent, rule, self._backend.step) for ascent in ascents]
+        # of each climb that has not ended: the pose and the pitch sign to be evaluated next
         wanted = {number: next(one) for number, one in enumerate(climbs)}
-        begun = False
         while wanted:
-            if begun and deadline_s is not None and time.monotonic() >= deadline_s:
-                for number in wanted:
-                    ascents[number].time_is_up = True
-                break
-            begun = True
-            for number, at in self._evaluated(wanted, rule.variant, deadline_s):
-                pose = wanted[number][0]
+            found: dict[int, Evaluation] = {}
+            for sign, scoring in scorings.items():
+                numbers = [number for number, (_, asked) in wanted.items() if asked == sign]
+                poses = np.array([wanted[number][0] for number in numbers])
+                found |= zip(numbers, self._evaluate(poses, scoring), strict=True)
+            for number, at in found.items():
                 if regularization is not None:
-                    at = regularization.applied(at, pose)
+                    at = regularization.applied(at, wanted[number][0])
                 try:
                     wanted[number] = climbs[number].send(at)
                 except StopIteration:
                     del wanted[number]
+            if deadline_s is not None and time.monotonic() >= deadline_s:
+                for number in wanted:
+                    ascents[number].time_is_up = True
+                break
         return ascents
 
-    def _evaluated(
-        self, wanted: dict[int, tuple[NDArray[np.float64], float]], variant: Variant, deadline_s: float | None
-    ) -> list[tuple[int, Evaluation]]:
-        if len(wanted) == 1:
-            ((number, (pose, sign)),) = wanted.items()
-            at = self._backend.evaluate(
-                pose,
-                neighbors=self._neighbors,
-                covariance=variant.covariance,
-                pitch_sign=sign,
-                deadline_s=deadline_s,
-            )
-            return [(number, at)]
-        found: list[tuple[int, Evaluation]] = []
-        for sign in sorted({sign for _, sign in wanted.values()}):
-            numbers = [number for number, (_, one) in wanted.items() if one == sign]
-            for first in range(0, len(numbers), self.limits.poses):
-                some = numbers[first : first + self.limits.poses]
-                evaluations = self._backend.evaluate_many(
-                    np.array([wanted[number][0] for number in some]),
-                    neighbors=self._neighbors,
-                    covariance=variant.covariance,
-                    pitch_sign=sign,
-                    deadline_s=deadline_s,
-                )
-                found += zip(some, evaluations, strict=True)
-        return found
-
-    def _step(self, at: Evaluation, steady: bool) -> NDArray[np.float64]:
-        return self._backend.step(at, steady=steady)
-
-    def _result(self, ways: Sequence[Ascent], used: int, dropped: int, extent: Extent) -> Result:
-        last = ways[-1].last
+    def _result(self, stages: Sequence[Ascent], used: int, dropped: int, extent: Extent) -> Result:
+        last = stages[-1].last
         transforms = np.array(
-            [T for index, way in enumerate(ways) for T in way.transforms[1 if index else 0 :]]
+            [T for index, stage in enumerate(stages) for T in stage.transforms[1 if index else 0 :]]
         )
-        evaluations = [at for way in ways for at in way.evaluations]
+        evaluations = [at for stage in stages for at in stage.evaluations]
         points = max(used, 1)
-        converged, probability, swings = ways[-1].converged, last.score / points, oscillations(transforms)
+        converged, probability, swings = stages[-1].converged, last.score / points, oscillations(transforms)
         no_map = used > 0 and not last.found
         covariance, leaf = covariance_of(last.hessian), self._map.leaf
         evidence = evidence_of(
@@ -317,7 +347,7 @@ class NdtMatcher:
         )
         return Result(
             T_map_base=transforms[-1],
-            iterations=sum(way.iterations for way in ways),
+            iterations=sum(stage.iterations for stage in stages),
             converged=converged,
             transform_probability=probability,
             nvtl=last.nvtl,
@@ -335,7 +365,7 @@ class NdtMatcher:
                 neighbors=last.cut_neighbours,
                 voxels=self._map.voxels_left_out,
                 map_bytes=self._map.bytes_left_out,
-                deadline=any(way.time_is_up for way in ways),
+                deadline=any(stage.time_is_up for stage in stages),
             ),
             no_map=no_map,
             failed_limits=self.trust.failed(

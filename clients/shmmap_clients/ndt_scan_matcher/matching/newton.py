@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -11,10 +12,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import matrix_from_pose, pose_from_matrix
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import NOTHING, Evaluation
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
+    NOTHING,
+    Evaluation,
+    matrix_from_pose,
+    pose_from_matrix,
+)
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import line_search
-from shmmap_clients.ndt_scan_matcher.matching.steps import numpy_step
+from shmmap_clients.ndt_scan_matcher.matching.pose_batch import numpy_step
 from shmmap_clients.ndt_scan_matcher.matching.variants import Variant
 
 __all__ = ["Ascent", "Step", "StepRule", "ascend", "climb", "started"]
@@ -77,7 +82,12 @@ def started(T_guess: NDArray[np.float64]) -> Ascent:
 
 
 def ascend(
-    T_guess: NDArray[np.float64], evaluate: Evaluate, rule: StepRule, step_of: Step = numpy_step
+    T_guess: NDArray[np.float64],
+    evaluate: Evaluate,
+    rule: StepRule,
+    step_of: Step = numpy_step,
+    *,
+    deadline_s: float | None = None,
 ) -> Ascent:
     """Climb from a guess.
 
@@ -89,13 +99,16 @@ def ascend(
     rule
     step_of
         Gives the step that an evaluation asks for, steady or not.
+    deadline_s
+        Of `time.monotonic`: no evaluation but the first begins after it.
     """
     ascent = started(T_guess)
     way = climb(ascent, rule, step_of)
     asked = next(way)
     with suppress(StopIteration):
-        while True:
+        while not ascent.time_is_up:
             asked = way.send(evaluate(*asked))
+            ascent.time_is_up = deadline_s is not None and time.monotonic() >= deadline_s
     return ascent
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many poses at once, by whole-array operations: their matrices, derivatives, and what their sums come to.
+"""What is computed once a pose, by whole-array operations: matrices, derivatives, evaluations, the next step.
 
-The same bits whether a pose is alone or among others.
+A pose has the same bits alone and among others.  First and second derivatives are eq. 6.19 and 6.21 of
+Magnusson 2009.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import SMALL_ANGLE
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     AX,
     BJ,
@@ -28,7 +28,23 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     Evaluation,
 )
 
-__all__ = ["derivatives_of_poses", "evaluations_of", "matrices_from_poses"]
+__all__ = [
+    "FLAT",
+    "SINGULAR",
+    "SMALL_ANGLE",
+    "derivatives_of_poses",
+    "evaluations_of",
+    "matrices_from_poses",
+    "newton_step",
+    "numpy_step",
+    "upward_step",
+]
+
+SMALL_ANGLE: Final = 10e-5  # below it the originals take the angle for zero in derivatives
+# what JacobiSVD of Eigen takes for zero: as many roundings as the matrix has rows
+SINGULAR: Final = 6 * float(np.finfo(np.float64).eps)
+
+FLAT: Final = 1e-9  # least curvature over greatest that a step divides by
 
 # where the Hessian's elements are among b (6), bj (9) and the rotation's (6)
 _HESSIAN: Final = np.array(
@@ -65,7 +81,19 @@ def matrices_from_poses(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def derivatives_of_poses(poses: NDArray[np.float64], pitch_sign: float = -1.0) -> NDArray[np.float64]:
-    """Return (k, 9, 3, 3) matrices, as `euler_derivatives`."""
+    """Return nine matrices M of each pose with d(Rx)/dp = M x and d2(Rx)/dpdq = M x.
+
+    Parameters
+    ----------
+    poses : (k, 6) float64
+    pitch_sign
+        As in `Scoring`.
+
+    Returns
+    -------
+    (k, 9, 3, 3) float64
+        After roll, pitch, yaw; then roll-roll, roll-pitch, roll-yaw, pitch-pitch, pitch-yaw, yaw-yaw.
+    """
     cx, sx, cy, sy, cz, sz = _sines(poses, SMALL_ANGLE)
     none = np.zeros(len(poses))
     a = (-sx * sz + cx * sy * cz, -sx * cz - cx * sy * sz, -cx * cy)
@@ -123,3 +151,33 @@ def evaluations_of(rows: NDArray[np.floating], derivatives: NDArray[np.float64])
         )
         for values, gradient, hessian in zip(sums[:, :6].tolist(), gradients, hessians, strict=True)
     ]
+
+
+def newton_step(at: Evaluation) -> NDArray[np.float64]:
+    """Solve H step = -gradient in the least-squares sense, as JacobiSVD does."""
+    if not np.isfinite(at.hessian).all():
+        return np.full(6, np.nan)
+    u, s, vt = np.linalg.svd(at.hessian)
+    if not s[0] > 0:
+        return np.zeros(6)
+    usable = s > max(s[0] * SINGULAR, np.finfo(np.float64).tiny)
+    coefficients = np.zeros(6)
+    coefficients[usable] = (u.T @ -at.gradient)[usable] / s[usable]
+    return np.asarray(vt.T @ coefficients, np.float64)
+
+
+def upward_step(at: Evaluation) -> NDArray[np.float64]:
+    """Return the step to the peak of a paraboloid that curves down by the Hessian's magnitudes."""
+    if not np.isfinite(at.hessian).all():
+        return np.full(6, np.nan)
+    values, vectors = np.linalg.eigh(at.hessian)
+    curvature = np.abs(values)
+    if not curvature.max() > 0:
+        return np.zeros(6)
+    curvature = np.maximum(curvature, curvature.max() * FLAT)
+    return np.asarray(vectors @ ((vectors.T @ at.gradient) / curvature), np.float64)
+
+
+def numpy_step(at: Evaluation, steady: bool) -> NDArray[np.float64]:
+    """Return `upward_step` if steady, else `newton_step`."""
+    return upward_step(at) if steady else newton_step(at)

@@ -4,17 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.evidence import Evidence
 from shmmap_clients.ndt_scan_matcher.matching.limits import Cut
+from shmmap_clients.ndt_scan_matcher.matching.trust import Evidence
 
-__all__ = ["Result", "covariance_of", "oscillations"]
-
-_INVERSION: Final = -0.9  # cosine between two steps that counts as going back
+__all__ = ["Result"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,24 +76,3 @@ class Result:
     def trustworthy(self) -> bool:
         """Whether the result is within all limits of trust."""
         return not self.failed_limits
-
-
-def covariance_of(hessian: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the inverse of the negated Hessian, or None if that is not positive definite."""
-    try:
-        np.linalg.cholesky(-hessian)
-    except np.linalg.LinAlgError:
-        return None
-    return np.asarray(np.linalg.inv(-hessian), np.float64)
-
-
-def oscillations(transforms: NDArray[np.float64]) -> int:
-    """Count as Autoware's count_oscillation: the longest run of reversed steps."""
-    steps = np.diff(transforms[:, :3, 3], axis=0)
-    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
-    units = steps / np.where(lengths > 0, lengths, 1.0)
-    run = longest = 0
-    for cosine in (units[1:] * units[:-1]).sum(axis=1):
-        run = run + 1 if cosine < _INVERSION else 0
-        longest = max(longest, run)
-    return longest

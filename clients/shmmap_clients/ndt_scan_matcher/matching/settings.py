@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Settings`: how to align, and who computes."""
+"""`Settings`: how to align, and what computes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
-from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceOptions
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule
 from shmmap_clients.ndt_scan_matcher.matching.variants import Variant
@@ -43,7 +43,7 @@ class Settings:
     steady
         Steps that never swing, see `StepRule`; default: not in ``"single"``, which equals the originals.
     backend
-        Who computes: ``"numba"``, ``"numpy"`` or ``"opencl"``.
+        What computes: ``"numba"``, ``"numpy"`` or ``"opencl"``.
     device
         For backends that compute on a device: which one, and how.
     fallback

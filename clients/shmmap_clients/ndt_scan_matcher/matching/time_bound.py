@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.euler_derivatives import pose_from_matrix
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import pose_from_matrix
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 
 __all__ = ["TimeBound", "predict_time_bound"]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Neighbors
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 __all__ = ["VARIANTS", "Stop", "Variant", "variant_named"]
 

@@ -1,17 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCL devices of this machine: which there are, what they can do, which one is taken."""
+"""OpenCL devices of this machine: which there are, what they can do, which one is taken.
+
+The loader of drivers reads files in /etc/OpenCL/vendors, each of which names a driver's library.  Containers
+with NVIDIA's driver often have the library without the file: then a folder with one is made for this process,
+with copies of those that are there.
+"""
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
-from shmmap_clients.ndt_scan_matcher.backends.device_options import DeviceOptions
-from shmmap_clients.ndt_scan_matcher.backends.opencl.drivers import make_drivers_known
+from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceOptions
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import NoDevice
 
-__all__ = ["NO_DRIVER_HINT", "Device", "DeviceInfo", "choose_device", "list_devices"]
+__all__ = [
+    "NO_DRIVER_HINT",
+    "Device",
+    "DeviceInfo",
+    "choose_device",
+    "list_devices",
+    "vendors_with_nvidia",
+]
 
 _VARIABLE: Final = "SHMMAP_OPENCL_DEVICE"
 NO_DRIVER_HINT: Final = (
@@ -20,6 +36,19 @@ NO_DRIVER_HINT: Final = (
     " that it can write (POCL_CACHE_DIR) shows no device"
 )
 _PREFERENCE: Final = ("GPU", "accelerator", "CPU", "other")
+_VENDORS: Final = Path("/etc/OpenCL/vendors")
+_NVIDIA: Final = "libnvidia-opencl.so.1"
+_FOLDERS: Final = tuple(
+    Path(folder)
+    for folder in (
+        "/usr/lib/x86_64-linux-gnu",
+        "/usr/lib/aarch64-linux-gnu",
+        "/usr/lib64",
+        "/usr/lib",
+        "/usr/local/nvidia/lib64",
+        "/usr/local/cuda/compat",
+    )
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +189,7 @@ def _found() -> list[tuple[DeviceInfo, Any]]:
     os.environ.setdefault(
         "PYOPENCL_NO_CACHE", "1"
     )  # a cache of its own, which fails where it cannot be written
-    make_drivers_known()
+    _make_drivers_known()
     import pyopencl as cl
 
     try:
@@ -211,3 +240,36 @@ def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
         svm_system=bool(svm & cl.device_svm_capabilities.FINE_GRAIN_SYSTEM) and handle.address_bits == 64,
         unusable=unusable,
     )
+
+
+def vendors_with_nvidia(vendors: Path, folders: Iterable[Path]) -> Path | None:
+    """Return a new folder of vendors' files that names NVIDIA's driver, too; None where none is needed.
+
+    Parameters
+    ----------
+    vendors
+        What the loader reads.
+    folders
+        Where the driver's library may be.
+    """
+    named = sorted(vendors.glob("*.icd")) if vendors.is_dir() else []
+    if any("nvidia" in file.read_text(encoding="utf-8", errors="replace") for file in named):
+        return None
+    library = next((folder / _NVIDIA for folder in folders if (folder / _NVIDIA).exists()), None)
+    if library is None:
+        return None
+    made = Path(tempfile.mkdtemp(prefix="shmmap-opencl-"))
+    for file in named:
+        shutil.copy(file, made)
+    (made / "nvidia.icd").write_text(f"{library}\n", encoding="utf-8")
+    return made
+
+
+def _make_drivers_known() -> None:
+    """Let the loader find NVIDIA's driver; to be called before the loader is."""
+    if "OCL_ICD_VENDORS" in os.environ:
+        return
+    made = vendors_with_nvidia(_VENDORS, _FOLDERS)
+    if made is not None:
+        os.environ["OCL_ICD_VENDORS"] = str(made)
+        atexit.register(shutil.rmtree, made, ignore_errors=True)

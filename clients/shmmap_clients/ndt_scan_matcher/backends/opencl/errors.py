@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be wrong with a device; none of these is ever answered by taking another one silently.
+"""What can be wrong with a device; after none of these is another one taken silently.
 
 ::
 
@@ -34,7 +34,7 @@ class DeviceError(ShmmapError):
 
     code = "device_error"
     exit_code = 69
-    advice = "`shmmap-ndt device-check` tells more; `--backend numba` needs no device"
+    advice = "`shmmap-ndt device-check` examines it; `--backend numba` needs no device"
 
 
 class NoDevice(DeviceError):
@@ -77,13 +77,13 @@ def device_errors(device: str, what: str) -> Iterator[None]:
     try:
         yield
     except cl.Error as error:
-        told = " ".join(str(error).split())[:300]
-        if isinstance(error, cl.MemoryError) or any(name in told for name in _OUT_OF_MEMORY):
+        said = " ".join(str(error).split())[:300]
+        if isinstance(error, cl.MemoryError) or any(name in said for name in _OUT_OF_MEMORY):
             raise DeviceMemory(
-                f"device {device!r} has not enough memory to {what}: {told}",
+                f"device {device!r} has not enough memory to {what}: {said}",
                 hint=_LESS,
             ) from None
-        raise DeviceError(f"device {device!r} cannot {what}: {told}") from None
+        raise DeviceError(f"device {device!r} cannot {what}: {said}") from None
     except MemoryError as error:  # of this process, which a processor's memory is
         raise DeviceMemory(
             f"device {device!r} has not enough memory to {what}: {error}", hint=_LESS

@@ -6,9 +6,9 @@
 // 128 points at each pose has a row of sums of its own, so that a repeat, and a pose among others, give the
 // same bits.
 //
-// Macros that the program is built with (program.py):
+// Macros that the program is built with (opencl_backend.py):
 //   DOUBLE          1: double throughout; 0: float throughout
-//   IN_PLACE        1: tables and what they lead to are at addresses; 0: at offsets into the pool
+//   IN_PLACE        1: tables and what they lead to are at addresses; 0: at offsets into the pool, a buffer
 //   SEARCH          1, 7 or 27: the places of the lattice that are looked at
 //   MOST            neighbours that a point may have; the nearest are taken
 //   ITEM_PER_CHUNK  1: one work-item sums a chunk, for processors; 0: one work-item a point, for GPUs

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting for a device, but not for ever: commands are polled, so that a device that hangs holds nobody."""
+"""Waiting for a device, with a limit: commands are polled, so that a device that hangs blocks no program."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError, DeviceHung
 
-__all__ = ["PATIENCE_S", "Waiting"]
+__all__ = ["TIMEOUT_S", "Waiting"]
 
-PATIENCE_S: Final = 10.0  # for any command, where no deadline is nearer
+TIMEOUT_S: Final = 10.0  # for any command, where no deadline is nearer
 _NAP_S: Final = 20e-6
 
 
@@ -39,7 +39,7 @@ class Waiting:
         event
             Of the command; its queue has been flushed.
         deadline_s
-            Of `time.monotonic`; None: `PATIENCE_S` from now.
+            Of `time.monotonic`; None: `TIMEOUT_S` from now.
 
         Raises
         ------
@@ -49,7 +49,7 @@ class Waiting:
             It failed.
         """
         began_s = time.monotonic()
-        latest_s = began_s + PATIENCE_S
+        latest_s = began_s + TIMEOUT_S
         if deadline_s is not None:
             latest_s = min(latest_s, deadline_s)
         if self._usual_s > 4 * _NAP_S and not _ended(event):
@@ -74,5 +74,5 @@ def _ended(event: Any) -> bool:
 
 
 def _never_free(event: Any) -> None:
-    """Keep an event for ever: who frees one of a hung device waits for it, even when the process ends."""
+    """Keep an event: to free one of a hung device is to wait for it, even when the process ends."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))
