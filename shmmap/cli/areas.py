@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from shmmap.geometry import Area
 
 __all__ = [
+    "BoxTuple",
     "add_area_options",
     "add_area_or_ids",
     "add_cells_argument",

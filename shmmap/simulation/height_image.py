@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from shmmap.formats.png import png_bytes
 
 __all__ = ["HeightImage"]
 
@@ -95,30 +95,10 @@ class HeightImage:
                 _mixed(_BUILDING_COLOURS, _HEIGHT_LEVELS),
             )
         )
-        return _png(pixels.reshape(self._rows, self._columns), palette)
+        return png_bytes(pixels.reshape(self._rows, self._columns), palette)
 
 
 def _mixed(stops: Sequence[tuple[float, tuple[int, int, int]]], levels: int) -> bytes:
     at = np.linspace(0.0, 1.0, levels)
     channels = [np.interp(at, [place for place, _ in stops], [rgb[i] for _, rgb in stops]) for i in range(3)]
     return bytes(np.stack(channels, axis=1).round().astype(np.uint8).tobytes())
-
-
-def _png(pixels: NDArray[np.uint8], palette: bytes) -> bytes:
-    """Return an image of palette indices, (rows, columns), as PNG (https://www.w3.org/TR/png/)."""
-    rows, columns = pixels.shape
-    filtered = np.zeros((rows, columns + 1), dtype=np.uint8)  # filter type 0 before every row
-    filtered[:, 1:] = pixels
-    return b"".join(
-        (
-            b"\x89PNG\r\n\x1a\n",
-            _chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)),
-            _chunk(b"PLTE", palette),
-            _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 9)),
-            _chunk(b"IEND", b""),
-        )
-    )
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shmmap.origin.catalogue import Catalogue
+from tests.benchmarks.drive_pictures import drive_picture
 from tests.benchmarks.slow_origin_counts import Counts
 from tests.benchmarks.slow_origin_drives import (
     Drive,
@@ -44,7 +45,6 @@ from tests.benchmarks.slow_origin_drives import (
     town_drive,
 )
 from tests.benchmarks.slow_origin_model import OUTAGES, SlowOrigin
-from tests.benchmarks.slow_origin_picture import drive_picture
 from tests.benchmarks.slow_origin_run import ROWS, Setting, simulate
 
 MEANS_S = (0.05, 0.15, 0.4)

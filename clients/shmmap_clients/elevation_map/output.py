@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest
 from shmmap.formats.npz_writer import npz_archive
+from shmmap.formats.png import PngWriter
 from shmmap_clients.elevation_map.grid import ElevationGrid
-from shmmap_clients.png import PngWriter
 
 __all__ = ["check_output", "hillshade", "write_elevation", "write_hillshade"]
 

@@ -6,19 +6,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.screens.output import format_bytes, format_duration, printable
-from shmmap.cli.screens.picture import CellSquare, Vehicle, WindowBox, top_view_svg
+from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.screens.picture import CellSquare, Vehicle, top_view_svg
+from shmmap.formats.svg import BoxTuple, escape
 
 if TYPE_CHECKING:
     from shmmap.statistics.cell_rows import CellRow
     from shmmap.statistics.client_rows import ClientRow
 
 __all__ = ["GLYPHS", "Scene", "html_page", "svg", "terminal_rows"]
-
-BoxTuple: TypeAlias = tuple[float, float, float, float]
 
 GLYPHS: Final = {
     # state: glyph, style on a terminal
@@ -174,7 +172,7 @@ def svg(scene: Scene) -> str:
         circle = window is not None and window.shape == "circle"
         if window is not None and not circle:
             x, y, half_x, half_y = window[1:]
-            windows.append(WindowBox((x - half_x, y - half_y, x + half_x, y + half_y), title))
+            windows.append(((x - half_x, y - half_y, x + half_x, y + half_y), title))
         if client.pose is not None:
             radius = window.half_x if window is not None and circle else 0.0
             label = client.client or client.command
@@ -214,14 +212,10 @@ _STYLE: Final = """
 """
 
 
-def _html(text: str) -> str:
-    return escape(printable(text))
-
-
 def html_page(scene: Scene) -> str:
     """Return a page that needs nothing else: the picture, its tooltips, and the clients as a table."""
     rows = "".join(
-        f"<tr><td>{_html(c.client or c.command or '?')}</td><td>{c.pid or '?'}</td><td>{c.cells:,}</td>"
+        f"<tr><td>{escape(c.client or c.command or '?')}</td><td>{c.pid or '?'}</td><td>{c.cells:,}</td>"
         f"<td>{format_bytes(c.bytes)}</td><td>{c.requests:,}</td>"
         f"<td>{f'{c.pose[0]:.1f}, {c.pose[1]:.1f}' if c.pose is not None else ''}</td></tr>"
         for c in scene.clients
@@ -233,6 +227,6 @@ def html_page(scene: Scene) -> str:
         else "<p>No client is connected.</p>"
     )
     return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{_html(scene.title)}</title>'
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(scene.title)}</title>'
         f"<style>{_STYLE}</style></head>\n<body>\n{svg(scene)}{table}\n</body></html>\n"
     )

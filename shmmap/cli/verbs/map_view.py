@@ -20,7 +20,8 @@ from shmmap.errors import DaemonUnreachable
 from shmmap.lacking import area_text, extent_text
 
 if TYPE_CHECKING:
-    from shmmap.cli.screens.map_scene import BoxTuple, Scene
+    from shmmap.cli.areas import BoxTuple
+    from shmmap.cli.screens.map_scene import Scene
     from shmmap.geometry import Area
     from shmmap.statistics.cell_rows import CellRow
     from shmmap.statistics.snapshot import Snapshot

@@ -3,23 +3,18 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
-from shmmap_clients.rolling_map.heights import HeightColours
-from shmmap_clients.rolling_map.picture import MapContent, map_picture
-from shmmap_clients.rolling_map.picture_legend import STATES
+from shmmap_clients.rolling_map.picture import STATES, HeightColours, MapContent, map_picture
 
 from shmmap import ChunkInfo
 from shmmap.chunks.voxels import ChunkKey
+from tests.support.pictures import SVG, rasters
 
-SVG = "{http://www.w3.org/2000/svg}"
 RESOLUTION = 0.5
 SIDE = 64 * RESOLUTION
 
@@ -36,17 +31,6 @@ def drawn(content: MapContent) -> ElementTree.Element:
     return ElementTree.fromstring(map_picture(content, "a < b", "note"))
 
 
-def images(root: ElementTree.Element) -> list[tuple[NDArray[np.uint8], list[float]]]:
-    """Pixels of each view, and its left, top, width and height; without the legend's bar."""
-    found = []
-    for image in root.iter(f"{SVG}image"):
-        if "preserveAspectRatio" not in image.attrib:
-            data = base64.b64decode(image.attrib["href"].partition(",")[2])
-            pixels = np.asarray(Image.open(io.BytesIO(data)).convert("RGBA"))
-            found.append((pixels, [float(image.attrib[name]) for name in ("x", "y", "width", "height")]))
-    return found
-
-
 def squares(root: ElementTree.Element) -> list[tuple[str, list[tuple[float, float, float]]]]:
     """Outline colour, and left, top and side of its squares; those of the legend are no paths."""
     found = []
@@ -61,7 +45,7 @@ def squares(root: ElementTree.Element) -> list[tuple[str, list[tuple[float, floa
 def test_north_and_up_are_at_the_top_and_the_highest_voxel_is_seen() -> None:
     low, high, north, free = (0, 0, -4), (0, 0, 6), (0, 9, 1), (5, 0, 0)
     content = MapContent(RESOLUTION, centers(high, low, north), centers(free, low))
-    (above, _), (side, _) = images(drawn(content))
+    (above, _), (side, _) = rasters(drawn(content))
     assert above.shape == (10, 6, 4)
     assert side.shape == (11, 6, 4)
     colours = HeightColours.of(content.occupied[:, 2])
@@ -88,7 +72,7 @@ def test_voxels_lie_in_their_chunk(key: tuple[int, int, int]) -> None:
     last = tuple(64 * part + 63 for part in key)
     content = MapContent(RESOLUTION, centers(first, last), chunks=[chunk(key, "dirty")])
     root = drawn(content)
-    views = images(root)
+    views = rasters(root)
     assert len(views) == 2
     boxes = [box for colour, found in squares(root) for box in found if colour == STATES["dirty"].colour]
     for (_, image), (x, y, size) in zip(views, boxes, strict=True):
@@ -151,7 +135,7 @@ def test_the_path_is_where_the_sensor_was() -> None:
 
 def test_a_large_map_is_made_coarser() -> None:
     content = MapContent(0.05, np.array([[0.025, 0.025, 0.025], [1000.025, 600.025, 3.025]]))
-    (above, _), _ = images(drawn(content))
+    (above, _), _ = rasters(drawn(content))
     assert max(above.shape) <= 2400
     assert above[-1, 0, 3] == above[0, -1, 3] == 255
     assert drawn(MapContent(1e-3, path=[(0.0, 0.0, 0.0)])) is not None, "and a very small one is drawn"

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ import pytest
 from shmmap.demo.demo_town import DemoSettings, fit, free_memory_bytes
 from shmmap.errors import ConfigError
 from shmmap.simulation.height_image import HeightImage
+from tests.support.pictures import png_pixels
 
 GIB = 1 << 30
 ROOMY = {"memory_bytes": 64 * GIB, "copies": 8}
@@ -62,33 +61,14 @@ def test_no_room_at_all(shm_bytes: int, disk_bytes: int) -> None:
         fit(DemoSettings(), shm_bytes=shm_bytes, disk_bytes=disk_bytes, **ROOMY)
 
 
-def decode_png(data: bytes) -> tuple[np.ndarray[tuple[int, int], np.dtype[np.uint8]], bytes]:
-    """Pixels and palette of a palette PNG without filters, read by the letter of the standard."""
-    assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    chunks: dict[bytes, bytes] = {}
-    at = 8
-    while at < len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + length]
-        assert struct.unpack_from(">I", data, at + 8 + length)[0] == zlib.crc32(kind + body)
-        chunks[kind] = body
-        at += 12 + length
-    width, height, depth, colour, *rest = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
-    assert (depth, colour, rest) == (8, 3, [0, 0, 0])
-    rows = np.frombuffer(zlib.decompress(chunks[b"IDAT"]), np.uint8).reshape(height, width + 1)
-    assert not rows[:, 0].any()
-    return rows[:, 1:], chunks[b"PLTE"]
-
-
 def test_height_image_shows_the_highest_point_north_up() -> None:
     image = HeightImage((0.0, 0.0, 4.0, 2.0), pixel=1.0)
     xyz = np.array(
         [[0.5, 1.5, 0.0], [3.5, 0.5, 0.0], [3.5, 0.5, 12.0], [3.5, 0.5, 6.0], [9.0, 9.0, 9.0]], np.float32
     )
     image.add(xyz, np.array([20, 20, 30, 200, 200], np.float32))
-    pixels, palette = decode_png(image.png(lambda x, y: 0.0 * (x + y)))
-    assert pixels.shape == (2, 4)
-    colours = np.frombuffer(palette, np.uint8).reshape(-1, 3)[pixels].astype(int)
+    colours = png_pixels(image.png(lambda x, y: 0.0 * (x + y)), "RGB").astype(int)
+    assert colours.shape == (2, 4, 3)
     seen = (colours != 255).any(axis=2)
     assert seen.tolist() == [[True, False, False, False], [False, False, False, True]]
     red, _, blue = colours[1, 3]

@@ -1,26 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive as one SVG picture: its way, its errors, its latencies."""
+"""A drive as one SVG picture: its path, its errors, its latencies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.formats.svg import Axes, Page, box_around, dash, element
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.spread import Decimated
 
 __all__ = ["DrivePlot"]
 
-_WIDTH: Final = 900
-_WAY_HEIGHT: Final = 420
-_CHART_HEIGHT: Final = 150
-_MARGIN: Final = 60
-_COLOURS: Final = {"ours": "#1f6fb4", "truth": "#999999", "error": "#c0392b", "second": "#e08e0b"}
+_WIDTH: Final = 900.0
+_MARGIN: Final = 60.0
+_PATH_HEIGHT: Final = 320.0
+_CHART_HEIGHT: Final = 100.0
+_OURS, _TRUTH, _BAD, _SECOND = "#1f6fb4", "#999999", "#c0392b", "#e08e0b"
 
 
 class _Row(NamedTuple):
@@ -60,75 +61,47 @@ class DrivePlot:
         self._frames += 1
 
     def svg(self) -> str:
-        """Return the picture: the trajectory (with the truth below it), then charts over the scans."""
-        rows = self._rows.values
-        title = f"{self._frames} scans: poses (blue), truth (grey), not trusted (red)"
-        parts = [_way(title, rows, np.array(self._untrusted.values).reshape(-1, 2))]
-        top = _WAY_HEIGHT
-        charts: list[tuple[str, dict[str, list[float]]]] = []
-        if rows and all(row.truth is not None for row in rows):
-            charts.append(("error, metres", {"error": [row.error_m for row in rows]}))
-            charts.append(("error, degrees", {"error": [row.error_deg for row in rows]}))
-        late = {"ours": [row.latency_ms for row in rows[1:]], "second": [row.align_ms for row in rows[1:]]}
-        charts.append(("latency (blue) and alignment (orange), ms", late))
-        charts.append(("NVTL", {"ours": [row.nvtl for row in rows]}))
-        for name, lines in charts:
-            parts.append(_chart(name, {colour: np.array(values) for colour, values in lines.items()}, top))
-            top += _CHART_HEIGHT
-        head = (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH}" height="{top}"'
-            ' font-family="sans-serif" font-size="12"><rect width="100%" height="100%" fill="white"/>'
-        )
-        return "\n".join([head, *parts, "</svg>", ""])
-
-
-def _line(x: NDArray[np.float64], y: NDArray[np.float64], colour: str, width: float) -> str:
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
-    return f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="{width}"/>'
-
-
-def _way(title: str, rows: Sequence[_Row], untrusted: NDArray[np.float64]) -> str:
-    ours = np.array([row.ours for row in rows]).reshape(-1, 2)
-    truth = np.array([row.truth for row in rows if row.truth is not None]).reshape(-1, 2)
-    every = np.concatenate([ours, truth, untrusted])
-    if not len(every):
-        return ""
-    low, high = every.min(axis=0), every.max(axis=0)
-    scale = min(
-        (_WIDTH - 2 * _MARGIN) / max(high[0] - low[0], 1.0), (_WAY_HEIGHT - 100) / max(high[1] - low[1], 1.0)
-    )
-
-    def placed(way: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return _MARGIN + (way[:, 0] - low[0]) * scale, _WAY_HEIGHT - 50 - (way[:, 1] - low[1]) * scale
-
-    marks = [
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{_COLOURS["error"]}"/>'
-        for x, y in zip(*placed(untrusted), strict=True)
-    ]
-    bar = 10 ** np.floor(np.log10(max(high[0] - low[0], high[1] - low[1], 10.0)))
-    end, level = _MARGIN + bar * scale, _WAY_HEIGHT - 15
-    return "\n".join(
-        [
-            f'<text x="{_MARGIN}" y="24">{title}</text>',
-            _line(*placed(truth), _COLOURS["truth"], 4.0),
-            _line(*placed(ours), _COLOURS["ours"], 1.5),
-            *marks,
-            f'<line x1="{_MARGIN}" x2="{end:.1f}" y1="{level}" y2="{level}" stroke="black"/>',
-            f'<text x="{_MARGIN}" y="{level - 5}">{bar:.0f} m</text>',
+        """Return the picture: the path (with the truth below it), then charts over the scans."""
+        rows, untrusted = self._rows.values, self._untrusted.values
+        page = Page(_WIDTH, f"{self._frames} scans", margin=_MARGIN)
+        page.heading(30, f"{self._frames} scans")
+        ours = [row.ours for row in rows]
+        truth = [row.truth for row in rows if row.truth is not None]
+        axes = Axes.fitted(page, box_around([*ours, *truth, *untrusted]), 50, _PATH_HEIGHT)
+        axes.line(truth, stroke=_TRUTH, stroke_width=4)
+        axes.line(ours, stroke=_OURS, stroke_width=1.5)
+        for x, y in untrusted:
+            axes.dot(x, y, 3, fill=_BAD)
+        entries = [(dash(stroke=_OURS, stroke_width=1.5), "poses")]
+        if truth:
+            entries.append((dash(stroke=_TRUTH, stroke_width=4), "truth"))
+        if untrusted:
+            entries.append((element("circle", cx=9, cy=-5, r=3, fill=_BAD), "not trusted"))
+        top = axes.legend(axes.bottom + 34, entries) + 56
+        charts = [
+            (
+                "latency (blue) and alignment (orange), ms",
+                {_OURS: [row.latency_ms for row in rows], _SECOND: [row.align_ms for row in rows]},
+            ),
+            ("NVTL", {_OURS: [row.nvtl for row in rows]}),
         ]
-    )
+        if rows and len(truth) == len(rows):
+            charts[:0] = [
+                ("error, metres", {_BAD: [row.error_m for row in rows]}),
+                ("error, degrees", {_BAD: [row.error_deg for row in rows]}),
+            ]
+        for title, lines in charts:
+            _chart(page, top, title, lines)
+            top += _CHART_HEIGHT + 50
+        return page.svg(top - 30)
 
 
-def _chart(title: str, lines: dict[str, NDArray[np.float64]], top: int) -> str:
-    most = max((float(values.max()) for values in lines.values() if len(values)), default=0.0) or 1.0
-    bottom, height = top + _CHART_HEIGHT - 20, _CHART_HEIGHT - 50
-    parts = [
-        f'<text x="{_MARGIN}" y="{top + 20}">{title}</text>',
-        f'<text x="{_MARGIN - 6}" y="{bottom - height + 4}" text-anchor="end">{most:.3g}</text>',
-        f'<text x="{_MARGIN - 6}" y="{bottom + 4}" text-anchor="end">0</text>',
-        f'<line x1="{_MARGIN}" x2="{_WIDTH - _MARGIN}" y1="{bottom}" y2="{bottom}" stroke="#cccccc"/>',
-    ]
+def _chart(page: Page, top: float, title: str, lines: Mapping[str, Sequence[float]]) -> None:
+    """Draw values over the number of the scan, one line for each colour."""
+    every = [value for values in lines.values() for value in values if math.isfinite(value)]
+    most = max(every, default=0.0) or 1.0
+    last = max(1, *(len(values) - 1 for values in lines.values()))
+    axes = Axes(page, (0.0, 0.0, last, most), page.margin, top, page.right - page.margin, _CHART_HEIGHT)
+    axes.frame(title, y_labels=[(0.0, "0"), (most, f"{most:.3g}")])
     for colour, values in lines.items():
-        x = _MARGIN + np.linspace(0.0, _WIDTH - 2 * _MARGIN, max(len(values), 1))[: len(values)]
-        parts.append(_line(x, bottom - values / most * height, _COLOURS[colour], 1.0))
-    return "\n".join(parts)
+        axes.line(enumerate(values), stroke=colour)

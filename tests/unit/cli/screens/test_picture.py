@@ -27,7 +27,6 @@ def draw() -> ElementTree.Element:
         note="1 & 2",
         raster=Raster(BOUNDS, b"png bytes"),
         driven=[(0, 0), (50, 0)],
-        ahead=[(50, 0), (50, 25)],
         vehicle=Vehicle(50, 0, 1.5707963267948966, 30),
     )
     return ElementTree.fromstring(text)

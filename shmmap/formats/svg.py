@@ -1,0 +1,367 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SVG pictures: a page, data on axes, rasters, legends and scale bars.
+
+A picture is one file without references.  Names of maps, files and clients stand in it, which may hold any
+character: every text and every attribute passes through `escape`.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
+from xml.sax import saxutils
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.formats.png import png_bytes
+from shmmap.logfmt import escaped
+
+__all__ = [
+    "INK",
+    "PALE",
+    "Axes",
+    "BoxTuple",
+    "Page",
+    "box_around",
+    "dash",
+    "element",
+    "escape",
+    "swatch",
+    "tooltip",
+]
+
+BoxTuple: TypeAlias = tuple[float, float, float, float]
+Place: TypeAlias = tuple[float, float]
+Attribute: TypeAlias = str | float | None
+
+INK: Final = "#1f2933"
+PALE: Final = "#66727f"
+_RULE: Final = "#ced4da"
+_FONT: Final = "system-ui, DejaVu Sans, sans-serif"
+_LETTER_PX: Final = 7.6  # width of a letter of the usual size, on average
+_LINE_PX: Final = 22.0
+_SYMBOL_PX: Final = 26.0
+_ENTRY_GAP_PX: Final = 18.0
+_SCALE_BAR_PX: Final = 180.0  # at most
+_SCALE_PX: Final = _SCALE_BAR_PX + 90.0  # with its label, and room before it
+_MAX_RASTER: Final = 2400  # pixels along the longer side
+
+
+def escape(text: str) -> str:
+    """Return text for XML and HTML, as content or in double quotes.
+
+    Characters that XML cannot hold or that do not print become backslash escapes; line breaks stay.
+    """
+    return saxutils.escape("\n".join(map(escaped, text.split("\n"))), {'"': "&quot;"})
+
+
+def element(tag: str, content: str = "", /, **attributes: Attribute) -> str:
+    """Return an XML element.
+
+    Parameters
+    ----------
+    content
+        Markup inside; text has passed through `escape`.
+    **attributes
+        ``stroke_width`` is the attribute ``stroke-width``, ``class_`` is ``class``; numbers have at most two
+        decimals, None is left out.
+    """
+    words = [tag]
+    for name, value in attributes.items():
+        if value is not None:
+            written = escape(value) if isinstance(value, str) else _number(value)
+            words.append(f'{name.rstrip("_").replace("_", "-")}="{written}"')
+    head = " ".join(words)
+    return f"<{head}>{content}</{tag}>" if content else f"<{head}/>"
+
+
+def tooltip(text: str) -> str:
+    """Return the content of an element that shows a text while the pointer is over it; empty for no text."""
+    return element("title", escape(text)) if text else ""
+
+
+def swatch(**attributes: Attribute) -> str:
+    """Return the symbol of an area for a legend, attributes as `element`."""
+    return element("rect", **attributes, y=-11, width=16, height=13)
+
+
+def dash(**attributes: Attribute) -> str:
+    """Return the symbol of a line for a legend, attributes as `element`."""
+    return element("path", **attributes, d="M0 -5h19")
+
+
+def box_around(places: Sequence[Place]) -> BoxTuple:
+    """Return the box around all places, one unit a side or larger; at the origin if there are none."""
+    x, y = zip(*places, strict=True) if places else ((0.0,), (0.0,))
+    return min(x), min(y), max(*x, min(x) + 1.0), max(*y, min(y) + 1.0)
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}".rstrip("0").rstrip(".")
+
+
+class Page:
+    """A white page that is filled from top to bottom; lengths in pixels, y downwards.
+
+    Parameters
+    ----------
+    width
+        Of the whole page.
+    title
+        What programs call the picture; a reader sees it where `heading` writes it.
+    margin
+        Left and right of what stands in lines.
+    style
+        CSS for the ``class_`` of elements.
+    """
+
+    def __init__(self, width: float, title: str, *, margin: float = 16.0, style: str = "") -> None:
+        self.width = width
+        self.margin = margin
+        self.right = width - margin
+        self._parts = [tooltip(title)]
+        if style:
+            self._parts.append(element("style", style))
+        self.add("rect", width="100%", height="100%", fill="#ffffff")
+
+    def svg(self, height: float) -> str:
+        """Return the file's text; ``height`` is that of the whole page."""
+        content = "\n".join(["", *self._parts, ""])
+        width, height = round(self.width), round(height)
+        size: dict[str, Attribute] = {"width": width, "height": height, "viewBox": f"0 0 {width} {height}"}
+        fonts: dict[str, Attribute] = {"font_family": _FONT, "font_size": 14, "fill": INK}
+        return element("svg", content, xmlns="http://www.w3.org/2000/svg", role="img", **size, **fonts) + "\n"
+
+    def add(self, tag: str, content: str = "", /, **attributes: Attribute) -> None:
+        """Add an `element`."""
+        self._parts.append(element(tag, content, **attributes))
+
+    @contextlib.contextmanager
+    def group(self, **attributes: Attribute) -> Iterator[None]:
+        """Put what is added inside the context into one group."""
+        before, self._parts = self._parts, []
+        yield
+        before.append(element("g", "\n".join(["", *self._parts, ""]), **attributes))
+        self._parts = before
+
+    def text(self, x: float, y: float, text: str, /, **attributes: Attribute) -> None:
+        """Write one line; ``y`` is its base line."""
+        self.add("text", escape(text), **attributes, x=x, y=y)
+
+    def heading(self, y: float, title: str, note: str = "") -> None:
+        """Write a title and a note below it."""
+        self.text(self.margin, y, title, font_size=18, font_weight=600)
+        if note:
+            self.text(self.margin, y + _LINE_PX, note, fill=PALE)
+
+    def image(self, png: bytes, /, **attributes: Attribute) -> None:
+        """Embed a PNG; ``x``, ``y``, ``width`` and ``height`` are among the attributes."""
+        data = base64.b64encode(png).decode("ascii")
+        self.add("image", **attributes, preserveAspectRatio="none", href=f"data:image/png;base64,{data}")
+
+    def legend(
+        self, y: float, entries: Iterable[tuple[str, str]], *, left: float = 0.0, spare: float = 0.0
+    ) -> float:
+        """Write what symbols mean, in as many lines as needed; return the base line of the last.
+
+        Parameters
+        ----------
+        y
+            Base line of the first.
+        entries
+            Symbols as `swatch` and `dash` return them, and texts.
+        left, spare
+            Length of the lines' beginnings and ends that stays free, between the margins.
+        """
+        start = self.margin + left
+        x = start
+        for symbol, text in entries:
+            width = _SYMBOL_PX + _LETTER_PX * len(text)
+            if x > start and x + width > self.right - spare:
+                x, y = start, y + _LINE_PX
+            label = element("text", escape(text), x=_SYMBOL_PX)
+            self.add("g", symbol + label, transform=f"translate({_number(x)} {_number(y)})")
+            x += width + _ENTRY_GAP_PX
+        return y
+
+
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """A rectangle of a page with data on it: x to the right, y upwards, both linear.
+
+    Parameters
+    ----------
+    page
+        What is drawn on.
+    box
+        Values at the rectangle's edges: min_x, min_y, max_x, max_y.
+    left, top, width, height
+        Where the rectangle is, pixels.
+    """
+
+    page: Page
+    box: BoxTuple
+    left: float
+    top: float
+    width: float
+    height: float
+
+    @classmethod
+    def fitted(
+        cls,
+        page: Page,
+        box: BoxTuple,
+        top: float,
+        max_height: float,
+        *,
+        left: float | None = None,
+        max_width: float | None = None,
+    ) -> Axes:
+        """Make axes with one scale for x and y: as large as fits, in the middle between left and right.
+
+        Parameters
+        ----------
+        top, max_height, left, max_width
+            Where there is room, pixels; from one margin of the page to the other if None.
+        """
+        left = page.margin if left is None else left
+        max_width = page.right - left if max_width is None else max_width
+        span_x, span_y = max(box[2] - box[0], 1e-9), max(box[3] - box[1], 1e-9)
+        scale = min(max_width / span_x, max_height / span_y)
+        width = span_x * scale
+        return cls(page, box, left + (max_width - width) / 2, top, width, span_y * scale)
+
+    @property
+    def bottom(self) -> float:
+        """Lower edge, pixels."""
+        return self.top + self.height
+
+    @property
+    def scale(self) -> float:
+        """Pixels along x for one unit of the data."""
+        return self.width / max(self.box[2] - self.box[0], 1e-9)
+
+    def place(self, x: float, y: float) -> Place:
+        """Return where on the page a value is, pixels."""
+        min_x, min_y, max_x, max_y = self.box
+        return (
+            self.left + (x - min_x) / max(max_x - min_x, 1e-9) * self.width,
+            self.top + (max_y - y) / max(max_y - min_y, 1e-9) * self.height,
+        )
+
+    def points(self, places: Iterable[Place]) -> str:
+        """Return an attribute ``points`` of these values, without those that are not finite."""
+        pixels = (self.place(x, y) for x, y in places if math.isfinite(x) and math.isfinite(y))
+        return " ".join(f"{_number(x)},{_number(y)}" for x, y in pixels)
+
+    def line(self, places: Iterable[Place], /, **attributes: Attribute) -> None:
+        """Draw a line through these values."""
+        if points := self.points(places):
+            self.page.add("polyline", **attributes, points=points, fill="none", stroke_linejoin="round")
+
+    def dot(self, x: float, y: float, radius: float, content: str = "", /, **attributes: Attribute) -> None:
+        """Draw a circle, its radius in pixels."""
+        at_x, at_y = self.place(x, y)
+        self.page.add("circle", content, **attributes, cx=at_x, cy=at_y, r=radius)
+
+    def rectangle(self, box: BoxTuple, content: str = "", /, **attributes: Attribute) -> None:
+        """Draw a box."""
+        self.page.add("rect", content, **attributes, **self._extent(box))
+
+    def rectangles(self, boxes: Iterable[BoxTuple], /, **attributes: Attribute) -> None:
+        """Draw boxes that look the same, as one element."""
+        steps = []
+        for box in boxes:
+            x, y, width, height = map(_number, self._extent(box).values())
+            steps.append(f"M{x} {y}h{width}v{height}h-{width}z")
+        if steps:
+            self.page.add("path", **attributes, d="".join(steps))
+
+    def image(self, box: BoxTuple, png: bytes) -> None:
+        """Fill a box with a PNG."""
+        self.page.image(png, **self._extent(box))
+
+    def raster(self, layers: Sequence[tuple[NDArray[np.int64], Any]], pixel: float) -> None:
+        """Draw squares of one size as one image; of several at one place the last is seen.
+
+        Parameters
+        ----------
+        layers
+            Squares, (N, 2): square (i, j) has its lower left corner at i and j times ``pixel``; and their
+            RGBA colours, (N, 4) or one for all.
+        pixel
+            Side of a square, in units of the data.  Where there would be too many pixels they are larger.
+        """
+        squares = np.concatenate([places for places, _ in layers])
+        if not len(squares):
+            return
+        low = squares.min(axis=0)
+        span = squares.max(axis=0) - low + 1
+        coarse = max(1, math.ceil(int(span.max()) / _MAX_RASTER))
+        columns, rows = (int(count) for count in -(-span // coarse))
+        image = np.zeros((rows, columns, 4), np.uint8)
+        for places, colours in layers:
+            at = (places - low) // coarse
+            image[rows - 1 - at[:, 1], at[:, 0]] = colours
+        west, south = (float(value) * pixel for value in low)
+        size = pixel * coarse
+        extent = self._extent((west, south, west + columns * size, south + rows * size))
+        self.page.image(png_bytes(image), image_rendering="pixelated", **extent)
+
+    @contextlib.contextmanager
+    def clipped(self) -> Iterator[None]:
+        """Cut off at the rectangle's edges what is drawn inside the context."""
+        self.page.add("clipPath", element("rect", **self._extent(self.box)), id="axes")
+        with self.page.group(clip_path="url(#axes)"):
+            yield
+
+    def frame(
+        self,
+        title: str,
+        *,
+        x_labels: Iterable[tuple[float, str]] = (),
+        y_labels: Iterable[tuple[float, str]] = (),
+    ) -> None:
+        """Draw a chart's title, its base line, and labels of values below and to the left of it."""
+        small: dict[str, Attribute] = {"font_size": 12, "fill": PALE}
+        self.page.text(self.left, self.top - 9, title, **small)
+        self.page.add(
+            "path", d=f"M{_number(self.left)} {_number(self.bottom)}h{_number(self.width)}", stroke=_RULE
+        )
+        for value, text in x_labels:
+            self.page.text(self.place(value, 0)[0], self.bottom + 17, text, text_anchor="middle", **small)
+        for value, text in y_labels:
+            self.page.text(self.left - 7, self.place(0, value)[1] + 4, text, text_anchor="end", **small)
+
+    def scale_bar(self, y: float, *, right: float | None = None) -> None:
+        """Draw a bar of 1, 2 or 5 times a power of ten metres, with its label to the left.
+
+        Parameters
+        ----------
+        y
+            Base line of the label.
+        right
+            Where the bar ends; at the page's margin if None.
+        """
+        right = self.page.right if right is None else right
+        longest = _SCALE_BAR_PX / self.scale
+        power = 10.0 ** math.floor(math.log10(longest))
+        metres = max(step * power for step in (1, 2, 5) if step * power <= longest)
+        length = metres * self.scale
+        bar = f"M{_number(right - length)} {_number(y - 10)}v7h{_number(length)}v-7"
+        self.page.add("path", d=bar, fill="none", stroke=INK, stroke_width=1.6)
+        self.page.text(right - length - 8, y, f"{metres:g} m", text_anchor="end")
+
+    def legend(self, y: float, entries: Iterable[tuple[str, str]], *, left: float = 0.0) -> float:
+        """Write a legend as `Page.legend`, with the scale bar at the end of its first line."""
+        self.scale_bar(y)
+        return self.page.legend(y, entries, left=left, spare=_SCALE_PX)
+
+    def _extent(self, box: BoxTuple) -> dict[str, float]:
+        (x, y), (right, bottom) = self.place(box[0], box[3]), self.place(box[2], box[1])
+        return {"x": x, "y": y, "width": right - x, "height": bottom - y}
