@@ -9,10 +9,11 @@ third reads the whole map again and again.  Nothing here waits for a time to pas
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -21,17 +22,17 @@ import msgspec
 import numpy as np
 import zmq
 from numpy.typing import NDArray
-
-from shmmap import InternalError
-from shmmap.demo.program import Program
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher, decode_scan
 from shmmap_clients.scans.trajectory import tum_line
 
+from shmmap.demo.program import Program
+from shmmap.errors import InternalError
+
 __all__ = ["ProgramRun", "ThreePrograms", "run_three_programs", "table"]
 
 _ON_THEIR_WAY: Final = 6  # scans
-_PATIENCE_S: Final = 120.0  # for an answer
+_ANSWER_S: Final = 120.0  # for an answer
 _LAST_RUN_S: Final = 900.0  # for a program's end: the elevation map may just have begun a large map
 _POLL_MS: Final = 1000
 
@@ -80,11 +81,6 @@ class ThreePrograms:
     ----------
     scans, seconds
         Scans sent, and how long it took.
-    kept, kept_moving
-        Points that the compare filter gave back, summed, and those among them that belong to what moves
-        (column ``moving``, where scans have one).
-    sent, sent_moving
-        The same of the scans that were sent.
     acknowledged
         Scans that came back from ``ndt`` and from ``compare``.
     segment_bytes
@@ -97,10 +93,6 @@ class ThreePrograms:
 
     scans: int = 0
     seconds: float = 0.0
-    kept: int = 0
-    kept_moving: int = 0
-    sent: int = 0
-    sent_moving: int = 0
     acknowledged: dict[str, int] = field(default_factory=dict)
     segment_bytes: list[int] = field(default_factory=list)
     segments_seen: set[str] = field(default_factory=set)
@@ -108,16 +100,14 @@ class ThreePrograms:
 
 
 class _Started:
-    """A program that runs, its memory, and what it says as JSON in the end."""
+    """A program that runs, and the record of it."""
 
     def __init__(self, run: ProgramRun, module: str, words: list[str], work: Path) -> None:
         self.run = run
-        self.program = Program(run.name, module, words, work, own_session=False)
+        self.program = Program(run.name, module, words, work)
 
     def sample(self) -> None:
         """Look at its memory."""
-        if self.program.pid is None:
-            return
         try:
             status = Path(f"/proc/{self.program.pid}/status").read_text(encoding="utf-8")
         except OSError:
@@ -128,8 +118,12 @@ class _Started:
             self.run.shared_bytes = max(self.run.shared_bytes, int(found["RssShmem"]) << 10)
 
     def finish(self) -> None:
-        """Wait for its end and read what it said."""
-        self.run.document, self.run.exit_code = self.program.document(_LAST_RUN_S)
+        """Wait for its end and read the document that it printed."""
+        printed = self.program.finish(_LAST_RUN_S, fails=True)
+        if not printed:
+            raise InternalError(f"{self.run.name} printed nothing: {self.program.last_words()}")
+        self.run.document = json.loads(printed)
+        self.run.exit_code = self.program.exit_code
         self.run.runs += 1
 
 
@@ -144,7 +138,6 @@ def run_three_programs(
     ndt: Iterable[str] = (),
     compare: Iterable[str] = (),
     elevation: Iterable[str] = (),
-    after_scan: Callable[[ThreePrograms], None] | None = None,
 ) -> ThreePrograms:
     """Run them until the scans end, then until each has ended.
 
@@ -160,8 +153,6 @@ def run_three_programs(
         Directory for sockets, caches and outputs; ``ndt.svg`` and ``compare.svg`` are the drives' pictures.
     ndt, compare, elevation
         More words for each program's command line.
-    after_scan
-        Called after each scan was sent.
 
     Raises
     ------
@@ -197,17 +188,13 @@ def run_three_programs(
         for program in programs.values():
             stack.enter_context(program.program)
         for output in outputs:
-            if not output.wait_for_listener(_PATIENCE_S):
-                raise InternalError(
-                    f"nobody listens to {output.endpoint}: {programs['ndt'].program.last_words()}"
-                )
+            if not output.wait_for_listener(_ANSWER_S):
+                raise InternalError(f"no program connects to {output.endpoint}")
         for scan in scans:
             answers.wait(result.scans - _ON_THEIR_WAY, programs)
             for output in outputs:
                 output.send(scan)
             result.scans += 1
-            result.sent += len(scan.xyz)
-            result.sent_moving += _moving(scan)
             answers.expect(scan.name)
             _sample(result, programs, Path(shm_dir), instance)
             if not programs["elevation"].program.running:
@@ -216,8 +203,6 @@ def run_three_programs(
                     work / "elevation", ignore_errors=True
                 )  # from the map again, not from its cache
                 programs["elevation"].program.start()
-            if after_scan is not None:
-                after_scan(result)
         for output in outputs:
             output.send(None)
         answers.wait(result.scans, programs)
@@ -225,11 +210,6 @@ def run_three_programs(
             program.finish()
     result.seconds = time.monotonic() - began_s
     return result
-
-
-def _moving(scan: Scan) -> int:
-    """How many of its points belong to what moves, as far as it tells."""
-    return int(np.count_nonzero(scan.columns["moving"])) if "moving" in scan.columns else 0
 
 
 class _Answers:
@@ -275,9 +255,9 @@ class _Answers:
                 continue
             for name, heard in self._heard.items():
                 if heard < count - 1 and not programs[name].program.running:
-                    raise InternalError(f"{name} ended: {programs[name].program.last_words()}")
-            if time.monotonic() - quiet_s > _PATIENCE_S:
-                raise InternalError(f"no answer for {_PATIENCE_S:g} s; heard {self._heard}")
+                    raise InternalError(f"{name} ended early: {programs[name].program.last_words()}")
+            if time.monotonic() - quiet_s > _ANSWER_S:
+                raise InternalError(f"no answer for {_ANSWER_S:g} s; heard {self._heard}")
 
     def _hear(self, socket: zmq.Socket[bytes]) -> None:
         program = self._sockets[socket]
@@ -289,8 +269,6 @@ class _Answers:
             if scan is None:
                 return
             name = scan.name
-            self._result.kept += len(scan.xyz)
-            self._result.kept_moving += _moving(scan)
         self._heard[program] = max(self._heard[program], self._numbers[name])
         self._result.acknowledged[program] += 1
 
