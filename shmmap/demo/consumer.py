@@ -13,7 +13,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import msgspec
 import numpy as np
@@ -104,13 +104,14 @@ def _survey(box: tuple[float, float, float, float], columns: Iterable[Points], x
     return _Cloud(box, xyz, sum(column.nbytes for column in columns), float(xyz[:, 2].max(initial=-math.inf)))
 
 
-class _MapAround(Protocol):
-    """The cells around a vehicle, by id."""
+class _MapAround:
+    """The cells around a vehicle, by id; one whose `follow` waits for them needs no other method."""
 
     clouds: dict[str, _Cloud]
 
     def follow(self, pose: Pose) -> None:
         """Go to a pose: what a control loop calls."""
+        raise NotImplementedError
 
     def take(self) -> None:
         """Let ``clouds`` be the cells that are there."""
@@ -120,9 +121,10 @@ class _MapAround(Protocol):
 
     def current(self) -> bool:
         """Whether all that the last pose needs is there."""
+        return True
 
 
-class _SharedMap:
+class _SharedMap(_MapAround):
     """Follows through shmmap: the points stay where the daemon put them."""
 
     def __init__(self, endpoint: str, radius: float, route: Sequence[Pose]) -> None:
@@ -160,7 +162,7 @@ class _SharedMap:
         return self._window.wait_until_current(0.0)
 
 
-class _PrivateMap:
+class _PrivateMap(_MapAround):
     """Follows by reading files: every process that does so has its own copy."""
 
     def __init__(self, map_path: str, radius: float, route: Sequence[Pose]) -> None:
@@ -188,16 +190,6 @@ class _PrivateMap:
                 columns = read_pcd(self._catalogue.source(index).name).columns
                 cloud = _survey(self._catalogue.box(index), columns.values(), columns["xyz"])
             self.clouds[cell_id] = cloud
-
-    def take(self) -> None:
-        """Do nothing: `follow` has read the cells."""
-
-    def wait(self) -> None:
-        """Do nothing: `follow` has read the cells."""
-
-    def current(self) -> bool:
-        """Return True: `follow` waits."""
-        return True
 
 
 def _near(clouds: Iterable[_Cloud], pose: Pose, radius: float) -> Points:

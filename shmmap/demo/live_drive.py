@@ -155,7 +155,7 @@ def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDrive
         words = [daemon.endpoint, _MAP, str(work)]
         mapper = stack.enter_context(Program("mapping program", "shmmap.demo.live_mapper", words, work))
         _map(daemon, mapper, _Watch(live, result), progress)
-        progress.stage("Drawing the map, saving it, comparing it with one that had no bounds", 3)
+        progress.stage("Saving the map, comparing it with one without bounds", 3)
         live.move_to(*path[-1])  # the vehicle stays where it is, its program ends
         mapper.end_input()
         mapper.finish(_TIMEOUT_S)

@@ -52,11 +52,11 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
     assert compare.document["incomplete_scans"] == 0
     assert compare.exit_code == 0
     assert result.acknowledged["compare"] == 60
-    assert result.acknowledged["ndt"] >= 59  # it does not wait for whoever listens
+    assert result.acknowledged["ndt"] >= 59  # it does not wait for listeners
     assert elevation.runs >= 1
     assert elevation.exit_code == 0
     assert elevation.document["cells"] == 144
-    # one copy: never more than the budget, whoever holds it
+    # one copy: never more than the budget, whichever process holds it
     assert 0 < max(result.segment_bytes) <= BUDGET
     assert len(result.segments_seen) > 200
     assert (work / "ndt.svg").exists()

@@ -7,19 +7,20 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.screens.output import format_duration, print_line
+from shmmap.cli.screens.output import print_line
 from shmmap.demo.progress import Progress
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
     from rich.live import Live
+    from rich.progress import TaskID
 
 __all__ = ["LiveProgress", "PlainProgress", "progress_for"]
 
 _PLAIN_EVERY_S: Final = 10.0
+_BAR: Final = 12  # columns: the text of a stage, its numbers and its time fit beside it
 
 
 class PlainProgress(Progress):
@@ -49,30 +50,33 @@ class PlainProgress(Progress):
 
 
 class LiveProgress(Progress):
-    """A picture of the present stage that is drawn over and over, below a list of the finished ones."""
+    """A bar for each stage; below them the last event, and the lines of the last step."""
 
     def __init__(self, live: Live) -> None:
-        self._live = live
-        self._finished: list[str] = []
-        self._begin("", 0)
+        from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bars
 
-    def _begin(self, text: str, total: int) -> None:
-        self._text, self._total, self._done, self._began_s = text, total, 0, time.monotonic()
-        self._lines: Sequence[str] = ()
+        self._live = live
+        self._bars = Bars(
+            "  {task.description}",
+            BarColumn(_BAR),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            auto_refresh=False,
+        )
+        self._stage: TaskID | None = None
         self._event = ""
 
     def stage(self, text: str, total: int) -> None:
-        """Draw a new stage."""
-        if self._text and self._done >= self._total:
-            self._finished.append(f"{self._text}: {format_duration(time.monotonic() - self._began_s)}")
-        self._begin(text, total)
+        """Draw a new bar."""
+        self._stage, self._event = self._bars.add_task(text, total=total), ""
         self._draw()
 
     def step(self, *lines: str) -> None:
         """Draw the step and its lines."""
-        self._done += 1
-        self._lines = lines
-        self._draw()
+        if self._stage is not None:
+            self._bars.advance(self._stage)
+        self._draw(*lines)
 
     def event(self, text: str) -> None:
         """Draw the event until the stage ends, or until the next event."""
@@ -80,28 +84,17 @@ class LiveProgress(Progress):
         self._draw()
 
     def close(self) -> None:
-        """Leave only the list of finished stages on the screen."""
-        self.stage("", 0)
+        """Leave only the bars on the screen."""
+        self._event = ""
+        self._draw()
 
-    def _draw(self) -> None:
+    def _draw(self, *lines: str) -> None:
         from rich.console import Group
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
         from rich.text import Text
 
-        parts: list[RenderableType] = [Text(f"  done  {line}", style="green") for line in self._finished]
-        if self._text:
-            parts.append(Text(f"  {self._text}", style="bold"))
-            bar = Table.grid(padding=(0, 2))
-            done = min(self._done, self._total)
-            bar.add_row("", ProgressBar(self._total, done, width=40), f"{done}/{self._total}")
-            parts.append(bar)
-        if self._event:
-            parts.append(Text(f"  {self._event}", style="yellow"))
-        parts += [
-            Text(f"    {line}", style="cyan", overflow="ellipsis", no_wrap=True) for line in self._lines
-        ]
-        self._live.update(Group(*parts), refresh=True)
+        below = [Text(f"  {self._event}", style="yellow")] if self._event else []
+        below += [Text(f"    {line}", style="cyan", overflow="ellipsis", no_wrap=True) for line in lines]
+        self._live.update(Group(self._bars, *below), refresh=True)
 
 
 @contextlib.contextmanager

@@ -149,11 +149,13 @@ def test_a_terminal_shows_stages_events_and_the_last_lines(width: int) -> None:
         progress = LiveProgress(live)
         progress.stage("Building a town", 1)
         progress.step()
-        progress.stage("Driving", 3)
+        progress.stage("Driving, 8 processes on the copy that shmmap shares", 3)
         before = len(out.getvalue())
         progress.step(*(f"consumer {number}: " + "road " * 30 for number in range(8)))
         drawn = out.getvalue()[before:]
-        assert "done  Building a town" in drawn
+        assert "Building a town" in drawn
+        assert "1/1" in drawn
+        assert "Driving, 8 processes on the copy that shmmap shares" in drawn
         assert [f"consumer {number}:" in drawn for number in range(8)] == [True] * 8
         assert "1/3" in drawn
         progress.event("The daemon is killed (SIGKILL)")
