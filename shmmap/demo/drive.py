@@ -264,8 +264,8 @@ def drive_through_outage(
     """
     reports: list[StepReport] = []
     poses = itertools.chain(route, itertools.repeat(route[-1]))
-    longest_pause_s = 0.0
-    driven = 0
+    driven, longest_pause_s = 0, 0.0
+    due_s = time.perf_counter()
 
     def step() -> None:
         """Send all to the next pose when it is due; they answer with the cells they have."""
@@ -276,7 +276,6 @@ def drive_through_outage(
         driven += 1
         longest_pause_s = max(longest_pause_s, *(report.paused_s for report in reports))
 
-    due_s = time.perf_counter()
     for _ in range(_BEFORE):
         step()
     segments = sum(not name.endswith(".zombie") for name in daemon.segments())

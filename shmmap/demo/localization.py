@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.demo.program import Program
@@ -114,7 +114,7 @@ def localize(map_path: str, options: Sequence[str], work: Path, progress: Progre
             "--update-distance", "10", "--route", truth,
         ]  # fmt: skip
         with Program("shmmap-ndt", _PROGRAM, words, work) as program:
-            document = {}
+            document: dict[str, Any] = {}
             for line in program.lines(_TIMEOUT_S):
                 document = json.loads(line)
                 if "error_m" in document:
