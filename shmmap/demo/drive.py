@@ -173,7 +173,15 @@ class Fleet:
         """
         answers = self._ask(Step(pose, drive_on))
         reports = [msgspec.json.decode(answer, type=StepReport) for answer in answers]
-        progress.step(*self._shown(reports))
+        lines = self._consumer_lines(reports)
+        if self.daemon is not None and not drive_on:  # the daemon is not killed
+            counters = read_statistics(self.daemon.instance, self.daemon.shm_dir).counters
+            used_bytes = counters["bytes_resident"] + counters["bytes_zombie"]
+            lines.append(
+                f"shared memory: {counters['cells_resident']} cells, {format_bytes(used_bytes)} of"
+                f" {format_bytes(counters['budget_bytes'])}, {counters['evictions']} evicted"
+            )
+        progress.step(*lines)
         return reports
 
     def _ask(self, question: object) -> list[str]:
@@ -182,8 +190,8 @@ class Fleet:
             program.write_line(line)
         return [program.read_line(_TIMEOUT_S) for program in self._programs]
 
-    def _shown(self, reports: Sequence[StepReport]) -> list[str]:
-        """Return a line for each consumer, as far as a screen has room for them, and one for the daemon."""
+    def _consumer_lines(self, reports: Sequence[StepReport]) -> list[str]:
+        """Return a line for each consumer, as far as a screen has room for them."""
         lines = []
         for task, report in list(zip(self._tasks, reports, strict=True))[:_SHOWN]:
             did = f"{report.counted / 1e6:.1f} M points read" if report.counted else ""
@@ -191,15 +199,6 @@ class Fleet:
             lines.append(f"{task:14}{report.cells:>4} cells  {did:>18}  {report.answer}")
         if len(reports) > _SHOWN:
             lines.append(f"and {len(reports) - _SHOWN} more")
-        counters = None
-        if self.daemon is not None and self.daemon.process is not None:
-            counters = read_statistics(self.daemon.instance, self.daemon.shm_dir).counters
-        if counters:
-            used = format_bytes(counters["bytes_resident"] + counters["bytes_zombie"])
-            lines.append(
-                f"shared memory: {counters['cells_resident']} cells, {used} of"
-                f" {format_bytes(counters['budget_bytes'])}, {counters['evictions']} evicted"
-            )
         return lines
 
 

@@ -207,6 +207,8 @@ def test_consumers_go_on_without_the_daemon(daemon: Callable[..., DaemonProcess]
     fleet = WatchedFleet(one, 3, route, tmp_path)
     with fleet:
         fleet.move_to(route[0], seen)
+        # a spectator sees each process and the daemon
+        assert [line.split()[0] for line in seen.lines] == ["localization", "mapping", "perception", "shared"]
         held = one.segments()
         result = drive_through_outage(fleet, one, route, seen, pace_s=0.02)
     assert one.pid != first_pid
@@ -223,5 +225,3 @@ def test_consumers_go_on_without_the_daemon(daemon: Callable[..., DaemonProcess]
     assert "killed" in seen.events[0]
     assert "starts again" in seen.events[1]
     assert str(result.adopted) in seen.events[2]
-    # a spectator sees each process and the daemon
-    assert [line.split()[0] for line in seen.lines] == ["localization", "mapping", "perception", "shared"]
