@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration: a town, a vehicle, many processes on one copy of the map, and the same with a copy each.
+"""The demonstration: a town, a vehicle, many processes on one copy of the map, and on private copies.
 
 Everything is real: files on disk, a daemon process that is killed and comes back, consumer processes, memory
 and processor time as the kernel counts them, a program that localizes.  It leaves nothing behind.
@@ -9,112 +9,99 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from shmmap.demo.demo_town import (
     DemoSettings,
-    Progress,
     TownMap,
     build_town,
     fit,
     free_bytes,
     free_memory_bytes,
 )
-from shmmap.demo.drive import DriveResult, drive
-from shmmap.demo.fleet import Fleet
-from shmmap.demo.localization import Localization, LocalizationResult
-from shmmap.demo.outage import OutageResult, drive_through_outage
-from shmmap.demo.three_programs import ThreeProgramsResult, run_three_programs
-from shmmap.demo.watched_daemon import Traffic, WatchedDaemon, statistics_now
+from shmmap.demo.drive import (
+    DriveResult,
+    Fleet,
+    OutageResult,
+    drive,
+    drive_through_outage,
+    statistics_now,
+)
+from shmmap.demo.localization import (
+    LocalizationResult,
+    localize,
+    missing_package,
+    prepare,
+    wait_prepared,
+)
+from shmmap.demo.progress import Progress
 from shmmap.processes.end_with_parent import with_us
 from shmmap.processes.interrupts import scratch_directory
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.testing.daemon_process import DaemonProcess
 
-__all__ = ["FULL_COUNTS", "DemoResult", "Round", "run_demo"]
+__all__ = ["DemoResult", "Round", "run_demo"]
 
-FULL_COUNTS: Final = (1, 2, 4, 8, 16)
-"""Processes that drive together in a full demonstration."""
-PREFETCH_SHARE: Final = "0.02"
+_PREFETCH_SHARE: Final = "0.02"
 """The drive is faster than any vehicle: as far ahead as that needs, all of the town would be fetched."""
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """The same drive on one shared copy, and with a private copy in each process."""
+    """The same drive of several processes on one shared copy, and with a private copy in each."""
 
+    consumers: int
     shared: DriveResult
     private: DriveResult
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class DemoResult:
     """Everything the demonstration measured.
 
     Attributes
     ----------
+    radius
+        Of every process's window, metres.
     rounds
-        By how many processes drove.
+        With ever more processes.
+    resident
+        The cells in shared memory at the end of the last round.
     outage
-        Of the daemon, with ``settings.many`` processes.
-    traffic, resident
-        Messages of the shared drive of that many processes, and the cells in shared memory at its end.
+        Of the daemon of the last round.
     localization
-        None where a package is missing, see ``missing``; in a full demonstration ``programs`` holds it.
-    missing
-        The package that the localization lacks.
-    programs
-        The three programs of a full demonstration.
+        None where a package is missing, see ``missing``.
     """
 
-    settings: DemoSettings
+    radius: float
     town: TownMap
-    rounds: dict[int, Round]
-    outage: OutageResult
-    traffic: Traffic
+    rounds: list[Round]
     resident: list[CellRow]
-    localization: LocalizationResult | None = None
-    missing: str = ""
-    programs: ThreeProgramsResult | None = None
-
-    @property
-    def many(self) -> Round:
-        """The drives of ``settings.many`` processes."""
-        return self.rounds[self.settings.many]
+    outage: OutageResult
+    localization: LocalizationResult | None
+    missing: str
 
     @property
     def one_more_bytes(self) -> tuple[float, float]:
-        """What one process more costs in memory, from the first round to the last: shared, private."""
-        first, last = min(self.rounds), max(self.rounds)
-        shared, private = (
-            (after - before) / (last - first)
-            for before, after in (
-                (self.rounds[first].shared.total_bytes, self.rounds[last].shared.total_bytes),
-                (self.rounds[first].private.total_bytes, self.rounds[last].private.total_bytes),
-            )
+        """Memory that each further process needs, from the first round to the last: shared, private."""
+        first, last = self.rounds[0], self.rounds[-1]
+        more = last.consumers - first.consumers
+        return (
+            (last.shared.total_bytes - first.shared.total_bytes) / more,
+            (last.private.total_bytes - first.private.total_bytes) / more,
         )
-        return shared, private
 
 
-def run_demo(
-    settings: DemoSettings,
-    progress: Progress,
-    *,
-    map_dir: str | None = None,
-    full: bool = False,
-) -> DemoResult:
+def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None = None) -> DemoResult:
     """Build, drive, measure, clean up.
 
     Parameters
     ----------
     map_dir
         Where the map is built and stays; by default in a temporary directory that is removed.
-    full
-        Whether three programs drive in the end, and not just the localization.
 
     Raises
     ------
@@ -125,10 +112,9 @@ def run_demo(
     InternalError
         A process failed.
     """
-    many = settings.many
     with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
-        map_dir = os.path.abspath(map_dir or scratch / "map")
+        work = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
+        map_dir = os.path.abspath(map_dir or work / "map")
         parent = Path(map_dir).parent
         parent.mkdir(parents=True, exist_ok=True)
         settings, budget_bytes = fit(
@@ -138,67 +124,35 @@ def run_demo(
             memory_bytes=free_memory_bytes(),
             copies=max(settings.counts),
         )
-        options = ["--budget", str(budget_bytes), "--workers", "2", "--cache-dir", str(scratch / "cache")]
-        options += ["--prefetch-share", PREFETCH_SHARE]
-        localization = None if full else stack.enter_context(Localization(settings, scratch))
+        options = [
+            "--budget", str(budget_bytes), "--workers", "2", "--cache-dir", str(work / "cache"),
+            "--prefetch-share", _PREFETCH_SHARE,
+        ]  # fmt: skip
+        missing = missing_package()
+        makers = [] if missing else prepare(settings, work, stack)
         town = build_town(settings, map_dir, progress)
-        if localization is not None:
+        if makers:
             progress.stage("Simulating LiDAR scans, compiling kernels", 1)
-            localization.wait_prepared()
+            wait_prepared(makers)
             progress.step()
-        show = _Show(settings, town, options, progress)
-        rounds = {count: Round(*show.compare(count)) for count in settings.counts if count != many}
-        private = show.private(many)
-        with DaemonProcess(town.path, *options, command=with_us()) as daemon:
-            watched = WatchedDaemon(daemon)
-            with Fleet("shared", daemon.endpoint, settings.radius, many, town.way) as fleet:
-                rounds[many] = Round(show.shared(fleet, watched), private)
-                traffic, resident = watched.traffic(), statistics_now(daemon).cells
-                progress.stage(f"Killing the daemon while {many} processes keep driving", len(town.onward))
-                outage = drive_through_outage(fleet, daemon, town.onward, progress)
-        result = DemoResult(settings, town, dict(sorted(rounds.items())), outage, traffic, resident)
-        if localization is None:
-            with DaemonProcess(town.path, *options, command=with_us()) as daemon:
-                result.programs = run_three_programs(settings, daemon, scratch, progress)
-        elif localization.missing:
-            result.missing = localization.missing
-        else:
-            result.localization = localization.run(town.path, options, progress)
-        return result
-
-
-class _Show:
-    """The drives, each with processes of its own."""
-
-    def __init__(
-        self, settings: DemoSettings, town: TownMap, options: Sequence[str], progress: Progress
-    ) -> None:
-        self._settings, self._town, self._options, self._progress = settings, town, options, progress
-
-    def compare(self, count: int) -> tuple[DriveResult, DriveResult]:
-        """Drive with a copy each, then on a daemon of their own; returns shared, private."""
-        private = self.private(count)
-        with DaemonProcess(self._town.path, *self._options, command=with_us()) as daemon:
-            watched = WatchedDaemon(daemon)
-            with Fleet("shared", daemon.endpoint, self._settings.radius, count, self._town.way) as fleet:
-                return self.shared(fleet, watched), private
-
-    def private(self, count: int) -> DriveResult:
-        """Drive with a copy each."""
-        with Fleet("private", self._town.path, self._settings.radius, count, self._town.way) as fleet:
-            self._stage(
-                f"{_processes(count)} with a private copy each" if count > 1 else "1 process, private copy"
-            )
-            return drive(fleet, self._town.route, self._settings.pace_s, self._progress, None)
-
-    def shared(self, fleet: Fleet, daemon: WatchedDaemon) -> DriveResult:
-        """Drive on the daemon's copy."""
-        self._stage(f"{_processes(len(fleet.pids))} on the copy that shmmap shares")
-        return drive(fleet, self._town.route, self._settings.pace_s, self._progress, daemon)
-
-    def _stage(self, text: str) -> None:
-        self._progress.stage(f"Driving, {text}", len(self._town.route))
-
-
-def _processes(count: int) -> str:
-    return f"{count} process" + ("es" if count > 1 else "")
+        route = town.route + town.onward
+        rounds = []
+        for count in settings.counts:
+            one = "1 process" if count == 1 else f"{count} processes"
+            copies = ", private copy" if count == 1 else " with a private copy each"
+            with Fleet(town.path, settings.radius, count, route, work) as fleet:
+                progress.stage(f"Driving, {one}{copies}", len(town.route))
+                private = drive(fleet, town.route, settings.pace_s, progress)
+            with (
+                DaemonProcess(town.path, *options, command=with_us()) as daemon,
+                Fleet(daemon, settings.radius, count, route, work) as fleet,
+            ):
+                progress.stage(f"Driving, {one} on the copy that shmmap shares", len(town.route))
+                shared = drive(fleet, town.route, settings.pace_s, progress)
+                rounds.append(Round(count, shared, private))
+                if count == settings.counts[-1]:
+                    resident = statistics_now(daemon).cells
+                    progress.stage(f"Killing the daemon while {one} keep driving", len(town.onward))
+                    outage = drive_through_outage(fleet, daemon, town.onward, progress)
+        found = None if missing else localize(town.path, options, work, progress)
+        return DemoResult(settings.radius, town, rounds, resident, outage, found, missing)

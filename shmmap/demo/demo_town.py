@@ -7,20 +7,19 @@ import contextlib
 import math
 import os
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from shmmap.demo.consumer import Pose
-from shmmap.demo.fleet import StepReport
+from shmmap.demo.progress import Progress
 from shmmap.dividing.map_writer import MapWriter
 from shmmap.errors import ConfigError
 from shmmap.simulation.height_image import HeightImage
 from shmmap.simulation.town import Town
 from shmmap.simulation.town_ground import BLOCK_METRES
 
-__all__ = ["DemoSettings", "Progress", "TownMap", "build_town", "fit", "free_bytes"]
+__all__ = ["DemoSettings", "TownMap", "build_town", "fit", "free_bytes"]
 
 _POINT_BYTES: Final = 16  # x, y, z and intensity as float32
 _POINTS_PER_GROUND_POINT: Final = 1.65  # roofs, walls and leaves add to the ground
@@ -48,15 +47,13 @@ class DemoSettings:
     length, step
         Of the drive that is measured, metres.
     onward
-        How far it continues after that, a metre at a time: the drive without a daemon.
-    localized, scanned
-        Length of the drives of the localization alone, and of three programs, metres.
+        How far the last drive continues, a metre at a time, while the daemon is killed and starts again.
+    localized
+        Length of the drive of the localization, metres.
     pace_s
         Least time per step.
     counts
-        How many processes drive together, one drive after the other.
-    many
-        One of the counts: these also drive while there is no daemon.
+        How many processes drive together, one drive after the other, ascending.
     seed
         Which town.
     """
@@ -68,16 +65,14 @@ class DemoSettings:
     step: float = 5.0
     onward: int = 50
     localized: float = 80.0
-    scanned: float = 160.0
     pace_s: float = 0.04
     counts: tuple[int, ...] = (1, 8)
-    many: int = 8
     seed: int = 4
 
 
 @dataclass(frozen=True, slots=True)
 class TownMap:
-    """The map on disk, a picture of it, and the way through it: ``route``, then ``onward``."""
+    """The map on disk, a picture of it, and the route through it, which goes on with ``onward``."""
 
     path: str
     cells: int
@@ -89,26 +84,6 @@ class TownMap:
     route: tuple[Pose, ...]
     onward: tuple[Pose, ...]
     build_s: float
-
-    @property
-    def way(self) -> tuple[Pose, ...]:
-        """All of the way through it."""
-        return self.route + self.onward
-
-
-class Progress(Protocol):
-    """What is told while the demonstration runs."""
-
-    def stage(self, text: str, total: int) -> None:
-        """A new stage of ``total`` steps begins."""
-
-    def step(
-        self, reports: Sequence[StepReport] = (), counters: dict[str, int] | None = None, note: str = ""
-    ) -> None:
-        """One step of the stage is done; what consumers did in it, the daemon's counters, and words to it."""
-
-    def event(self, text: str) -> None:
-        """Something happened that a spectator should know."""
 
 
 def free_bytes(directory: str) -> int:
@@ -134,14 +109,14 @@ def fit(
     """Choose a budget of shared memory, and thin the town out where there is little room.
 
     The budget holds the largest window and a little more, so that cells stay for a while and are evicted
-    in the end.  A container has 64 MB of shared memory unless told otherwise.
+    in the end.  A container has 64 MB of shared memory by default.
 
     Parameters
     ----------
     shm_bytes, disk_bytes, memory_bytes
         What is free.
     copies
-        Private copies of the window that have to fit in memory at once, each in a process of its own.
+        Private copies of the window that have to fit in memory at once, each in its own process.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A drive that is mapped into a live map with too little memory, while daemon and mapping program are killed.
 
-The way is a round through the town, and a part of it once more: chunks are given up, and come back.  In the
+The route is a round through the town, and a part of it once more: chunks are evicted, and come back.  In the
 end the map's files are compared with a map without bounds of the same scans.
 """
 
@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from shmmap.demo.demo_town import Progress
 from shmmap.demo.live_mapper import FILTER
-from shmmap.demo.live_mapping import PATIENCE_S, Kills, Mapping, Watch, map_all
 from shmmap.demo.program import Program
+from shmmap.demo.progress import Progress
 from shmmap.demo.unbounded_map import UnboundedMap
 from shmmap.errors import InternalError
 from shmmap.processes.end_with_parent import with_us
@@ -29,17 +29,23 @@ from shmmap.simulation.lidar_drive import LidarDrive
 from shmmap.simulation.town import Town
 from shmmap.testing.daemon_process import DaemonProcess
 
+if TYPE_CHECKING:
+    from shmmap.chunks.voxels import ChunkKey
+    from shmmap.client.live.live_map import LiveMap
+
 __all__ = ["LiveDriveResult", "LiveDriveSettings", "run_live_drive"]
 
 _MAP: Final = "town"
 _LIDAR: Final = Lidar(rings=32, highest_deg=12.0, azimuth_deg=0.6, farthest=25.0)
-_SETTINGS: Final = """\
+_CONFIG: Final = """\
 [live.{name}]
 path = {path}
 resolution = {resolution!r}
 radius = 2
 linger_s = 0.5
 """
+_TIMEOUT_S: Final = 300.0  # for a compiler on a slow machine
+_WITHOUT_DAEMON: Final = 2  # scans that come while there is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +59,7 @@ class LiveDriveSettings:
     length, step
         Of the drive, and between scans, metres.
     lidar, density
-        What takes the scans, and points per square metre that it sees.
+        The sensor, and points per square metre of the surfaces that it sees.
     resolution
         Edge of a voxel, metres.
     budget_bytes
@@ -70,28 +76,31 @@ class LiveDriveSettings:
     budget_bytes: int = 8 << 20
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class LiveDriveResult:
-    """What came of it.
+    """What was mapped, killed and compared.
 
     Attributes
     ----------
     scans, points, length_m
         Of the drive.
-    chunks, file_bytes
-        Of the map on disk.
-    given_up, came_back
-        How often a chunk of it left memory, and how often one came into memory again.
-    budget_bytes, most_bytes
-        Memory that chunks may take, and the most that those in service took.
-    active, active_bytes
-        Known voxels in memory at the end of the drive, and what their chunks take there.
-    kills
-        Of the daemon and of the mapping program.
     mapping_s
         Time from the first scan to the last, with both kills.
+    mapper_killed_at, mapper_resumed_at
+        Scan after which the mapping program was killed, and the first one of its next run.
+    daemon_killed_at, daemon_down_s, daemon_chunks
+        Scan after which the daemon was killed, seconds until it was back, and chunks that it then found in
+        memory.
+    evicted, came_back
+        How often a chunk left memory, and how often one came into memory again.
+    budget_bytes, max_bytes
+        Memory that chunks may take, and the most that those in service took.
+    active, active_bytes
+        Known voxels in memory at the end of the drive, and memory of their chunks.
+    chunks, file_bytes
+        Of the map on disk.
     voxels, differing
-        Of the map on disk and of the one without bounds.
+        Voxels of the map on disk and of the one without bounds, and those among them that differ.
     picture_svg
         The map at the end of the drive, before all of it was saved.
     """
@@ -99,19 +108,23 @@ class LiveDriveResult:
     scans: int
     points: int
     length_m: float
-    chunks: int
-    file_bytes: int
-    given_up: int
-    came_back: int
     budget_bytes: int
-    most_bytes: int
-    active: int
-    active_bytes: int
-    kills: Kills
-    mapping_s: float
-    voxels: int
-    differing: int
-    picture_svg: str
+    mapping_s: float = 0.0
+    mapper_killed_at: int = 0
+    mapper_resumed_at: int = 0
+    daemon_killed_at: int = 0
+    daemon_down_s: float = 0.0
+    daemon_chunks: int = 0
+    evicted: int = 0
+    came_back: int = 0
+    max_bytes: int = 0
+    active: int = 0
+    active_bytes: int = 0
+    chunks: int = 0
+    file_bytes: int = 0
+    voxels: int = 0
+    differing: int = 0
+    picture_svg: str = ""
 
 
 def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDriveResult:
@@ -127,77 +140,133 @@ def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDrive
     import shmmap
 
     with contextlib.ExitStack() as stack:
-        scratch = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
-        map_dir = scratch / "map"
-        config = scratch / "live.toml"
+        work = Path(stack.enter_context(scratch_directory("shmmap-demo-")))
+        map_dir, config = work / "map", work / "live.toml"
         config.write_text(
-            _SETTINGS.format(name=_MAP, path=json.dumps(str(map_dir)), resolution=settings.resolution),
+            _CONFIG.format(name=_MAP, path=json.dumps(str(map_dir)), resolution=settings.resolution),
             encoding="utf-8",
         )
         budgets = ["--budget", "16M", "--live-budget", str(settings.budget_bytes)]
         daemon = stack.push(DaemonProcess("", "--config", str(config), *budgets, command=with_us()))
         daemon.launch()  # it starts while scans are made
-        drive = _Drive(settings, scratch, progress)
-        daemon.wait_ready(PATIENCE_S)
-        client = stack.enter_context(shmmap.connect(daemon.endpoint, name="demo"))
-        live = client.live(_MAP)
-        watch = Watch(live)
-        mapping = stack.enter_context(Mapping(_MAP, daemon.endpoint, drive.scans_dir, scratch))
-        began_s = time.perf_counter()
-        kills = map_all(len(drive.path), mapping, watch, daemon, progress)
-        mapping_s = time.perf_counter() - began_s
-        progress.stage("Drawing the map, saving it, comparing it with one that had no bounds", 3)
-        x, y, z = drive.path[-1]
-        live.move_to(x, y, z)  # the vehicle stays where it is, its program ends
-        mapping.finish()
-        watch.look()
+        path, unbounded, result = _take_scans(settings, work, progress)
+        daemon.wait_ready(_TIMEOUT_S)
+        live = stack.enter_context(shmmap.connect(daemon.endpoint, name="demo")).live(_MAP)
+        words = [daemon.endpoint, _MAP, str(work)]
+        mapper = stack.enter_context(Program("mapping program", "shmmap.demo.live_mapper", words, work))
+        _map(daemon, mapper, _Watch(live, result), progress)
+        progress.stage("Saving the map, comparing it with one without bounds", 3)
+        live.move_to(*path[-1])  # the vehicle stays where it is, its program ends
+        mapper.end_input()
+        mapper.finish(_TIMEOUT_S)
         usage = live.status()
-        picture_svg = _draw(daemon.endpoint, drive, scratch)
+        result.active, result.active_bytes = usage.active, usage.bytes
+        result.picture_svg = _draw(daemon.endpoint, path, work)
         progress.step()
         live.save()
         files = live.status()
+        result.chunks, result.file_bytes = files.files, files.file_bytes
         daemon.stop()
         progress.step()
-        voxels, differing = drive.unbounded.compare(str(map_dir))
+        result.voxels, result.differing = unbounded.compare(str(map_dir))
         progress.step()
-        return LiveDriveResult(
-            scans=len(drive.path), points=drive.points, length_m=settings.length, chunks=files.files,
-            file_bytes=files.file_bytes, given_up=watch.given_up, came_back=watch.came_back,
-            budget_bytes=settings.budget_bytes, most_bytes=watch.most_bytes, active=usage.active,
-            active_bytes=usage.bytes, kills=kills, mapping_s=mapping_s, voxels=voxels, differing=differing,
-            picture_svg=picture_svg,
-        )  # fmt: skip
+        return result
 
 
-class _Drive:
-    """Scans in files, where the sensor was, and the map without bounds."""
+def _take_scans(
+    settings: LiveDriveSettings, work: Path, progress: Progress
+) -> tuple[list[tuple[float, float, float]], UnboundedMap, LiveDriveResult]:
+    """Write the scans to ``work``; returns where the sensor was, the map without bounds, and the result."""
+    drive = LidarDrive(
+        Town(seed=settings.seed, blocks=settings.blocks), settings.length, settings.step,
+        lidar=settings.lidar, density=settings.density,
+    )  # fmt: skip
+    progress.stage("Driving through a generated town with a LiDAR", sum(1 for _ in drive.poses()))
+    unbounded = UnboundedMap(settings.resolution, FILTER)
+    path = []
+    points = 0
+    for number, scan in enumerate(drive.scans(), 1):
+        np.savez(work / f"{number}.npz", xyz=scan.xyz, pose=scan.T_map_sensor)
+        unbounded.add(scan.xyz, scan.T_map_sensor)
+        x, y, z = scan.T_map_sensor[:3, 3].tolist()
+        path.append((x, y, z))
+        points += len(scan.xyz)
+        progress.step()
+    return path, unbounded, LiveDriveResult(len(path), points, settings.length, settings.budget_bytes)
 
-    def __init__(self, settings: LiveDriveSettings, scratch: Path, progress: Progress) -> None:
-        town = Town(seed=settings.seed, blocks=settings.blocks)
-        drive = LidarDrive(
-            town, settings.length, settings.step, lidar=settings.lidar, density=settings.density
+
+class _Watch:
+    """Counts chunks that leave memory, and that come back into it."""
+
+    def __init__(self, live: LiveMap, result: LiveDriveResult) -> None:
+        self.result = result
+        self._live = live
+        self._in_memory: set[ChunkKey] = set()
+        self._on_disk: set[ChunkKey] = set()
+
+    def look(self) -> str:
+        """Look at all chunks in which a voxel is known; returns how many are where."""
+        known = [row for row in self._live.chunks(saved=True) if row.active]
+        on_disk = {row.key for row in known if row.state == "saved"}
+        in_memory = {row.key for row in known} - on_disk
+        result = self.result
+        result.evicted += len(self._in_memory & on_disk)
+        result.came_back += len(self._on_disk & in_memory)
+        result.max_bytes = max(result.max_bytes, self._live.status().bytes)
+        self._in_memory, self._on_disk = in_memory, on_disk
+        return (
+            f"{len(in_memory)} chunks in memory, {len(on_disk)} on disk alone; {result.came_back} came back"
         )
-        progress.stage("Driving through a generated town with a LiDAR", sum(1 for _ in drive.poses()))
-        self.scans_dir = scratch / "scans"
-        self.scans_dir.mkdir()
-        self.unbounded = UnboundedMap(settings.resolution, FILTER)
-        self.path: list[tuple[float, float, float]] = []
-        self.points = 0
-        for number, scan in enumerate(drive.scans(), 1):
-            np.savez(self.scans_dir / f"{number}.npz", xyz=scan.xyz, pose=scan.T_map_sensor)
-            self.unbounded.add(scan.xyz, scan.T_map_sensor)
-            x, y, z = scan.T_map_sensor[:3, 3].tolist()
-            self.path.append((x, y, z))
-            self.points += len(scan.xyz)
-            progress.step()
 
 
-def _draw(endpoint: str, drive: _Drive, scratch: Path) -> str:
-    """The picture of ``shmmap-rolling``, of the whole map."""
-    picture, path = scratch / "live.svg", scratch / "path.json"
-    path.write_text(json.dumps(drive.path), encoding="utf-8")
-    words = ["--endpoint", endpoint, "--live", _MAP, "--path", str(path), "--picture", str(picture)]
-    with Program("picture", "shmmap_clients.demo.live_picture", words, scratch) as program:
-        if code := program.wait(PATIENCE_S):
-            raise InternalError(f"the picture ended with {code}: {program.last_words()}")
+def _map(daemon: DaemonProcess, mapper: Program, watch: _Watch, progress: Progress) -> None:
+    """Map scan after scan; both are killed right after a scan was sent, which may be in the map or not."""
+    result, scans = watch.result, watch.result.scans
+    progress.stage("Mapping it, with memory for a part of the map", scans)
+    began_s = time.perf_counter()
+    number = int(mapper.read_line(_TIMEOUT_S))
+    while number <= scans:
+        mapper.write_line(str(number))
+        mapper.read_line(_TIMEOUT_S)
+        progress.step(f"scan {number}: {watch.look()}")
+        if not result.mapper_killed_at and number >= scans // 3:
+            result.mapper_killed_at = number
+            mapper.kill()
+            progress.event(f"The mapping program is killed (SIGKILL) after scan {number}")
+            mapper.start()
+            number = result.mapper_resumed_at = int(mapper.read_line(_TIMEOUT_S))
+            progress.event(f"Its next run asks the daemon, and continues with scan {number}")
+            continue
+        if not result.daemon_killed_at and number >= 2 * scans // 3:
+            result.daemon_killed_at = number
+            sent = range(number + 1, min(number + _WITHOUT_DAEMON, scans) + 1)
+            daemon.kill()
+            killed_s = time.perf_counter()
+            progress.event(f"The daemon is killed (SIGKILL) after scan {number}; the drive continues")
+            for without_daemon in sent:
+                mapper.write_line(str(without_daemon))
+            daemon.start(_TIMEOUT_S)
+            result.daemon_down_s = time.perf_counter() - killed_s
+            # that it took over; some may have been evicted since
+            found = re.findall(r" live map in memory .* chunks=(\d+)", daemon.log)
+            result.daemon_chunks = int(found[-1]) if found else 0
+            progress.event(f"It is back; it found {result.daemon_chunks} chunks in memory")
+            for _ in sent:
+                mapper.read_line(_TIMEOUT_S)
+                progress.step()
+            number += len(sent)
+        number += 1
+    result.mapping_s = time.perf_counter() - began_s
+    watch.look()
+
+
+def _draw(endpoint: str, path: list[tuple[float, float, float]], work: Path) -> str:
+    """Draw the whole map as ``shmmap-rolling`` does."""
+    picture, path_file = work / "live.svg", work / "path.json"
+    path_file.write_text(json.dumps(path), encoding="utf-8")
+    words = ["--endpoint", endpoint, "--live", _MAP, "--path", str(path_file), "--picture", str(picture)]
+    with Program("picture", "shmmap_clients.demo.live_picture", words, work) as program:
+        program.finish(_TIMEOUT_S)
+    if not picture.exists():
+        raise InternalError("the picture was not drawn")
     return picture.read_text(encoding="utf-8")

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program of the live demonstration that maps: it is killed on the way, and started again.
 
-``python -m shmmap.demo.live_mapper ENDPOINT NAME SCANS`` reads the number of a scan a line from stdin, adds
-``SCANS/<number>.npz`` to the live map NAME, and answers with a line of JSON, ``{"applied": n}``: how many are
-in the map by now.  Its first line is ``{"next": n}``, the scan that the map wants next; the last comes after
-the end of stdin, when all are in the map.
+``python -m shmmap.demo.live_mapper ENDPOINT NAME SCANS`` first prints the number of the scan that the live
+map NAME needs next.  For each line of stdin, the number of a scan, it adds ``SCANS/<number>.npz`` to the map
+and prints how many scans are in it.  It ends after stdin, when all are in the map.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Final
@@ -34,21 +32,20 @@ def main(argv: list[str]) -> int:
         shmmap.connect(endpoint, name="demo mapper") as client,
         client.live(name).mapper("demo", FILTER) as mapper,
     ):
-        _say("next", mapper.applied + 1)
+        _print(mapper.applied + 1)
         for line in sys.stdin:
             number = int(line)
             with np.load(Path(scans, f"{number}.npz")) as scan:
                 sent = mapper.add(scan["xyz"], scan["pose"])
             if sent != number:
                 raise InternalError(f"scan {number} was sent as {sent}")
-            _say("applied", mapper.applied)
+            _print(mapper.applied)
         mapper.wait_applied()
-        _say("applied", mapper.applied)
     return 0
 
 
-def _say(what: str, number: int) -> None:
-    sys.stdout.write(json.dumps({what: number}) + "\n")
+def _print(number: int) -> None:
+    sys.stdout.write(f"{number}\n")
     sys.stdout.flush()
 
 

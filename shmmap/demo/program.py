@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program beside the demonstration, in a process of its own that cannot be left behind."""
+"""A program beside a demonstration: a process that reads and writes lines, and is never left behind."""
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -12,7 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import Final
 
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
@@ -21,47 +20,42 @@ from shmmap.testing.process_watch import wait_readable
 
 __all__ = ["Program"]
 
-_LAST_WORDS: Final = 2000
+_LAST_WORDS: Final = 2000  # characters
 
 
 class Program:
-    """``python -m MODULE WORD...``, and what it says.
+    """``python -m MODULE WORD...`` with pipes to its stdin and from its stdout.
 
     Parameters
     ----------
     name
-        What it is called where it fails.
+        Its name in error messages.
     module, words
-        What is started.
+        Module and command line.
     work
-        Directory for what it writes.
-    piped
-        Whether stdout is read while it runs, see `lines`, and not in the end, see `document`.
-    fed
-        Whether it reads lines from stdin, see `tell`.
-    own_session
-        Whether a Ctrl-C is kept from it, and it is ended with all that it has started.
+        Directory for its stderr.
 
-    Used as a context manager it is started on entry; on exit it is killed, with all it has started, if it
-    has not ended.
+    Attributes
+    ----------
+    exit_code
+        As `finish` found it.
+
+    Used as a context manager it is started on entry; on exit it is killed with all that it has started, if
+    it still runs.  A Ctrl-C does not reach it.
+
+    Raises
+    ------
+    InternalError
+        From methods: it ended too early, or took longer than it may; the message holds its last words.
     """
 
-    def __init__(
-        self,
-        name: str,
-        module: str,
-        words: Sequence[str],
-        work: Path,
-        *,
-        piped: bool = False,
-        fed: bool = False,
-        own_session: bool = True,
-    ) -> None:
+    def __init__(self, name: str, module: str, words: Sequence[str], work: Path) -> None:
         self.name = name
         self._command = [sys.executable, "-m", module, *words]
-        self._piped, self._fed, self._own_session = piped, fed, own_session
-        self._out, self._err = work / f"{name}.out", work / f"{name}.err"
+        self._err = work / f"{name}.err"
         self._process: subprocess.Popen[bytes] | None = None
+        self._unread = b""
+        self.exit_code = 0
 
     def __enter__(self) -> Program:
         try:
@@ -77,123 +71,118 @@ class Program:
         self.kill()
 
     @property
-    def pid(self) -> int | None:
-        """Its process id, None when it does not run."""
-        return self._process.pid if self._process is not None else None
+    def pid(self) -> int:
+        """Its process id.
+
+        Raises
+        ------
+        InternalError
+            It does not run.
+        """
+        return self._started.pid
 
     @property
     def running(self) -> bool:
         """Whether it was started and has not ended."""
         return self._process is not None and self._process.poll() is None
 
+    @property
+    def _started(self) -> subprocess.Popen[bytes]:
+        if self._process is None:
+            raise InternalError(f"{self.name} does not run")
+        return self._process
+
     def start(self) -> None:
-        """Start it, maybe once more."""
-        with open(self._out, "wb") as out, open(self._err, "wb") as err, interrupts_later():
+        """Start it; again, when it has ended."""
+        self._unread = b""
+        with open(self._err, "wb") as err, interrupts_later():
             self._process = subprocess.Popen(
                 self._command,
-                stdin=subprocess.PIPE if self._fed else subprocess.DEVNULL,
-                stdout=subprocess.PIPE if self._piped else out,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
                 stderr=err,
                 env=without_settings(),
-                start_new_session=self._own_session,
+                start_new_session=True,
             )
 
-    def tell(self, line: str) -> None:
-        """Write a line to the stdin of a ``fed`` one.
-
-        Raises
-        ------
-        InternalError
-            It has ended.
-        """
-        if self._process is None or self._process.stdin is None:
-            raise InternalError(f"{self.name} hears nobody")
+    def write_line(self, line: str | bytes) -> None:
+        """Write a line to its stdin."""
+        stdin = self._started.stdin
+        assert stdin is not None  # noqa: S101  it is a pipe
         try:
-            self._process.stdin.write(line.encode() + b"\n")
-            self._process.stdin.flush()
+            stdin.write((line.encode() if isinstance(line, str) else line) + b"\n")
+            stdin.flush()
         except BrokenPipeError:
-            raise InternalError(f"{self.name} ended early: {self.last_words()}") from None
+            raise self._ended_early() from None
 
-    def tell_no_more(self) -> None:
-        """End the stdin of a ``fed`` one."""
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
+    def end_input(self) -> None:
+        """Close its stdin."""
+        stdin = self._started.stdin
+        assert stdin is not None  # noqa: S101  it is a pipe
+        stdin.close()
 
-    def lines(self, patience_s: float) -> Iterator[str]:
-        """What a ``piped`` one writes to stdout, line by line, until it ends.
+    def read_line(self, timeout_s: float) -> str:
+        """Return the next line of its stdout."""
+        for line in self.lines(timeout_s):
+            return line
+        raise self._ended_early()
 
-        Raises
-        ------
-        InternalError
-            It has written nothing for ``patience_s``.
-        """
-        if self._process is None or self._process.stdout is None:
-            raise InternalError(f"nobody listens to {self.name}")
-        out = self._process.stdout.fileno()
-        rest = b""
+    def lines(self, timeout_s: float) -> Iterator[str]:
+        """Yield the lines of its stdout until it ends, each at most ``timeout_s`` after the one before."""
+        stdout = self._started.stdout
+        assert stdout is not None  # noqa: S101  it is a pipe
         while True:
-            if not wait_readable([out], patience_s):
-                raise InternalError(f"{self.name} says nothing for {patience_s:g} s: {self.last_words()}")
-            piece = os.read(out, 1 << 16)
-            if not piece:
-                return
-            *whole, rest = (rest + piece).split(b"\n")
-            for line in whole:
-                yield line.decode()
+            while b"\n" not in self._unread:
+                if not wait_readable([stdout.fileno()], timeout_s):
+                    raise InternalError(f"{self.name} wrote nothing for {timeout_s:g} s: {self.last_words()}")
+                piece = os.read(stdout.fileno(), 1 << 16)
+                if not piece:
+                    return
+                self._unread += piece
+            line, _, self._unread = self._unread.partition(b"\n")
+            yield line.decode()
 
-    def wait(self, timeout_s: float) -> int:
-        """Wait for its end; returns its exit code.
+    def finish(self, timeout_s: float, *, fails: bool = False) -> str:
+        """Wait for its end; returns what it has written to stdout and was not read.
 
-        Raises
-        ------
-        InternalError
-            It takes longer.
+        Parameters
+        ----------
+        timeout_s
+            Longest time between two lines, and from the last one until its end.
+        fails
+            Whether an exit code other than 0 is allowed.
         """
-        if self._process is None:
-            raise InternalError(f"{self.name} was not started")
+        text = "\n".join(self.lines(timeout_s))
         try:
-            code = self._process.wait(timeout_s)
+            self.exit_code = self._started.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise InternalError(
-                f"{self.name} takes longer than {timeout_s:g} s: {self.last_words()}"
+                f"{self.name} does not end within {timeout_s:g} s: {self.last_words()}"
             ) from None
-        self._forget(self._process)
-        return code
-
-    def document(self, timeout_s: float) -> tuple[dict[str, Any], int]:
-        """Wait for its end; returns the JSON document that it printed, and its exit code.
-
-        Raises
-        ------
-        InternalError
-            It takes longer, or printed none.
-        """
-        code = self.wait(timeout_s)
-        try:
-            found = json.loads(self._out.read_text(encoding="utf-8"))
-        except ValueError:
-            found = None
-        if not isinstance(found, dict):
-            raise InternalError(f"{self.name} ended with {code}: {self.last_words()}")
-        return found, code
-
-    def last_words(self) -> str:
-        """The end of what it wrote to stderr."""
-        return self._err.read_text(encoding="utf-8", errors="replace")[-_LAST_WORDS:].strip()
+        self._close_pipes()
+        if self.exit_code and not fails:
+            raise InternalError(f"{self.name} ended with {self.exit_code}: {self.last_words()}")
+        return text
 
     def kill(self) -> None:
-        """End it with all that it has started."""
+        """End it, and all that it has started, with SIGKILL."""
         with interrupts_later():
             if self._process is not None:
                 with contextlib.suppress(ProcessLookupError):
-                    (os.killpg if self._own_session else os.kill)(self._process.pid, signal.SIGKILL)
+                    os.killpg(self._process.pid, signal.SIGKILL)
                 self._process.wait()
-                self._forget(self._process)
+                self._close_pipes()
 
-    def _forget(self, process: subprocess.Popen[bytes]) -> None:
-        """It has ended: nobody talks with it any more."""
-        for pipe in (process.stdin, process.stdout):
+    def last_words(self) -> str:
+        """Return the end of its stderr."""
+        return self._err.read_text(encoding="utf-8", errors="replace")[-_LAST_WORDS:].strip()
+
+    def _close_pipes(self) -> None:
+        for pipe in (self._started.stdin, self._started.stdout):
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
                     pipe.close()
         self._process = None
+
+    def _ended_early(self) -> InternalError:
+        return InternalError(f"{self.name} ended early: {self.last_words()}")

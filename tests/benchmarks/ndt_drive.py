@@ -31,7 +31,7 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.trajectory import Trajectory
 
 from shmmap import read_cloud
-from shmmap.demo.process_memory import process_memory
+from shmmap.demo.process_usage import process_memory
 from shmmap.testing.daemon_process import DaemonProcess
 from tests.benchmarks.street_data import TILE_M, Street, sampled, street
 from tests.benchmarks.tile_map import tile_map

@@ -24,11 +24,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from shmmap_clients.demo.three_programs import ThreePrograms, run_three_programs, table
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory
 
 import shmmap
+from tests.benchmarks.programs_side_by_side import ThreePrograms, run_three_programs, table
 from tests.benchmarks.street_data import TILE_M, street
 from tests.benchmarks.tile_map import tile_map
 from tests.support.daemon_process import DaemonProcess

@@ -16,9 +16,9 @@ import pytest
 from shmmap import cli
 from shmmap.cli.screens import demo_progress
 from shmmap.demo import live_drive
+from shmmap.demo.progress import Progress
 from tests.support.daemon_process import wait_ended
-from tests.support.demo_process import Demo, until
-from tests.support.small_demo import SMALL_LIVE
+from tests.support.demo_process import SMALL_LIVE, Demo, until
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -29,20 +29,20 @@ def test_nothing_is_lost(tmp_path: Path) -> None:
     assert (demo.process.returncode, err) == (0, "")
     told = json.loads(out)
     assert sorted(told) == [
-        "active", "active_bytes", "budget_bytes", "came_back", "chunks", "daemon", "differing", "file_bytes",
-        "given_up", "length_m", "mapper", "mapping_s", "most_bytes", "points", "scans", "seconds", "svg",
-        "voxels",
+        "active", "active_bytes", "budget_bytes", "came_back", "chunks", "daemon_chunks", "daemon_down_s",
+        "daemon_killed_at", "differing", "evicted", "file_bytes", "length_m", "mapper_killed_at",
+        "mapper_resumed_at", "mapping_s", "max_bytes", "points", "scans", "seconds", "svg", "voxels",
     ]  # fmt: skip
     assert told["scans"] == 61
     assert told["differing"] == 0
     assert 0 < told["active"] < told["voxels"], "a part of the map is on disk alone"
-    assert told["most_bytes"] <= told["budget_bytes"] == 4 << 20
+    assert told["max_bytes"] <= told["budget_bytes"] == 4 << 20
     # it went round, and once more along the first streets
-    assert told["given_up"] >= told["came_back"] > 0
-    assert told["daemon"]["killed_at"] == 40
-    assert told["daemon"]["chunks"] > 0, "those that were in memory"
-    assert told["mapper"]["killed_at"] == 20
-    assert told["mapper"]["resumed_at"] in (18, 19, 20, 21), "three scans may have been on their way"
+    assert told["evicted"] >= told["came_back"] > 0
+    assert told["daemon_killed_at"] == 40
+    assert told["daemon_chunks"] > 0, "those that were in memory"
+    assert told["mapper_killed_at"] == 20
+    assert told["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been on their way"
     picture = ElementTree.parse(told["svg"]).getroot()
     text = " ".join(element.text or "" for element in picture.iter(f"{SVG}text"))
     for word in ("61 scans", "height", "on disk only", "sensor's path", "active cells"):
@@ -71,11 +71,11 @@ def test_a_voxel_that_differs_is_told(
 ) -> None:
     """The mapping program gets another scan than the map without bounds had."""
 
-    class Saboteur(demo_progress.QuietProgress):
+    class Saboteur(Progress):
         def stage(self, text: str, total: int) -> None:
             assert total > 0
             if text.startswith("Mapping"):
-                (scan,) = tmp_path.glob("shmmap-demo-*/scans/7.npz")
+                (scan,) = tmp_path.glob("shmmap-demo-*/7.npz")
                 with np.load(scan) as found:
                     xyz, pose = found["xyz"], found["pose"]
                 np.savez(scan, xyz=xyz[::2], pose=pose)

@@ -1,33 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap demo`` in a process of its own, and what it must not leave behind."""
+"""``shmmap demo`` in its own process, and what it must not leave behind.
+
+``python -m tests.support.demo_process`` is the verb in a small town with two processes: all that the
+demonstration starts and does, in a few seconds.
+"""
 
 from __future__ import annotations
 
+import functools
 import os
 import secrets
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
+from shmmap import cli
+from shmmap.demo import demo_town, live_drive
+from shmmap.simulation.lidar import Lidar
 from tests.support.daemon_process import ROOT, processes_marked
 
-__all__ = ["Demo", "until"]
+__all__ = ["SMALL", "SMALL_LIVE", "Demo", "until"]
+
+SMALL: Final = demo_town.DemoSettings(
+    blocks=(3, 2), density=4.0, radius=60.0, length=20.0, onward=12, localized=10.0, counts=(1, 2)
+)
+
+SMALL_LIVE: Final = live_drive.LiveDriveSettings(
+    length=420.0,
+    step=7.0,
+    lidar=Lidar(rings=16, azimuth_deg=1.5, farthest=25.0),
+    density=4.0,
+    budget_bytes=4 << 20,
+)
 
 
 class Demo:
-    """A demonstration in its own process, with marked descendants and a temporary directory of its own.
+    """A demonstration with marked descendants and its own temporary directory.
 
     Parameters
     ----------
     *words
-        What the demonstration is told.
+        Options of the demonstration.
     command
         The module, and its words.
     """
 
     def __init__(
-        self, cwd: Path, *words: str, command: Sequence[str] = ("tests.support.small_demo",)
+        self, cwd: Path, *words: str, command: Sequence[str] = ("tests.support.demo_process",)
     ) -> None:
         self.mark = secrets.token_hex(8)
         self.cwd = cwd
@@ -60,3 +81,13 @@ def until(demo: Demo, stage: str) -> None:
         if line.startswith(stage):
             return
     raise AssertionError(f"it never said {stage!r}")
+
+
+if __name__ == "__main__":
+    demo_town.DemoSettings = functools.partial(  # type: ignore[misc, assignment]
+        demo_town.DemoSettings, **{name: getattr(SMALL, name) for name in SMALL.__slots__}
+    )
+    live_drive.LiveDriveSettings = functools.partial(  # type: ignore[misc, assignment]
+        live_drive.LiveDriveSettings, **{name: getattr(SMALL_LIVE, name) for name in SMALL_LIVE.__slots__}
+    )
+    sys.exit(cli.main(["demo", *sys.argv[1:]]))

@@ -19,7 +19,7 @@ from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.scans.scan_file import read_scan
 
-from shmmap.demo.process_memory import process_memory
+from shmmap.demo.process_usage import process_memory
 
 
 def not_shared(voxel_map: VoxelMap) -> list[str]:

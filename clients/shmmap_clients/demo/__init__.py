@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several programs side by side on one daemon."""
+"""What demonstrations and checks need of the programs: a picture, a scene."""

@@ -1,40 +1,65 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap demo`` says in the end: a table of what was measured, and some lines of what it means."""
+"""What ``shmmap demo`` prints in the end: what was measured, in a table and some lines, or as JSON."""
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import sys
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_line, print_table
 
 if TYPE_CHECKING:
     from shmmap.demo.demo import DemoResult
-    from shmmap.demo.drive import DriveResult
-    from shmmap.demo.localization import LocalizationResult
+    from shmmap.demo.live_drive import LiveDriveResult
 
-__all__ = ["draw", "print_report", "print_texts"]
+__all__ = ["DemoReport", "live_report", "print_report", "town_report"]
 
-_WIDTH: Final = 79  # columns, of which every line has to make do
+_WIDTH: Final = 79  # columns of the longest line
 _NARROWEST: Final = 30
 _NAMES: Final = 10  # columns, in front of the lines
+_COLUMNS: Final = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP")
 
 
-def print_report(result: DemoResult, picture: str, duration_s: float) -> None:
-    """Print the table and the lines."""
+@dataclass(frozen=True, slots=True)
+class DemoReport:
+    """The result of a demonstration for its spectators.
+
+    Attributes
+    ----------
+    document
+        What ``--json`` prints.
+    lines
+        The texts by name.
+    picture_svg
+        The picture.
+    passed
+        Whether all was as it has to be.
+    rows
+        Of the table of memory and times; empty without one.
+    """
+
+    document: dict[str, Any]
+    lines: dict[str, str]
+    picture_svg: str
+    passed: bool
+    rows: Sequence[Sequence[str]] = ()
+
+
+def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
+    """Print the table and the lines, each with its name in front; in a pipe, too, no wider than a page."""
     print_line()
-    _print_table(result)
-    print_line()
-    print_texts([*_lines(result), ("duration", f"{format_duration(duration_s)}; picture: {picture}")])
-
-
-def print_texts(texts: Sequence[tuple[str, str]]) -> None:
-    """Print texts, each with its name in front; in a pipe, too, lines of a page's width."""
+    if report.rows:
+        columns = [Column(name, "right" if number else "left") for number, name in enumerate(_COLUMNS)]
+        print_table(columns, report.rows)
+        print_line()
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
-    for name, text in texts:
+    duration = f"{format_duration(duration_s)}; picture: {picture}"
+    for name, text in {**report.lines, "duration": duration}.items():
         for line in textwrap.wrap(
             text,
             max(min(width, _WIDTH), _NARROWEST),
@@ -46,163 +71,139 @@ def print_texts(texts: Sequence[tuple[str, str]]) -> None:
             print_line(line)
 
 
-def _print_table(result: DemoResult) -> None:
+def town_report(result: DemoResult) -> DemoReport:
+    """Report a drive on one shared copy of the map, and on private ones."""
     rows = []
-    for count, each in result.rounds.items():
-        copies = "private copies" if count > 1 else "private copy"
-        rows += [_row(f"{count} {copies}", each.private), _row(f"{count} with shmmap", each.shared)]
-    columns = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP")
-    print_table([Column(name, "right" if number else "left") for number, name in enumerate(columns)], rows)
-
-
-def _row(name: str, drive: DriveResult) -> list[str]:
-    return [
-        name,
-        format_bytes(drive.total_bytes),
-        format_duration(drive.cpu_s),
-        format_duration(drive.start_s),
-        format_duration(drive.follow_max_s),
-    ]
-
-
-def _lines(result: DemoResult) -> list[tuple[str, str]]:
-    lines = [
-        ("town", _town(result)),
-        ("memory", _memory(result)),
-        ("one more", _one_more(result)),
-        ("waiting", _waiting(result)),
-        ("CPU", _cpu(result)),
-        ("kill -9", _outage(result)),
-    ]
-    if result.programs is not None:
-        document = result.programs.document
-        return [
-            *lines,
-            ("position", _all_positions(document)),
-            ("moving", _moving(document["errors"]["compare"])),
-            ("ground", _ground(document["errors"]["elevation"])),
-        ]
-    found = result.localization
-    if found is None:
-        return [*lines, ("position", f"left out: the package {result.missing} is not installed")]
-    return [*lines, ("position", _position(found))]
-
-
-def _town(result: DemoResult) -> str:
-    town, one = result.town, result.many.shared
-    return (
-        f"{town.cells} cells, {town.points / 1e6:.1f} million points; a process needs {one.cells} cells,"
-        f" {format_bytes(one.map_bytes)}"
+    for each in result.rounds:
+        copies = "private copies" if each.consumers > 1 else "private copy"
+        for name, drive in ((copies, each.private), ("with shmmap", each.shared)):
+            seconds = (drive.cpu_s, drive.start_s, drive.follow_max_s)
+            rows.append(
+                [f"{each.consumers} {name}", format_bytes(drive.total_bytes), *map(format_duration, seconds)]
+            )
+    town, out, found = result.town, result.outage, result.localization
+    more_shared, more_private = result.one_more_bytes
+    document = {
+        "town": {
+            "cells": town.cells,
+            "points": town.points,
+            "file_bytes": town.file_bytes,
+            "build_s": town.build_s,
+        },
+        "rounds": [dataclasses.asdict(each) for each in result.rounds],
+        "one_more_bytes": {"shared": more_shared, "private": more_private},
+        "outage": dataclasses.asdict(out),
+        "localization": dataclasses.asdict(found) if found else None,
+    }
+    return DemoReport(
+        document, _town_lines(result), _draw(result), found is None or found.trustworthy == found.scans, rows
     )
 
 
-def _memory(result: DemoResult) -> str:
-    count = max(result.rounds)
-    last = result.rounds[count]
-    return (
-        f"{count} processes, a private copy each: {format_bytes(last.private.total_bytes)}; with shmmap:"
-        f" {format_bytes(last.shared.total_bytes)}{_too_small(result)}"
-    )
+def _town_lines(result: DemoResult) -> dict[str, str]:
+    town, out, found = result.town, result.outage, result.localization
+    last = result.rounds[-1]
+    count, shared, private = last.consumers, last.shared, last.private
+    more_shared, more_private = result.one_more_bytes
+    too_small = ""
+    if shared.total_bytes >= private.total_bytes:  # every process also has a fixed size
+        too_small = (
+            f". The map around the vehicle ({format_bytes(shared.map_bytes)}) is too small to gain"
+            " from sharing; --density 100 makes a larger one"
+        )
+    position = f"left out: the package {result.missing} is not installed"
+    if found is not None:
+        position = (
+            f"{found.scans} LiDAR scans: {found.error_m * 100:.1f} cm off,"
+            f" {found.error_max_m * 100:.1f} cm at most; first pose after"
+            f" {format_duration(found.first_pose_s)}"
+        )
+    return {
+        "town": (
+            f"{town.cells} cells, {town.points / 1e6:.1f} million points; a process needs {shared.cells}"
+            f" cells, {format_bytes(shared.map_bytes)}"
+        ),
+        "memory": (
+            f"{count} processes, a private copy each: {format_bytes(private.total_bytes)}; with shmmap:"
+            f" {format_bytes(shared.total_bytes)}{too_small}"
+        ),
+        "one more": (
+            f"each further process: {format_bytes(more_private)} with a copy, {format_bytes(more_shared)}"
+            " with shmmap"
+        ),
+        "waiting": (
+            f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; shmmap:"
+            f" {format_duration(shared.follow_max_s)}"
+        ),
+        "CPU": (
+            f"{count} copies: {format_duration(private.cpu_s)}; shmmap: {format_duration(shared.cpu_s)},"
+            f" {format_duration(shared.daemon_start_cpu_s)} of it to start the daemon"
+        ),
+        "kill -9": (
+            f"back in {format_duration(out.down_s)} with {out.adopted} of {out.segments} cells;"
+            f" no process paused over {format_duration(out.longest_pause_s)}"
+        ),
+        "position": position,
+    }
 
 
-def _too_small(result: DemoResult) -> str:
-    """Say why sharing saves nothing where the map is sparse: every process also has a fixed size."""
-    last = result.rounds[max(result.rounds)]
-    if last.shared.total_bytes < last.private.total_bytes:
-        return ""
-    return (
-        f". The map around the vehicle ({format_bytes(last.shared.map_bytes)}) is too small to gain"
-        " from sharing; --density 100 makes a larger one"
-    )
-
-
-def _one_more(result: DemoResult) -> str:
-    shared_bytes, private_bytes = result.one_more_bytes
-    return (
-        f"each further process: {format_bytes(private_bytes)} with a copy, {format_bytes(shared_bytes)}"
-        " with shmmap"
-    )
-
-
-def _waiting(result: DemoResult) -> str:
-    shared, private = result.many.shared, result.many.private
-    return (
-        f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; shmmap:"
-        f" {format_duration(shared.follow_max_s)}"
-    )
-
-
-def _cpu(result: DemoResult) -> str:
-    count = max(result.rounds)
-    last = result.rounds[count]
-    return (
-        f"{count} copies: {format_duration(last.private.cpu_s)}; shmmap:"
-        f" {format_duration(last.shared.cpu_s)}, {format_duration(last.shared.daemon_start_cpu_s)} of it"
-        " to start the daemon"
-    )
-
-
-def _outage(result: DemoResult) -> str:
-    out = result.outage
-    return (
-        f"back in {format_duration(out.down_s)} with {out.adopted} of {out.segments} cells;"
-        f" no process paused over {format_duration(out.longest_pause_s)}"
-    )
-
-
-def _position(found: LocalizationResult) -> str:
-    return (
-        f"{found.scans} LiDAR scans: {_cm(found.error_m)} off, {_cm(found.error_max_m)} at most;"
-        f" first pose after {format_duration(found.first_pose_s)}"
-    )
-
-
-def _all_positions(document: dict[str, Any]) -> str:
-    errors = document["errors"]["ndt"]
-    return (
-        f"{document['programs']['ndt']['frames']} of {document['scans']} LiDAR scans localized:"
-        f" {_cm(errors['mean_m'])} off on average, {_cm(errors['max_m'])} at most"
-    )
-
-
-def _moving(errors: dict[str, float]) -> str:
-    return (
-        f"shmmap-compare kept {errors['moving_kept']:.0%} of points on cars and people,"
-        f" {errors['still_kept']:.1%} of others"
-    )
-
-
-def _ground(errors: dict[str, Any]) -> str:
-    return (
-        f"shmmap-elevation: road height {_cm(errors['mean_m'])} off on average, {_cm(errors['max_m'])}"
-        " at most"
-    )
-
-
-def _cm(metres: float | None) -> str:
-    return "unknown" if metres is None else f"{metres * 100:.1f} cm"
-
-
-def draw(result: DemoResult) -> str:
-    """Draw the town from above, with the way and the cells in shared memory, as SVG."""
+def _draw(result: DemoResult) -> str:
+    """Draw the town from above, with the route and the cells in shared memory, as SVG."""
     from shmmap.cli.screens.picture import CellSquare, Raster, Vehicle, top_view_svg
 
-    town = result.town
+    town, shared = result.town, result.rounds[-1].shared
     states = {row.box: row for row in result.resident}
     cells = []
     for box in town.boxes:
         row = states.get(box)
         title = f"{box[0]:g}, {box[1]:g}" + (f": {row.points:,} points, {row.state}" if row else "")
         cells.append(CellSquare(box, row.state if row else "", title))
-    last = town.route[-1]
+    end = town.route[-1]
     resident = sum(1 for cell in cells if cell.state == "resident")
     return top_view_svg(
         town.bounds,
         cells,
         title=f"A generated town: {town.cells} cells, {town.points / 1e6:.1f} million points",
         note=f"At the end of the drive {resident} cells are in shared memory, once for all"
-        f" {result.many.shared.consumers} processes: {format_bytes(result.many.shared.shm_bytes)}.",
+        f" {shared.consumers} processes: {format_bytes(shared.shm_bytes)}.",
         raster=Raster(town.bounds, town.picture_png),
         driven=[(pose.x, pose.y) for pose in town.route],
-        vehicle=Vehicle(last.x, last.y, last.heading, result.settings.radius),
+        vehicle=Vehicle(end.x, end.y, end.heading, result.radius),
     )
+
+
+def live_report(result: LiveDriveResult) -> DemoReport:
+    """Report a drive that was mapped, what was killed on it, and whether a voxel was lost."""
+    voxels = f"{result.voxels:,}".replace(",", " ")
+    compared = f"all {voxels} voxels on disk are as in a map without bounds of the same scans"
+    if result.differing:
+        differing = f"{result.differing:,}".replace(",", " ")
+        compared = (
+            f"{differing} of {voxels} voxels on disk are NOT as in a map without bounds of the same scans"
+        )
+    lines = {
+        "drive": (
+            f"{result.scans} LiDAR scans, {result.points / 1e6:.1f} million points, on {result.length_m:g} m;"
+            f" mapped in {format_duration(result.mapping_s)}, with both kills"
+        ),
+        "map": (
+            f"{result.chunks} chunks, {voxels} known voxels; each takes"
+            f" {result.active_bytes / max(1, result.active):.1f} bytes in memory,"
+            f" {result.file_bytes / max(1, result.voxels):.1f} on disk"
+        ),
+        "memory": (
+            f"chunks in service took at most {format_bytes(result.max_bytes)} of"
+            f" {format_bytes(result.budget_bytes)}; {result.evicted} times a chunk was saved and evicted,"
+            f" {result.came_back} times one came back"
+        ),
+        "kill -9": (
+            f"the daemon after scan {result.daemon_killed_at}: back in"
+            f" {format_duration(result.daemon_down_s)}, and found {result.daemon_chunks} chunks in memory;"
+            f" the mapping program after scan {result.mapper_killed_at}: its next run continued with scan"
+            f" {result.mapper_resumed_at}"
+        ),
+        "compared": compared,
+    }
+    document = dataclasses.asdict(result)
+    picture_svg = document.pop("picture_svg")
+    return DemoReport(document, lines, picture_svg, passed=not result.differing)

@@ -7,9 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from shmmap.formats.svg import Axes, Page, box_around, dash, element
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors

@@ -9,10 +9,11 @@ third reads the whole map again and again.  Nothing here waits for a time to pas
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -21,33 +22,28 @@ import msgspec
 import numpy as np
 import zmq
 from numpy.typing import NDArray
-
-from shmmap import InternalError
-from shmmap.demo.program import Program
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher, decode_scan
 from shmmap_clients.scans.trajectory import tum_line
 
+from shmmap.demo.program import Program
+from shmmap.errors import InternalError
+
 __all__ = ["ProgramRun", "ThreePrograms", "run_three_programs", "table"]
 
 _ON_THEIR_WAY: Final = 6  # scans
-_PATIENCE_S: Final = 120.0  # for an answer
+_ANSWER_S: Final = 120.0  # for an answer
 _LAST_RUN_S: Final = 900.0  # for a program's end: the elevation map may just have begun a large map
 _POLL_MS: Final = 1000
 
 
-@dataclass(slots=True)
-class ProgramRun:
-    """One program.
+class ProgramRun(Program):
+    """One of the programs, and what was seen of it.
 
     Attributes
     ----------
-    name
-        ``ndt``, ``compare`` or ``elevation``.
     document
         What it printed at its end, its ``--json``.
-    exit_code
-        Of its last run.
     runs
         How often it ran to its end.
     own_bytes
@@ -56,12 +52,31 @@ class ProgramRun:
         Shared memory that it had mapped and touched, at most (RssShmem).
     """
 
-    name: str
-    document: dict[str, Any] = field(default_factory=dict)
-    exit_code: int = 0
-    runs: int = 0
-    own_bytes: list[int] = field(default_factory=list)
-    shared_bytes: int = 0
+    def __init__(self, name: str, module: str, words: list[str], work: Path) -> None:
+        super().__init__(name, module, words, work)
+        self.document: dict[str, Any] = {}
+        self.runs = 0
+        self.own_bytes: list[int] = []
+        self.shared_bytes = 0
+
+    def sample(self) -> None:
+        """Look at its memory."""
+        try:
+            status = Path(f"/proc/{self.pid}/status").read_text(encoding="utf-8")
+        except OSError:
+            return
+        found = dict(re.findall(r"^(RssAnon|RssShmem):\s+(\d+) kB$", status, re.MULTILINE))
+        if "RssAnon" in found:  # not in one that has just ended
+            self.own_bytes.append(int(found["RssAnon"]) << 10)
+            self.shared_bytes = max(self.shared_bytes, int(found["RssShmem"]) << 10)
+
+    def complete(self) -> None:
+        """Wait for its end and read the document that it printed."""
+        printed = self.finish(_LAST_RUN_S, fails=True)
+        if not printed:
+            raise InternalError(f"{self.name} printed nothing: {self.last_words()}")
+        self.document = json.loads(printed)
+        self.runs += 1
 
     @property
     def growth_bytes(self) -> int:
@@ -80,11 +95,6 @@ class ThreePrograms:
     ----------
     scans, seconds
         Scans sent, and how long it took.
-    kept, kept_moving
-        Points that the compare filter gave back, summed, and those among them that belong to what moves
-        (column ``moving``, where scans have one).
-    sent, sent_moving
-        The same of the scans that were sent.
     acknowledged
         Scans that came back from ``ndt`` and from ``compare``.
     segment_bytes
@@ -97,40 +107,10 @@ class ThreePrograms:
 
     scans: int = 0
     seconds: float = 0.0
-    kept: int = 0
-    kept_moving: int = 0
-    sent: int = 0
-    sent_moving: int = 0
     acknowledged: dict[str, int] = field(default_factory=dict)
     segment_bytes: list[int] = field(default_factory=list)
     segments_seen: set[str] = field(default_factory=set)
     programs: dict[str, ProgramRun] = field(default_factory=dict)
-
-
-class _Started:
-    """A program that runs, its memory, and what it says as JSON in the end."""
-
-    def __init__(self, run: ProgramRun, module: str, words: list[str], work: Path) -> None:
-        self.run = run
-        self.program = Program(run.name, module, words, work, own_session=False)
-
-    def sample(self) -> None:
-        """Look at its memory."""
-        if self.program.pid is None:
-            return
-        try:
-            status = Path(f"/proc/{self.program.pid}/status").read_text(encoding="utf-8")
-        except OSError:
-            return
-        found = dict(re.findall(r"^(RssAnon|RssShmem):\s+(\d+) kB$", status, re.MULTILINE))
-        if "RssAnon" in found:  # not in one that has just ended
-            self.run.own_bytes.append(int(found["RssAnon"]) << 10)
-            self.run.shared_bytes = max(self.run.shared_bytes, int(found["RssShmem"]) << 10)
-
-    def finish(self) -> None:
-        """Wait for its end and read what it said."""
-        self.run.document, self.run.exit_code = self.program.document(_LAST_RUN_S)
-        self.run.runs += 1
 
 
 def run_three_programs(
@@ -144,7 +124,6 @@ def run_three_programs(
     ndt: Iterable[str] = (),
     compare: Iterable[str] = (),
     elevation: Iterable[str] = (),
-    after_scan: Callable[[ThreePrograms], None] | None = None,
 ) -> ThreePrograms:
     """Run them until the scans end, then until each has ended.
 
@@ -160,8 +139,6 @@ def run_three_programs(
         Directory for sockets, caches and outputs; ``ndt.svg`` and ``compare.svg`` are the drives' pictures.
     ndt, compare, elevation
         More words for each program's command line.
-    after_scan
-        Called after each scan was sent.
 
     Raises
     ------
@@ -184,56 +161,42 @@ def run_three_programs(
         "elevation": ["build", "--cache", str(work / "elevation"), "--quiet", *elevation],
     }  # fmt: skip
     modules = {"ndt": "ndt_scan_matcher", "compare": "compare_map_filter", "elevation": "elevation_map"}
-    programs = {}
+    programs = result.programs
     for name, module in modules.items():
-        run = result.programs[name] = ProgramRun(name)
-        programs[name] = _Started(
-            run, f"shmmap_clients.{module}", [*words[name], "--endpoint", endpoint, "--json"], work
-        )
+        line = [*words[name], "--endpoint", endpoint, "--json"]
+        programs[name] = ProgramRun(name, f"shmmap_clients.{module}", line, work)
     began_s = time.monotonic()
     with contextlib.ExitStack() as stack:
         outputs = [stack.enter_context(ScanPublisher(address[name])) for name in ("to-ndt", "to-compare")]
         answers = stack.enter_context(_Answers(address["poses"], address["kept"], result))
         for program in programs.values():
-            stack.enter_context(program.program)
+            stack.enter_context(program)
         for output in outputs:
-            if not output.wait_for_listener(_PATIENCE_S):
-                raise InternalError(
-                    f"nobody listens to {output.endpoint}: {programs['ndt'].program.last_words()}"
-                )
+            if not output.wait_for_listener(_ANSWER_S):
+                raise InternalError(f"no program connects to {output.endpoint}")
         for scan in scans:
             answers.wait(result.scans - _ON_THEIR_WAY, programs)
             for output in outputs:
                 output.send(scan)
             result.scans += 1
-            result.sent += len(scan.xyz)
-            result.sent_moving += _moving(scan)
             answers.expect(scan.name)
             _sample(result, programs, Path(shm_dir), instance)
-            if not programs["elevation"].program.running:
-                programs["elevation"].finish()
-                shutil.rmtree(
-                    work / "elevation", ignore_errors=True
-                )  # from the map again, not from its cache
-                programs["elevation"].program.start()
-            if after_scan is not None:
-                after_scan(result)
+            if not programs["elevation"].running:
+                programs["elevation"].complete()
+                # from the map again, not from its cache
+                shutil.rmtree(work / "elevation", ignore_errors=True)
+                programs["elevation"].start()
         for output in outputs:
             output.send(None)
         answers.wait(result.scans, programs)
         for program in programs.values():
-            program.finish()
+            program.complete()
     result.seconds = time.monotonic() - began_s
     return result
 
 
-def _moving(scan: Scan) -> int:
-    """How many of its points belong to what moves, as far as it tells."""
-    return int(np.count_nonzero(scan.columns["moving"])) if "moving" in scan.columns else 0
-
-
 class _Answers:
-    """Hears what the two programs give back for each scan."""
+    """Receives what the two programs give back for each scan."""
 
     def __init__(self, poses: str, kept: str, result: ThreePrograms) -> None:
         self._context = zmq.Context()
@@ -247,7 +210,7 @@ class _Answers:
             self._sockets[socket] = name
             self._poller.register(socket, zmq.POLLIN)
         self._numbers: dict[str, int] = {}
-        self._heard = {"ndt": -1, "compare": -1}
+        self._answered = {"ndt": -1, "compare": -1}
         self._result = result
         result.acknowledged = {"ndt": 0, "compare": 0}
 
@@ -263,23 +226,23 @@ class _Answers:
         """A scan of this name was sent."""
         self._numbers[name] = len(self._numbers)
 
-    def wait(self, count: int, programs: dict[str, _Started]) -> None:
+    def wait(self, count: int, programs: dict[str, ProgramRun]) -> None:
         """Wait until both have answered the first ``count`` scans, or a later one."""
         quiet_s = time.monotonic()
-        while min(self._heard.values()) < count - 1:
+        while min(self._answered.values()) < count - 1:
             ready = self._poller.poll(_POLL_MS)
             for socket, _ in ready:
-                self._hear(socket)
+                self._receive(socket)
             if ready:
                 quiet_s = time.monotonic()
                 continue
-            for name, heard in self._heard.items():
-                if heard < count - 1 and not programs[name].program.running:
-                    raise InternalError(f"{name} ended: {programs[name].program.last_words()}")
-            if time.monotonic() - quiet_s > _PATIENCE_S:
-                raise InternalError(f"no answer for {_PATIENCE_S:g} s; heard {self._heard}")
+            for name, last in self._answered.items():
+                if last < count - 1 and not programs[name].running:
+                    raise InternalError(f"{name} ended early: {programs[name].last_words()}")
+            if time.monotonic() - quiet_s > _ANSWER_S:
+                raise InternalError(f"no answer for {_ANSWER_S:g} s; answered so far: {self._answered}")
 
-    def _hear(self, socket: zmq.Socket[bytes]) -> None:
+    def _receive(self, socket: zmq.Socket[bytes]) -> None:
         program = self._sockets[socket]
         frames = socket.recv_multipart()
         if program == "ndt":
@@ -289,13 +252,11 @@ class _Answers:
             if scan is None:
                 return
             name = scan.name
-            self._result.kept += len(scan.xyz)
-            self._result.kept_moving += _moving(scan)
-        self._heard[program] = max(self._heard[program], self._numbers[name])
+        self._answered[program] = max(self._answered[program], self._numbers[name])
         self._result.acknowledged[program] += 1
 
 
-def _sample(result: ThreePrograms, programs: dict[str, _Started], shm_dir: Path, instance: str) -> None:
+def _sample(result: ThreePrograms, programs: dict[str, ProgramRun], shm_dir: Path, instance: str) -> None:
     """Look at the memory of the programs, and at the daemon's segments."""
     for program in programs.values():
         program.sample()

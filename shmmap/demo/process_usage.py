@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Memory of processes as the kernel counts it, from ``/proc/PID/smaps_rollup``.
+"""Memory and processor time of processes as the kernel counts them.
 
 *PSS* (proportional set size) divides every shared page among the processes that map it, so that
 the PSS of several processes may be summed.  A page of shared memory that no process maps right now
-is in nobody's PSS, although it is in memory.
+is in no process's PSS, although it is in memory.  From ``/proc/PID/smaps_rollup`` and ``/proc/PID/stat``.
 """
 
 from __future__ import annotations
@@ -12,32 +12,28 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-__all__ = ["ProcessMemory", "descendants", "process_memory", "sum_memory"]
+__all__ = ["ProcessMemory", "cpu_seconds", "descendants", "process_memory"]
+
+_USER: Final = 11  # utime, stime, cutime, cstime follow one another: proc(5), counted after the command
+_TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessMemory:
-    """Memory of one process, or of several summed.
+    """Memory of one process.
 
     Attributes
     ----------
-    pss_bytes
-        Proportional set size.
-    pss_shm_bytes
-        The part of it in POSIX shared memory and other tmpfs files.
+    own_bytes
+        Proportional set size without shared memory: interpreter, libraries (its share of them), heap.
     private_bytes
         Pages that no other process maps.
     """
 
-    pss_bytes: int
-    pss_shm_bytes: int
+    own_bytes: int
     private_bytes: int
-
-    @property
-    def own_bytes(self) -> int:
-        """Everything but shared memory: interpreter, libraries (its share of them), heap."""
-        return self.pss_bytes - self.pss_shm_bytes
 
 
 def process_memory(pid: int) -> ProcessMemory:
@@ -55,33 +51,33 @@ def process_memory(pid: int) -> ProcessMemory:
         name, value = line.split(":")
         fields[name] = int(value.split()[0]) * 1024
     return ProcessMemory(
-        pss_bytes=fields["Pss"],
-        pss_shm_bytes=fields.get("Pss_Shmem", 0),  # since Linux 5.9
+        own_bytes=fields["Pss"] - fields.get("Pss_Shmem", 0),  # since Linux 5.9
         private_bytes=fields["Private_Clean"] + fields["Private_Dirty"],
     )
 
 
-def sum_memory(pids: Iterable[int]) -> ProcessMemory:
-    """Sum the memory of several processes, read one after the other."""
-    parts = [process_memory(pid) for pid in pids]
-    return ProcessMemory(
-        pss_bytes=sum(part.pss_bytes for part in parts),
-        pss_shm_bytes=sum(part.pss_shm_bytes for part in parts),
-        private_bytes=sum(part.private_bytes for part in parts),
-    )
+def cpu_seconds(pids: Iterable[int]) -> float:
+    """Return the user and system time of processes, and of their children that have ended, seconds.
+
+    Raises
+    ------
+    ProcessLookupError, FileNotFoundError
+        One of them is gone.
+    """
+    ticks = 0
+    for pid in pids:
+        ticks += sum(int(field) for field in _stat(pid)[_USER : _USER + 4])
+    return ticks / _TICKS_PER_S
 
 
 def descendants(pid: int) -> list[int]:
     """Return ``pid`` and every living process below it, ascending."""
     children: dict[int, list[int]] = {}
-    for entry in os.listdir("/proc"):
-        if not entry.isdigit():
-            continue
+    for entry in filter(str.isdigit, os.listdir("/proc")):
         try:
-            stat = Path(f"/proc/{entry}/stat").read_text(encoding="utf-8", errors="replace")
+            state, parent = _stat(int(entry))[:2]
         except (FileNotFoundError, ProcessLookupError):
             continue
-        state, parent = stat[stat.rindex(")") + 2 :].split(maxsplit=2)[:2]
         if state != "Z":
             children.setdefault(int(parent), []).append(int(entry))
     found, waiting = [], [pid]
@@ -90,3 +86,9 @@ def descendants(pid: int) -> list[int]:
         found.append(current)
         waiting.extend(children.get(current, ()))
     return sorted(found)
+
+
+def _stat(pid: int) -> list[str]:
+    """Return the fields after the command, which may hold blanks and brackets."""
+    stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    return stat[stat.rindex(")") + 2 :].split()
