@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from shmmap.daemon.config import ROWS, DaemonConfig, load_config
 from shmmap.daemon.config_live import LIVE_ROWS, LiveSettings
@@ -13,7 +14,7 @@ from shmmap.service.installation import configuration
 from tests.support.daemon_process import ROOT
 
 EXAMPLE = ROOT / "systemd" / "shmmap.toml"
-SET_FOR_THE_SERVICE = {"map_path": "/var/lib/shmmap/maps", "group": "shmmap"}
+SET_FOR_THE_SERVICE: dict[str, Any] = {"map_path": "/var/lib/shmmap/maps", "group": "shmmap"}
 
 
 def test_it_is_the_one_that_settings_make() -> None:
