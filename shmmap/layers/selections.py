@@ -121,7 +121,7 @@ SAMPLE: Final = LayerKind(
     name="sample",
     builder_version=1,
     summary="some of the points, with every column: every n-th, or a random choice",
-    borders="each cell is sampled alone: count is of a cell, and every begins with the first point of each",
+    borders="each cell is sampled alone: count is a cell's, and every begins with a cell's first point",
     parameters=(
         Parameter(
             "every", int, "keep the first of each group of this many points", minimum=1, maximum=1 << 40

@@ -587,7 +587,7 @@ def test_who_left_without_a_goodbye(daemon: Factory, divided_map: DividedMap) ->
     """The daemon keeps no descriptor and no pose of it, and its name while the kernel says that it maps."""
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint, name="watcher") as watcher:
-        watcher.stats()
+        watcher.around(0, 0, 10)  # the loaders run, and are watched
         before = descriptors(one.pid)
         kept = []
         for number in range(20):
