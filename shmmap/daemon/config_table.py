@@ -189,8 +189,7 @@ def setting(
 ) -> T:
     """Describe a field of a dataclass as a setting, see `Row`."""
     described = (help, metavar, allowed, unset, size, parse)
-    made: Any = field(default=default, metadata={"setting": described})
-    return made
+    return field(default=default, metadata={"setting": described})
 
 
 def rows_of(kind: type) -> dict[str, Row]:
