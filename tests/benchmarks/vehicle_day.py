@@ -290,8 +290,8 @@ def main() -> None:
         )
     if not 0.0 < args.hours <= 1.0:
         parser.error("--hours: the way takes one hour")
-    if args.picture is not None and args.picture.suffix != ".png":
-        parser.error(f"--picture: {args.picture} has to end in .png")
+    if args.picture is not None and args.picture.suffix != ".svg":
+        parser.error(f"--picture: {args.picture} has to end in .svg")
     way = city_drive(args.seed, 45_000.0, BLOCKS)
     kinds = [args.only] if args.only else list(KINDS)
     print(f"load {os.getloadavg()[0]:.1f}; an hour takes {args.minutes:g} minutes", flush=True)

@@ -270,6 +270,7 @@ def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:
     [
         (["serve", "/nowhere/at/all"], 66),
         (["serve", ".", "--budget", "much"], 78),
+        (["serve", ".", "--eviction", "lru"], 78),
         (["serve", ".", "--instance", "a/b"], 78),
         (["serve", ".", "--config", "missing.toml"], 78),
         (["serve"], 78),

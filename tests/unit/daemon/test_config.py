@@ -156,11 +156,12 @@ def test_a_setting_that_is_gone_is_refused_with_what_to_do(tmp_path: Path) -> No
     """Also one that says what always holds now."""
     file = tmp_path / "shmmap.toml"
     file.write_text('workers = 2\neviction = "time"\n')
-    for flags, environ, path, message, hint in (
+    cases: list[tuple[dict[str, Any], dict[str, str], str, str, str]] = [
         ({}, {}, str(file), f"{file}:2: eviction is gone: what clients will need", "delete this line"),
         ({}, {"SHMMAP_EVICTION": "lru"}, "", "SHMMAP_EVICTION: eviction is gone", "unset SHMMAP_EVICTION"),
         ({"eviction": "distance"}, {}, "", "command line: --eviction is gone", "leave it out"),
-    ):
+    ]
+    for flags, environ, path, message, hint in cases:
         with pytest.raises(ConfigError) as failure:
             load(flags, environ, path)
         assert message in failure.value.message

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 from shmmap.daemon.config import ROWS, DaemonConfig, load_config
 from shmmap.daemon.config_live import LIVE_ROWS, LiveSettings
@@ -14,7 +13,7 @@ from shmmap.service.installation import configuration
 from tests.support.daemon_process import ROOT
 
 EXAMPLE = ROOT / "systemd" / "shmmap.toml"
-SET_FOR_THE_SERVICE: dict[str, Any] = {"map_path": "/var/lib/shmmap/maps", "group": "shmmap"}
+OF_THE_SERVICE = DaemonConfig(map_path="/var/lib/shmmap/maps", group="shmmap")
 
 
 def test_it_is_the_one_that_settings_make() -> None:
@@ -23,7 +22,7 @@ def test_it_is_the_one_that_settings_make() -> None:
 
 
 def test_it_can_be_used_as_it_stands() -> None:
-    assert load_config({}, file=str(EXAMPLE), environ={}) == DaemonConfig(**SET_FOR_THE_SERVICE)
+    assert load_config({}, file=str(EXAMPLE), environ={}) == OF_THE_SERVICE
 
 
 def test_what_is_commented_out_are_all_settings_with_their_defaults(tmp_path: Path) -> None:
@@ -35,7 +34,7 @@ def test_what_is_commented_out_are_all_settings_with_their_defaults(tmp_path: Pa
     assert ["name", *LIVE_ROWS] == [one.name for one in fields(LiveSettings)]
     file = tmp_path / "all.toml"
     file.write_text(assignment.sub("", text))
-    expected = DaemonConfig(**SET_FOR_THE_SERVICE, live=(LiveSettings("lidar"),))
+    expected = replace(OF_THE_SERVICE, live=(LiveSettings("lidar"),))
     assert load_config({}, file=str(file), environ={}) == expected
 
 
