@@ -21,10 +21,13 @@ class Origin:
     def __init__(self) -> None:
         self.answer: bool | Exception = False
         self.asked = 0
+        self.may_answer = threading.Event()
+        self.may_answer.set()
         self._links: list[OriginLink] = []
 
     def ask(self) -> bool:
         self.asked += 1
+        self.may_answer.wait()
         if isinstance(self.answer, Exception):
             raise self.answer
         return self.answer
@@ -83,8 +86,10 @@ def test_what_cannot_be_had_of_one_that_answers_is_asked_for_less_and_less(origi
     link = origin.link()
     times = []
     for _ in range(3):
+        origin.may_answer.clear()
         link.doubt()
         link.doubt()
+        origin.may_answer.set()
         waiting = Patience()
         while waiting(not news(link).back):
             pass
