@@ -160,6 +160,8 @@ class EvictionOrder:
         Deferred because they were just handed out: their readers may be opening them.
     deferred
         Deferred because a request or pin needs them, or a process has them mapped.
+    new : ShardedDict
+        Not scored yet; what comes into service is put here.
     changes : int
         How often a segment came or was reconsidered: there may be more that can be evicted now.
     scored : int
@@ -170,7 +172,7 @@ class EvictionOrder:
         self.in_grace = Deferred()
         self.deferred = Deferred()
         self.scored = self.changes = 0
-        self._new: ShardedDict[Resident, float | None] = ShardedDict()
+        self.new: ShardedDict[Resident, float | None] = ShardedDict()
         self._entries: ShardedDict[Resident, _Entry] = ShardedDict()
         self._sorted = _Sorted()
         self._number = 0
@@ -178,20 +180,15 @@ class EvictionOrder:
         self._tried: dict[Resident, None] = {}
 
     def __len__(self) -> int:
-        return len(self._new) + len(self._entries) + len(self.in_grace) + len(self.deferred)
-
-    def enter(self, resident: Resident) -> None:
-        """Add a segment that came into service, or may be evicted again."""
-        self._new[resident] = None
-        self.changes += 1
+        return len(self.new) + len(self._entries) + len(self.in_grace) + len(self.deferred)
 
     def leave(self, resident: Resident) -> None:
         """Remove a segment from the order."""
         entry = self._entries.pop(resident, None)
         if entry is not None:
             self._sorted.remove(entry)
-        elif resident in self._new:
-            del self._new[resident]
+        elif resident in self.new:
+            del self.new[resident]
         elif not self.in_grace.take(resident):
             self.deferred.take(resident)
 
@@ -200,18 +197,19 @@ class EvictionOrder:
         entry, resident.deferred_s = self._entries.get(resident), 0.0
         if self.deferred.take(resident) or (entry is not None and entry.unclaimed is bool(resident.sessions)):
             self.leave(resident)
-            self.enter(resident)
+            self.new[resident] = None
+            self.changes += 1
             return entry is None
         return False
 
     def reconsider_all(self) -> None:
         """Take note that any segment deferred as mapped or needed may have been released."""
-        few, many = self._new, self.deferred.take_all()
+        few, many = self.new, self.deferred.take_all()
         if len(few) > len(many):
             few, many = many, few
         many.update(few)  # however many there are, few of them are touched
         self.changes += 1
-        self._new = many
+        self.new = many
 
     def defer(self, resident: Resident, where: Deferred, until_s: float) -> None:
         """Defer a segment; ``where`` is `in_grace` or `deferred`."""
@@ -242,21 +240,21 @@ class EvictionOrder:
     @property
     def settled(self) -> bool:
         """Whether all have been scored."""
-        return not self._new
+        return not self.new
 
     def fill(self, score: Score, now_s: float) -> bool:
         """Score some new segments, or some whose time has come, if few are in order; whether any were."""
         for resident in (*self.in_grace.due(now_s), *self.deferred.due(now_s)):
-            self._new[resident] = None
-        if len(self._entries) >= FRONT or not self._new:
+            self.new[resident] = None
+        if len(self._entries) >= FRONT or not self.new:
             return False  # they wait: many at once cost little more than one
         self.score_new(score, FRONT)
         return True
 
     def score_new(self, score: Score, most: int = BATCH) -> None:
         """Score new segments, a bounded number."""
-        if self._new:
-            self._place([self._new.popitem()[0] for _ in range(min(most, len(self._new)))], score)
+        if self.new:
+            self._place([self.new.popitem()[0] for _ in range(min(most, len(self.new)))], score)
 
     def refresh(self, some: Iterable[Resident], score: Score) -> None:
         """Bring the scores of some segments up to date."""

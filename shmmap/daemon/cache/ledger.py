@@ -196,7 +196,8 @@ class Ledger:
         self.unchecked_count += not resident.checked
         self.prefetched_bytes += resident.nbytes * resident.prefetched
         self.segments.add(resident)
-        self.order.enter(resident)
+        self.order.new[resident] = None
+        self.order.changes += 1
         if old is not None:
             self._leave_service(old)
         return old

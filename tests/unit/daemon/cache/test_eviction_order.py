@@ -74,7 +74,7 @@ class Machine(RuleBasedStateMachine):
         one = made(self.number, last_use_s)
         self.worth.of_number[self.number] = score
         self.known[one] = -math.inf
-        self.order.enter(one)
+        self.order.new[one] = None
 
     @precondition(lambda self: self.known)
     @rule(draw=st.integers(0, 100))
@@ -142,7 +142,7 @@ def test_all_of_many_in_order(count: int) -> None:
     some = [made(number, random.random()) for number in range(count)]
     for one in some:
         worth.of_number[one.version] = random.random() * 100
-        order.enter(one)
+        order.new[one] = None
     while not order.settled:
         order.score_new(worth.score)
     for one in random.sample(some, count // 3):
@@ -159,7 +159,7 @@ def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
     order, some = EvictionOrder(), [made(number) for number in range(count)]
     for one in some:
         worth.of_number[one.version] = float(one.version)
-        order.enter(one)
+        order.new[one] = None
     while not order.settled:
         order.score_new(worth.score)
     return order, some
