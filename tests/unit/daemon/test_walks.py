@@ -101,7 +101,7 @@ def test_cold_load(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> 
     )
     assert [Path(cell.id).name for cell in reply.cells] == ["20_20.pcd"]
     assert walker.files == listed(2)
-    assert len(walker.files) <= 18
+    assert len(walker.files) <= 17
 
 
 def test_eviction(whole: Callable[..., WholeDaemon], tmp_path: Path) -> None:
