@@ -4,6 +4,7 @@
     python -m tests.benchmarks.mutants [--tree DIR] draw --seed 29ca3b8 --count 60 > mutants.json
     python -m tests.benchmarks.mutants [--tree DIR] run mutants.json [--only 3,17] [--together 5]
                                                                      [--results FILE] [STAGE ...]
+    python -m tests.benchmarks.mutants carry mutants.json --from OLD > here.json
 
 A mutant is one change of one place: a bound dropped, a comparison turned, a version not compared, a lock not
 taken, an fsync left out, nanoseconds for seconds, an error not raised, a condition turned, a number one
@@ -19,7 +20,9 @@ counts as caught only if the first test that failed passes in the copy that is n
 run once with N mutants in the copy.  What fails then is run with each of them alone, and where some are
 caught the stage is run again with the rest.
 
-``--tree`` is another checkout, such as an older one, whose code is broken and whose tests are run.
+``--tree`` is another checkout, such as an older one, whose code is broken and whose tests are run.  ``carry``
+finds its mutants in this one, where the lines that they change stand as they were, in whatever module; the
+others are named and left out.
 """
 
 from __future__ import annotations
@@ -41,7 +44,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-__all__ = ["Mutant", "caught_together", "draw", "mutants_of"]
+__all__ = ["Mutant", "carry", "caught_together", "draw", "mutants_of"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGES: Final = (
@@ -228,6 +231,34 @@ def _in_turn(queues: Sequence[Sequence[Mutant] | Iterator[Mutant]]) -> Iterator[
                 yield mutant
 
 
+def carry(mutant: Mutant, old: Path, new: Path) -> Mutant | None:
+    """Find a mutant of a tree in another one; None if its lines are not there, or in several places.
+
+    Indentation and what surrounds the lines may differ.  Where several modules have them, the one in a module
+    of the same name counts.
+    """
+    text = (old / mutant.path).read_text(encoding="utf-8")
+    begin = text.rfind("\n", 0, mutant.at) + 1
+    end = text.find("\n", mutant.at + len(mutant.old))
+    lines = [line.strip() for line in text[begin:end].split("\n")]
+    wanted = re.compile(r"^[ \t]*" + r"\n[ \t]*".join(map(re.escape, lines)) + "$", re.MULTILINE)
+    nth = len(re.findall(re.escape(mutant.old.split("\n")[0]), text[begin : mutant.at]))
+    found: list[Mutant] = []
+    for file in sorted((new / "shmmap").rglob("*.py")):
+        other = file.read_text(encoding="utf-8")
+        for match in wanted.finditer(other):
+            parts = r"\n[ \t]*".join(re.escape(line.strip()) for line in mutant.old.split("\n"))
+            places = list(re.finditer(parts, match[0]))
+            if len(places) > nth:
+                at = match.start() + places[nth].start()
+                line = other.count("\n", 0, at) + 1
+                path = str(file.relative_to(new))
+                found.append(Mutant(mutant.kind, path, line, at, places[nth][0], mutant.new))
+    if len(found) > 1:
+        found = [one for one in found if Path(one.path).name == Path(mutant.path).name]
+    return found[0] if len(found) == 1 else None
+
+
 def _own_tests(tree: Path, path: str) -> str:
     """Return the folder of unit tests nearest to a module; empty if it has none."""
     folder = Path(path).parent
@@ -391,8 +422,20 @@ def main() -> None:
     running.add_argument("--together", type=int, default=1, metavar="N", help="how many in a stage at once")
     running.add_argument("--limit", type=float, default=LIMIT_S, help="of a stage, seconds")
     running.add_argument("--results", type=Path, help="append a line of JSON for each")
+    carrying = verbs.add_parser("carry", help="print mutants of another checkout as they are in this one")
+    carrying.add_argument("mutants", type=Path)
+    carrying.add_argument("--from", type=Path, required=True, dest="old", metavar="OLD", help="that checkout")
     args = parser.parse_args()
-    if args.verb == "draw":
+    if args.verb == "carry":
+        carried = []
+        for number, one in enumerate(json.loads(args.mutants.read_text(encoding="utf-8"))):
+            mutant = carry(Mutant(**one), args.old, args.tree)
+            if mutant is None:
+                print(f"{number:3} is not here: {Mutant(**one)}", file=sys.stderr)
+            else:
+                carried.append(asdict(mutant))
+        print(json.dumps(carried, indent=1))
+    elif args.verb == "draw":
         print(json.dumps([asdict(one) for one in draw(args.tree, args.seed, args.count)], indent=1))
     else:
         _run(args)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.mutants import Mutant, caught_together, draw, mutants_of
+from tests.benchmarks.mutants import Mutant, carry, caught_together, draw, mutants_of
 from tests.support.daemon_process import ROOT
 
 CODE = """
@@ -98,3 +98,35 @@ def test_mutants_broken_together_are_caught_one_by_one(tmp_path: Path) -> None:
 
     assert caught == {0: "test_sums.py::test_both", 1: "test_sums.py::test_both"}
     assert (broken / "package/sums.py").read_text() == (whole / "package/sums.py").read_text()
+
+
+def test_mutants_are_found_in_another_checkout(tmp_path: Path) -> None:
+    """In another module, indented otherwise, also where several places of a line could be meant."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    for tree in (old, new):
+        (tree / "shmmap/package").mkdir(parents=True)
+    (old / "shmmap/package/small.py").write_text(
+        "left = 1\nif left == (1 and\n    2):\n    gone = 3\nboth = [7, 7]\n"
+    )
+    (old / "shmmap/package/twice.py").write_text("one = 5\n")
+    (new / "shmmap/large.py").write_text(
+        "def all():\n    left = 1\n    if left == (1 and\n            2):\n        pass\n"
+        "    both = [7, 7]\n    one = 5\n"
+    )
+    (new / "shmmap/package/twice.py").write_text("one = 5\n")
+
+    found = {}
+    for one in mutants_of(old, "shmmap"):
+        carried = carry(one, old, new)
+        found[one.line, one.old, one.at] = carried and (carried.path, carried.line)
+        if carried is not None:
+            assert carried.new == one.new
+            whole = (new / carried.path).read_text()
+            carried.apply(new)  # its place has what it changes
+            (new / carried.path).write_text(whole)
+
+    places = {(line, text): where for (line, text, _), where in found.items()}
+    assert places[1, "1"] == ("shmmap/large.py", 2)
+    assert places[4, "3"] is None
+    assert places[5, "7"] == ("shmmap/large.py", 6)
+    assert places[1, "5"] == ("shmmap/package/twice.py", 1)
