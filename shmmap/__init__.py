@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import shmmap.errors as _errors
 from shmmap.lazy_names import lazy_names
 from shmmap.optional_packages import needed_packages
 from shmmap.segment.process_limits import no_files_left
@@ -175,6 +176,8 @@ _load = lazy_names(__name__)
 
 
 def __getattr__(name: str) -> Any:
+    if name in _errors.__all__:  # an error can be named where no file can be opened
+        return getattr(_errors, name)
     try:
         with needed_packages(f"shmmap.{name}"):
             return _load(name)

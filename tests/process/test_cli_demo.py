@@ -153,7 +153,7 @@ def test_an_occupied_directory_is_refused_before_anything_is_built(tmp_path: Pat
 
     (tmp_path / "town").mkdir()
     (tmp_path / "town" / "mine").touch()
-    with pytest.raises(BadRequest, match="not an empty"):
+    with pytest.raises(BadRequest, match="is not a divided map: it has mine"):
         run_demo(DemoSettings(), NothingMayBegin(), map_dir=str(tmp_path / "town"))
     assert [path.name for path in (tmp_path / "town").iterdir()] == ["mine"]
 

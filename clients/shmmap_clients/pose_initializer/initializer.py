@@ -117,7 +117,8 @@ class InitializerRules:
     scoring_points
         Points of the scan that score candidates and align the starts.
     wait_s
-        How long the map may take.
+        How long the map may take.  The first time on a machine kernels are compiled for its layers, which
+        takes a minute or more on a slow or busy one.
     seed
         The same seed searches the same way.
     """
@@ -129,7 +130,7 @@ class InitializerRules:
     starts: int = 10
     finals: int = 3
     scoring_points: int = 500
-    wait_s: float = 60.0
+    wait_s: float = 300.0
     seed: int = 0
 
     def __post_init__(self) -> None:
