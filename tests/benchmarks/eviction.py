@@ -38,8 +38,8 @@ from shmmap.statistics.cell_rows import CELL_ROW_BYTES
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.make_many_cells import CELL_METRES, make_many_cells
 from tests.support import connections
+from tests.support.connections import says
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.moving import says
 from tests.support.raw_client import RawClient
 
 CLIENTS = 300

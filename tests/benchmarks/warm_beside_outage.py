@@ -21,10 +21,10 @@ from pathlib import Path
 
 from tests.benchmarks.warm_request import Warm, pin
 from tests.benchmarks.warm_under_load import LOADED, Meanwhile, Other, heavy_cells, while_loading
+from tests.support.command_line import publish
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
-from tests.support.faulty_web import Fault, faulty_web
-from tests.support.publishing import publish
+from tests.support.web_servers import Fault, faulty_web
 
 FAULTS = ("corrupt", "503", "stall", "refuse")
 

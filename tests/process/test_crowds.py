@@ -11,9 +11,8 @@ from contextlib import contextmanager
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 from tests.support.process_costs import descriptors, resident_bytes
 from tests.support.raw_client import RawClient, circle
 
@@ -115,7 +114,7 @@ def test_more_connections_than_descriptors(
         serves(connect(one))
         assert f"connections ended pid={process.pid} count=" in one.log
         serves(client)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > LIMIT // 2):
         client.ask("stats")
 
@@ -143,7 +142,7 @@ done()
         serves(client)
         serves(connect(one))
         assert "sessions already" not in one.log
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(client.ask("stats")[5]) > 2):
         pass
 
@@ -194,7 +193,7 @@ except OSError:
         serves(client)
         assert f"connections ended pid={process.pid} count=" in one.log
         assert "it made the daemon take too much memory" in one.log
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(resident_bytes(one.pid) > 400 << 20):
         client.ask("stats")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -26,7 +26,7 @@ def test_the_daemon_goes_on(
     client.ask("release", None)
     from_now_on.touch()
     client.ask("evict", None)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(client.ask("stats")[4]["zombies"] > 0):
         pass
     assert len(client.area(circle(0, 0, 30)).cells) == len(loaded)

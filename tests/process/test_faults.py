@@ -13,9 +13,8 @@ import pytest
 
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import wait_ended
+from tests.support.daemon_process import Deadline, wait_ended
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 from tests.support.process_costs import peak_bytes
 from tests.support.raw_client import RawClient, circle
 
@@ -84,7 +83,7 @@ def ask_for_four(client: RawClient) -> int:
     """Ask for four cells, and wait until a loader, which stands still, has been given them."""
     started = client.ask("stats")[4]["loads_started"]
     request = client.send("area", circle(40, 40, 5), ["points"], 30.0)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(client.ask("stats")[4]["loads_started"] < started + 4):
         pass
     return request
@@ -105,7 +104,7 @@ def test_a_loader_that_is_killed_costs_one_cell(
     assert (failure.code, "SIGKILL" in failure.message) == ("load_failed", True)
     assert client.ask("stats")[4]["worker_crashes"] == 1
     reply = client.area(circle(40, 40, 5))  # not tried again at once
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(bool(reply.failed)):
         reply = client.area(circle(40, 40, 5))
     assert len(reply.cells) == 4
@@ -189,7 +188,7 @@ def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
     interim.write_bytes(whole)
     interim.rename(path)
     reply = client.area(circle(0, 0, 5))
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(bool(reply.failed)):  # a file that could not even be looked at is tried again after a while
         reply = client.area(circle(0, 0, 5))
     assert len(reply.cells) == 4
@@ -230,13 +229,13 @@ def test_statistics_that_cannot_be_written_end_nobody(
     soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
     told = 'statistics not written error="File too large"'
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(told not in one.log):
         os.sched_yield()
     asked = client.ask("stats")[4]["requests"]
     assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (soft, hard))
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
         os.sched_yield()
     assert one.log.count(told) == 1

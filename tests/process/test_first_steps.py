@@ -22,10 +22,9 @@ import pytest
 from shmmap_clients.scans.trajectory import read_trajectory
 
 from shmmap.simulation.town import Town
+from tests.support.cloud_bytes import write_las
 from tests.support.daemon_process import ROOT
-from tests.support.las_files import write_las
-from tests.support.pages import read_page
-from tests.support.reader import Reader, Terminal
+from tests.support.pages import Reader, Terminal, read_page
 
 README = read_page("README.md")
 INSTALL = read_page("shmmap/INSTALL.md")

@@ -16,12 +16,11 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
+from tests.support.command_line import publish
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import make_map
-from tests.support.faulty_web import FaultyWeb, faulty_web
-from tests.support.nginx import Nginx, free_port, needed_nginx
 from tests.support.pages import read_page
-from tests.support.patience import Patience
-from tests.support.publishing import publish
+from tests.support.web_servers import FaultyWeb, Nginx, faulty_web, free_port, needed_nginx
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -130,7 +129,7 @@ def test_a_new_version_comes_through(
         before = client.area(ALL, wait=120.0).map_version
         other = make_map(tmp_path / "other", columns=3, rows=3, points=200)
         publish(other.root, origin.folder / "town")
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(client.area(ALL, wait=5.0).map_version == before):
             client.reload()
         assert client.area(ALL, wait=120.0).complete
@@ -149,7 +148,7 @@ def test_what_it_does_not_have_is_offline_while_the_server_is_away(
         assert {failure.code for failure in cells.failed} == {"offline"}
         assert {cell.id for cell in near} <= {cell.id for cell in cells}
         origin.listen()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
             time.sleep(0.02)
         assert len(cells) == 9

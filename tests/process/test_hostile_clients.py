@@ -15,10 +15,9 @@ from typing import Any
 import zmq
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
-from tests.support.patience import Patience
 from tests.support.process_costs import descriptors, peak_bytes, resident_bytes
 from tests.support.raw_client import RawClient, circle
 
@@ -81,7 +80,7 @@ def test_bytes_that_are_no_zeromq(daemon: DaemonFactory, connect: Connect, divid
             stranger.send(rng.randbytes(rng.randrange(1, 500)))
     for _ in range(50):
         assert len(client.area(circle(0, 0, 5)).cells) == 4
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > before):
         client.ask("stats")
 
@@ -142,17 +141,17 @@ def test_clients_that_die_are_forgotten(
     for process in dying[1:]:
         process.kill()
         process.communicate()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(client.ask("stats")[5]) > 2):
         pass
     for _ in range(20):
         assert len(client.ask("stats")[5]) == 2  # the stopped one is not reaped
     dying[0].kill()
     dying[0].communicate()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(client.ask("stats")[5]) > 1):
         pass
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > before):
         client.ask("stats")
 
@@ -172,14 +171,14 @@ def test_sessions_come_and_go_without_a_trace(
             client.ask("evict")
             if number % 4 == 0:
                 client.ask("reload")
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
             client.ask("stats")
 
     busy()
     before, loaders = descriptors(one.pid), one.children()
     busy()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > before):
         client.ask("stats")
     assert one.children() == loaders

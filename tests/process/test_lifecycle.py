@@ -19,10 +19,9 @@ import shmmap
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -144,7 +143,7 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
     assert read_statistics(one.instance, one.shm_dir).state == "stopped"
     one.send(signal.SIGCONT)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting((seen := read_statistics(one.instance, one.shm_dir)).counters["cells_resident"] < 12):
         client.ask("stats")
     assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
@@ -153,10 +152,10 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     before = {cell.id: cell for cell in seen.cells}
     for _ in range(3):
         client.selected(["0_0.pcd"])
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(read_statistics(one.instance, one.shm_dir).counters["handles_sent"] < 15):
         client.ask("stats")
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(_row(one, "0_0.pcd").hits < before["0_0.pcd"].hits + 3):
         client.ask("stats")
     assert _row(one, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
@@ -266,7 +265,7 @@ def test_loaders_weigh_less_than_the_daemon(daemon: DaemonFactory, divided_map: 
         return [Path(f"/proc/{pid}/autogroup").read_text().split()[-1] for pid in pids]
 
     leaves = (1.0 + 0.01 * number for number in itertools.count())
-    waiting = Patience()
+    waiting = Deadline()
     with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
         while waiting("5" not in weights(*one.loaders())):
             client.around(0, 0, 5, layers=f"voxel(leaf={next(leaves):.2f})", wait=60.0)

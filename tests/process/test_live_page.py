@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.daemon_process import ROOT
-from tests.support.pages import read_page
-from tests.support.reader import Reader
+from tests.support.pages import Reader, read_page
 
 PAGE = read_page("shmmap/client/live/LIVE_MAPS.md")
 

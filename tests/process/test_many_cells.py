@@ -12,9 +12,8 @@ from pathlib import Path
 
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import ROOT, Deadline
 from tests.support.divided_map import make_map
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient
 
 Connect = Callable[..., RawClient]
@@ -56,7 +55,7 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
         assert (cells, points) == (3000, 15_000)
         assert descriptors < 64
         assert len(os.listdir(f"/proc/{one.pid}/fd")) < 64
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(read_statistics(one.instance, one.shm_dir).cells) < 3000):
             raw.ask("stats")
         seen = read_statistics(one.instance, one.shm_dir)
@@ -67,7 +66,7 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
         holder.stdin.write("\n")
         assert holder.stdout.readline() == "released\n"
         one.until_segments(0, lambda: raw.ask("stats"))
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bool(read_statistics(one.instance, one.shm_dir).cells)):
             raw.ask("stats")
     finally:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.bucket_server import BucketServer
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import make_map
+from tests.support.map_stores import BucketServer
 from tests.support.pages import read_page
 
 PAGE = read_page("shmmap/publishing/PUBLISHING.md")

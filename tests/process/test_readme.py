@@ -16,8 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.daemon_process import ROOT
-from tests.support.pages import read_page
-from tests.support.reader import Reader, Terminal
+from tests.support.pages import Reader, Terminal, read_page
 
 README = read_page("README.md")
 

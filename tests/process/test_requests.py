@@ -14,7 +14,7 @@ from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
 from tests.support.raw_client import DaemonError, RawClient, circle, square
-from tests.support.served_cells import assert_same_points, names
+from tests.support.segment_reader import assert_same_points, names
 
 Connect = Callable[..., RawClient]
 

@@ -14,14 +14,13 @@ import pytest
 import shmmap
 from shmmap.daemon.config import load_config
 from tests.process.conftest import DaemonFactory
-from tests.support.bucket_server import KEYS, BucketServer
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.command_line import publish
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import make_map
-from tests.support.faulty_web import faulty_web
 from tests.support.forked_programs import run_verb
+from tests.support.map_stores import KEYS, BucketServer
 from tests.support.pages import read_page
-from tests.support.patience import Patience
-from tests.support.publishing import publish
+from tests.support.web_servers import faulty_web
 
 PAGE = read_page("shmmap/publishing/SERVING_FROM_A_BUCKET.md")
 
@@ -103,7 +102,7 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
     (serve,) = PAGE.commands("serve")
     with faulty_web(tmp_path / "www") as web:
         one = daemon(serve.split()[2], "--poll", "1", environment={**KEYS, "AWS_ENDPOINT_URL": web.url})
-        waiting = Patience()
+        waiting = Deadline()
         with shmmap.connect(one.endpoint) as client:
             near = client.around(-15.0, -15.0, 2.0, wait=60.0)
             assert near.complete

@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.support.bucket_server import BucketServer
+from tests.support.command_line import Verbs
 from tests.support.daemon_process import ROOT, wait_ended
 from tests.support.divided_map import make_map
+from tests.support.map_stores import BucketServer
 from tests.support.pages import read_page
-from tests.support.published_map_reader import PublishedMapReader
-from tests.support.publishing_verbs import Shmmap
+from tests.support.published_maps import PublishedMapReader
 
 PAGE = read_page("shmmap/publishing/SLICES.md")
 EXAMPLE = "clients/examples/slices_with_dask.py"
@@ -150,7 +150,7 @@ def test_dask_on_this_machine(machine: Machine) -> None:
 
 
 @pytest.fixture
-def cluster(tmp_path: Path, shmmap: Shmmap) -> Iterator[dict[str, subprocess.Popen[str]]]:
+def cluster(tmp_path: Path, shmmap: Verbs) -> Iterator[dict[str, subprocess.Popen[str]]]:
     """A scheduler and two workers on loopback, without nannies that would start others in their place."""
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     environment = shmmap.environment | {"DASK_TEMPORARY_DIRECTORY": str(tmp_path / "dask")}
@@ -190,7 +190,7 @@ def commands_of(worker: subprocess.Popen[str]) -> list[int]:
 
 
 def test_a_dask_worker_that_is_killed_changes_nothing(
-    cluster: dict[str, subprocess.Popen[str]], tmp_path: Path, shmmap: Shmmap
+    cluster: dict[str, subprocess.Popen[str]], tmp_path: Path, shmmap: Verbs
 ) -> None:
     """The same root as in one go; a worker is killed while it makes a slice."""
     import json

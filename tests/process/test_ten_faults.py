@@ -21,14 +21,13 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
-from tests.support.damage import damage_header, damage_payload, other_layout
+from tests.support.client_programs import HoldingClient
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.holding_client import HoldingClient
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient
-from tests.support.served_cells import assert_right, whole
+from tests.support.segment_reader import assert_right, whole
+from tests.support.segments import damage_header, damage_payload, other_layout
 
 
 class Bystanders:
@@ -75,7 +74,7 @@ def bystanders(daemon: DaemonFactory, divided_map: DividedMap) -> Iterator[Bysta
 
 def test_1_a_client_is_killed(bystanders: Bystanders) -> None:
     holder = HoldingClient(bystanders.one.endpoint)
-    assert len(holder.tell([0, 0, 500]).cells) == 36
+    assert len(holder.hold([0, 0, 500]).cells) == 36
     bystanders.client.evict()
     assert len(bystanders.one.segments()) == 36
     bystanders.check()
@@ -85,7 +84,7 @@ def test_1_a_client_is_killed(bystanders: Bystanders) -> None:
 
 def test_2_a_client_stands_still(bystanders: Bystanders) -> None:
     holder = HoldingClient(bystanders.one.endpoint)
-    held = holder.tell([40, 40, 15])
+    held = holder.hold([40, 40, 15])
     os.kill(holder.pid, signal.SIGSTOP)
     for _ in range(5):
         bystanders.client.evict()
@@ -94,7 +93,7 @@ def test_2_a_client_stands_still(bystanders: Bystanders) -> None:
         (segment,) = bystanders.client.show(row.id).segments
         assert [known.pid for known in segment.holders] == [holder.pid]
     os.kill(holder.pid, signal.SIGCONT)
-    assert holder.tell(None).cells == held.cells
+    assert holder.hold(None).cells == held.cells
     holder.kill()
 
 
@@ -128,7 +127,7 @@ def test_4_the_daemon_is_killed_at_work(bystanders: Bystanders) -> None:
         before = bystanders.client.stats().counters["loads_started"]
         thread = threading.Thread(target=lambda: found.append(whole(asking, 40, 40, 5)))
         thread.start()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bystanders.client.stats().counters["loads_started"] == before):
             pass
         one.kill()
@@ -186,7 +185,7 @@ def test_7_a_file_changes_under_its_loader_and_the_loader_is_killed(bystanders: 
         started = bystanders.client.stats().counters["loads_started"]
         thread = threading.Thread(target=ask)
         thread.start()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bystanders.client.stats().counters["loads_started"] < started + 4):
             pass
         os.truncate(path, len(good) // 2)
@@ -220,7 +219,7 @@ def test_9_names_are_removed_and_descriptors_run_out(bystanders: Bystanders) -> 
     for name in one.segments():
         os.unlink(f"{one.shm_dir}/{name}")
     assert bystanders.reader.checksums() == bystanders.before
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not all(_there(one, cell) for cell in whole(bystanders.client, 0, 0, 5))):
         pass
     _soft, hard = resource.prlimit(one.pid, resource.RLIMIT_NOFILE)

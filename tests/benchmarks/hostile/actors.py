@@ -17,7 +17,7 @@ from shmmap.processes.end_with_parent import die_with
 __all__ = ["Actor", "Orders"]
 
 _SPAWN: Final = multiprocessing.get_context("spawn")
-PATIENCE_S: Final = 300.0
+TIMEOUT_S: Final = 300.0
 
 
 class Orders:
@@ -86,7 +86,7 @@ class Actor:
         assert self._process.pid is not None
         return self._process.pid
 
-    def said(self, timeout_s: float = PATIENCE_S) -> Any:
+    def said(self, timeout_s: float = TIMEOUT_S) -> Any:
         """Wait for what it says next, or for what its function returns.
 
         Raises
@@ -96,7 +96,7 @@ class Actor:
         """
         return self._next(timeout_s)[1]
 
-    def end(self, timeout_s: float = PATIENCE_S) -> Any:
+    def end(self, timeout_s: float = TIMEOUT_S) -> Any:
         """Tell it to end, and return what its function returns; errors as of `said`."""
         with contextlib.suppress(OSError):  # it has ended by itself
             self._pipe.send("end")

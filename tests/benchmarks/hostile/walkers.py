@@ -15,7 +15,7 @@ __all__ = ["fills", "walks_cold"]
 STEP_M: Final = 140.0
 INSIDE_M: Final = STEP_M - 21.0
 """So wide a box touches 6 cells of 20 m, and the next one none of them."""
-PATIENCE_S: Final = 900.0
+TIMEOUT_S: Final = 900.0
 
 
 def places(x_m: tuple[float, float], y_m: tuple[float, float]) -> list[tuple[float, float]]:
@@ -49,7 +49,7 @@ def walks_cold(
     float
         Seconds it took, less than ``seconds`` if it is told to end.
     """
-    with RawClient(endpoint, name="walks", timeout=PATIENCE_S) as client:
+    with RawClient(endpoint, name="walks", timeout=TIMEOUT_S) as client:
         before = client.ask("stats")[4]["loads_finished"]
         begin_s = time.monotonic()
         way = places(x_m, y_m)
@@ -65,7 +65,7 @@ def walks_cold(
 def fills(orders: Orders, endpoint: str, side: int, most: int) -> int:
     """Have the cells of a map of ``side`` x ``side`` loaded, row by row, until so many came."""
     came = 0
-    with RawClient(endpoint, name="fills", timeout=PATIENCE_S) as client:
+    with RawClient(endpoint, name="fills", timeout=TIMEOUT_S) as client:
         for row in range(side):
             columns = min(side, most - came)
             if columns <= 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads published maps in directories; written from ORIGIN.md and LAYOUT.md, without shmmap."""
+"""Published maps in directories, read from ORIGIN.md and LAYOUT.md, and signed by python-tuf, alone."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ import json
 import math
 import struct
 from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xxhash
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from numpy.typing import NDArray
+from securesystemslib.signer import CryptoSigner
+from tuf.api.metadata import Metadata
 
 from tests.support.message_pack import unpack
 
@@ -171,3 +175,73 @@ def columns_of(unpacked: bytes, layer: str, builder_version: int) -> dict[str, N
         assert xxhash.xxh3_64_intdigest(np.ascontiguousarray(values).tobytes()) == checksum
         found[name] = values
     return found
+
+
+# A signed map, read and changed with python-tuf alone: nothing of shmmap's own signing is used
+
+
+class Signed:
+    """The newest metadata of a map in a directory, each verified with the key of its role."""
+
+    def __init__(self, store: Path, keys: Path) -> None:
+        self.store, self.keys = store, keys
+        self.root: Any = Metadata.from_file(str(store / "1.root.json"))
+        assert (store / "1.root.json").read_bytes() == (keys / "ROOT.json").read_bytes()
+        while (path := store / f"{self.root.signed.version + 1}.root.json").exists():
+            following: Any = Metadata.from_file(str(path))
+            for root in (self.root, following):
+                root.signed.verify_delegate("root", following.signed_bytes, following.signatures)
+            assert following.signed.version == self.root.signed.version + 1
+            self.root = following
+        self.timestamp: Any = self._read("timestamp.json", "timestamp")
+        number = self.timestamp.signed.snapshot_meta.version
+        self.snapshot: Any = self._read(f"{number}.snapshot.json", "snapshot")
+        number = self.snapshot.signed.meta["targets.json"].version
+        self.targets: Any = self._read(f"{number}.targets.json", "targets")
+        (self.target,) = self.targets.signed.targets.values()
+        assert self.target.path == "root"
+
+    def _read(self, name: str, role: str) -> Any:
+        found: Any = Metadata.from_file(str(self.store / name))
+        self.root.signed.verify_delegate(role, found.signed_bytes, found.signatures)
+        assert found.signed.type == role
+        return found
+
+    @property
+    def version(self) -> int:
+        number: int = self.target.custom["map_version"]
+        return number
+
+    @property
+    def current(self) -> dict[str, Any]:
+        """What ``CURRENT`` has to say."""
+        return {
+            "version": self.version,
+            "root": self.target.hashes["sha256"],
+            "bytes": self.target.length,
+        }
+
+    def write(self, role: str, **fields: Any) -> None:
+        """Sign a role's newest metadata again, with other fields, under the same name."""
+        metadata = getattr(self, role)
+        for name, value in fields.items():
+            setattr(metadata.signed, name, value)
+        key = {"snapshot": "online", "timestamp": "online"}.get(role, role)
+        private = load_pem_private_key((self.keys / f"{key}.pem").read_bytes(), None)
+        metadata.sign(CryptoSigner(private))
+        name = "timestamp.json" if role == "timestamp" else f"{metadata.signed.version}.{role}.json"
+        metadata.to_file(str(self.store / name))
+
+
+def read_signed(store: Path, keys: Path) -> Signed:
+    """Read a signed map whose entry and ``CURRENT`` say what is signed."""
+    signed = Signed(store, keys)
+    current = json.loads((store / "CURRENT").read_bytes())
+    entry = json.loads((store / f"versions/{signed.version}.json").read_bytes())
+    assert current == signed.current
+    assert {name: entry[name] for name in current} == current
+    return signed
+
+
+def in_days(days: float) -> datetime:
+    return datetime.now(timezone.utc).replace(microsecond=0) + timedelta(days=days)

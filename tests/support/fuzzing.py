@@ -1,16 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What reads bytes that others wrote, and what may come out of it for any bytes at all."""
+"""Readers of foreign bytes, changes that find defects in them, and children that may crash."""
 
 from __future__ import annotations
 
+import argparse
+import math
 import os
 import random
+import resource
+import shutil
 import struct
+import subprocess
+import sys
 import tempfile
+import time
+import traceback
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -24,9 +32,95 @@ from shmmap.formats.pcd.reader import PcdReader
 from shmmap.protocol.codec import decode_reply, decode_request, encode, request_number, unpack_versions
 from shmmap.segment.attach import attach
 from shmmap.segment.layout import PAGE_BYTES, TAIL_BYTES
-from tests.support.mutations import mutate_bytes, mutate_message
+from tests.support.message_pack import pack, unpack
 
 CORPUS: Final = Path(__file__).resolve().parents[1] / "corpus"
+
+
+# --- changes to well-formed bytes ---------------------------------------------------------------
+
+
+LENGTHS = (0, 1, 15, 16, 31, 32, 255, 256, 65535, 65536, 2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, -1, 0, 1, 2**31, 2**63 - 1, 2**63, 2**64 - 1, -(2**63), 0.0, -0.0, 1e308, 5e-324),
+    *(math.nan, math.inf, -math.inf, "", "points", "0_0.pcd", "/", "x" * 70, "\x00", "\N{SNOWMAN}"),
+    *(
+        b"",
+        bytes(8),
+        bytes(9),
+        [],
+        [[]],
+        ["points"],
+        ["circle", 0, 0, 5],
+        ["box", 0, 0, -1, -1],
+        {},
+        {"a": 1},
+    ),
+)
+
+
+def mutate_bytes(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
+    """Flip, overwrite, cut, repeat, insert, splice; one to a few times."""
+    out = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
+        at = rng.randrange(max(1, len(out)))
+        match rng.randrange(8):
+            case 0 if out:
+                out[at % len(out)] ^= 1 << rng.randrange(8)
+            case 1 if out:
+                out[at % len(out)] = rng.choice(
+                    (0, 0x7F, 0x80, 0xC0, 0xC1, 0xDD, 0xDF, 0xFF, rng.randrange(256))
+                )
+            case 2:
+                del out[at : at + rng.choice((1, 2, 8, 64))]
+            case 3:
+                out[at:at] = rng.randbytes(rng.choice((1, 2, 8, 100)))
+            case 4:
+                out[at:at] = out[at : at + rng.choice((1, 8, 64))] * rng.choice((1, 2, 50))
+            case 5:
+                other = rng.choice(pool)
+                out[at:] = other[rng.randrange(len(other) + 1) :]
+            case 6:
+                kind = rng.choice(("<H", ">H", "<I", ">I", "<Q", ">Q"))
+                size = struct.calcsize(kind)
+                out[at : at + size] = struct.pack(kind, rng.choice(LENGTHS) % (1 << 8 * size))
+            case _:
+                del out[at:]
+    return bytes(out)
+
+
+def mutate_message(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
+    """Change a MessagePack array by its elements, so that what results is well-formed."""
+    try:
+        tree = unpack(data)
+    except Exception:  # noqa: BLE001  what is not MessagePack is mutated as bytes
+        return mutate_bytes(data, rng, pool)
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        tree = _mutate_tree(tree, rng)
+    try:
+        return pack(tree)
+    except (ValueError, OverflowError, RecursionError, struct.error, TypeError):
+        return data
+
+
+def _mutate_tree(tree: Any, rng: random.Random) -> Any:
+    if not isinstance(tree, list) or rng.random() < 0.2:
+        return rng.choice(VALUES)
+    out = list(tree)
+    at = rng.randrange(len(out) + 1)
+    match rng.randrange(5):
+        case 0 if out:
+            del out[at % len(out)]
+        case 1:
+            out.insert(at, rng.choice(VALUES))
+        case 2 if out:
+            out[at % len(out) :] = [out[at % len(out)]] * rng.choice((2, 20, 300))
+        case _ if out:
+            out[at % len(out)] = _mutate_tree(out[at % len(out)], rng)
+    return out
+
+
+# --- readers ------------------------------------------------------------------------------------
 
 
 class Target(NamedTuple):
@@ -225,3 +319,53 @@ TARGETS: Final = {
     "marks": Target(mutate_bytes, check_marks),
     "chunk": Target(mutate_bytes, check_chunk),
 }
+
+
+# --- child processes of thirty seconds each: a crash is a finding, and its input stays ----------
+
+
+_CHILD_S: Final = 30.0
+
+
+def print_outcomes(seed: int, count: int, slowest_s: float, outcomes: Mapping[str, int]) -> None:
+    """Print what a child did."""
+    table = " ".join(f"{name}={number}" for name, number in sorted(outcomes.items()))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"seed {seed}: {count} inputs, slowest {slowest_s * 1e3:.0f} ms, peak {peak:.0f} MB: {table}")
+
+
+def fuzz_in_children(name: str, docstring: str | None, child: Callable[[Path, int, float], int]) -> int:
+    """Be the program ``tests.benchmarks.NAME``; returns its exit code, 1 for a finding.
+
+    Parameters
+    ----------
+    name, docstring
+        The benchmark's.
+    child
+        Fuzzes in a directory, from a seed, for some seconds; what it leaves there led to the finding.
+    """
+    parser = argparse.ArgumentParser(description=docstring.splitlines()[0] if docstring else "")
+    parser.add_argument("--seconds", type=float, default=60.0, help="how long to fuzz (default 60)")
+    parser.add_argument("--seed", type=int, default=None, help="first seed (default: from the clock)")
+    parser.add_argument("--child", type=Path, default=None, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child is not None:
+        try:
+            return child(options.child, options.seed, options.seconds)
+        except Exception:  # noqa: BLE001  whatever it is, it is a finding
+            traceback.print_exc()
+            return 1
+    seed = time.time_ns() % 10**9 if options.seed is None else options.seed
+    deadline = time.monotonic() + options.seconds
+    while (left := deadline - time.monotonic()) > 0:
+        folder = Path(tempfile.mkdtemp(prefix=f"{name}."))
+        command = [sys.executable, "-X", "faulthandler", "-W", "error", "-m", f"tests.benchmarks.{name}"]
+        command += ["--child", str(folder), "--seed", str(seed), "--seconds", f"{min(left, _CHILD_S):.3f}"]
+        done = subprocess.run(command, check=False, env=os.environ)
+        if done.returncode:
+            kept = next(folder.iterdir(), folder)
+            print(f"FOUND with seed {seed} (exit {done.returncode}): {kept}", flush=True)
+            return 1
+        shutil.rmtree(folder)
+        seed += 1
+    return 0

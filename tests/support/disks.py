@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A disk in memory that loses at a power cut whatever it may lose."""
+"""Disks that fail: one that loses at a power cut whatever it may lose, and one that never answers."""
 
 from __future__ import annotations
 
+import ctypes
 import errno
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 
 class PowerCut(BaseException):
@@ -136,3 +139,38 @@ def _apply(change: dict[str, _File | None], names: dict[str, _File]) -> None:
             names.pop(name, None)
         else:
             names[name] = file
+
+
+# A file system that never answers, as a network's whose server is away: FUSE without a program behind it
+
+
+_DETACH = 2
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class HangingDirectory:
+    """Hangs over a directory until `end`: then that is as it was.
+
+    Raises
+    ------
+    OSError
+        This process may not mount, or the kernel has no FUSE.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = os.fsencode(path)
+        self._fd = os.open("/dev/fuse", os.O_RDWR | os.O_CLOEXEC)
+        options = b"fd=%d,rootmode=40000,user_id=%d,group_id=%d,allow_other" % (
+            self._fd, os.geteuid(), os.getegid(),
+        )  # fmt: skip
+        if _libc.mount(b"hangs", self._path, b"fuse", 0, options):
+            number = ctypes.get_errno()
+            os.close(self._fd)
+            raise OSError(number, os.strerror(number))
+
+    def end(self) -> None:
+        """Unmount it: whoever waits gets an error."""
+        if self._fd >= 0:
+            _libc.umount2(self._path, _DETACH)
+            os.close(self._fd)
+            self._fd = -1
