@@ -11,7 +11,9 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,14 +79,13 @@ def all_pages() -> list[str]:
     return sorted(str(path.relative_to(ROOT)) for path in [*ROOT.glob("*.md"), *found])
 
 
-# Somebody who follows a page: a home of their own, terminals, and commands typed as they stand
-
+# --- a reader who follows a page: a home, terminals, and commands typed as they stand -----------------
 
 _SERVE_S = 180.0  # a cloud is divided and kernels are compiled before a first daemon is ready
 
 
 class Terminal:
-    """A shell of a reader: directory and environment go on from one command to the next."""
+    """A shell of a reader, which keeps directory and environment from one command to the next."""
 
     def __init__(self, environment: dict[str, str], cwd: Path, state: Path) -> None:
         self._environment = environment
@@ -117,6 +118,24 @@ class Terminal:
         path = self._state.with_suffix(".py")
         path.write_text("\n".join(program) + "\n", encoding="utf-8")
         return self.run(f"python {shlex.quote(str(path))}")
+
+    @contextlib.contextmanager
+    def web_server(self, command: str, port: int) -> Iterator[None]:
+        """Run a web server from when it listens until the end of the block."""
+        server = subprocess.Popen(
+            ["bash", "-c", self._script(command).replace(command, f"exec {command}")],
+            cwd=self._cwd, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            waiting = Deadline()
+            with socket.socket() as probe:
+                while waiting(probe.connect_ex(("127.0.0.1", port)) != 0):
+                    assert server.poll() is None, command
+                    time.sleep(0.01)
+            yield
+        finally:
+            server.kill()
+            server.wait()
 
     @contextlib.contextmanager
     def serving(self, command: str) -> Iterator[None]:
@@ -152,7 +171,7 @@ class Terminal:
 
 
 class Reader:
-    """Somebody to whom nothing is configured.
+    """A reader to whom nothing is configured.
 
     Parameters
     ----------
@@ -199,3 +218,23 @@ class Reader:
         finally:
             shutil.rmtree(self.shm_dir)
             shutil.rmtree(self._run_dir)
+
+
+def write_program(path: Path, text: str) -> None:
+    """Write a program of a shell."""
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+
+
+@contextlib.contextmanager
+def reader_with_programs(home: Path, **variables: str) -> Iterator[Reader]:
+    """Have a reader whose ``shmmap``, ``python`` and ``python3`` are this tree's and this interpreter's."""
+    programs = home / "bin"
+    programs.mkdir()
+    for name, words in (("shmmap", "-m shmmap.cli"), ("python", ""), ("python3", "")):
+        write_program(programs / name, f'exec "{sys.executable}" {words} "$@"')
+    reader = Reader(home, [programs], {"PYTHONPATH": str(ROOT), **variables})
+    try:
+        yield reader
+    finally:
+        reader.leave()

@@ -30,11 +30,6 @@ ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 ASKERS = 16
 
 
-def test_every_block_is_tested() -> None:
-    assert set(PAGE.blocks) == {"nginx", "start", "serve"}
-    assert PAGE.fences == len(PAGE.blocks) - 1  # one is a configuration
-
-
 @pytest.fixture
 def origin(tmp_path: Path) -> Iterator[FaultyWeb]:
     """The server behind the gateway, which records requests."""
