@@ -15,7 +15,7 @@ import hypothesis
 import pytest
 
 from shmmap.kernel_cache import compiled_mark
-from tests.support.built_once import built_once
+from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
     NEEDS_ROOT,

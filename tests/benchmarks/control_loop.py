@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 import shmmap
-from tests.support.control_loop import ControlLoop, Rounds, compiled_loop
+from tests.support.compiled_programs import ControlLoop, Rounds, compiled_loop
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
 

@@ -35,7 +35,7 @@ from shmmap_clients.elevation_map import ElevationGrid, ElevationRule, build_ele
 import shmmap
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
-from tests.support.pcd_files import write_pcd
+from tests.support.divided_map import write_pcd
 
 __all__ = ["main"]
 

@@ -25,7 +25,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.support.daemon_process import ROOT
-from tests.support.fuzz_targets import CORPUS, TARGETS, corpus
+from tests.support.fuzzing import CORPUS, TARGETS, corpus
 
 ALLOWED_BYTES = 100 << 20
 CHILD_S = 30.0

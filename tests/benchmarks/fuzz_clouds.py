@@ -30,8 +30,8 @@ from shmmap.errors import MapDataError
 from shmmap.formats.block_reader import open_blocks
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import read_cloud
-from tests.support.fuzz_children import fuzz_in_children, print_outcomes
-from tests.support.ply_bytes import random_ply
+from tests.support.cloud_bytes import random_ply
+from tests.support.fuzzing import fuzz_in_children, print_outcomes
 
 ALLOWED_BYTES = 200 << 20
 MOST_S = 10

@@ -26,8 +26,8 @@ from shmmap.errors import MapDataError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.reader import PcdReader
-from tests.support.fuzz_children import fuzz_in_children, print_outcomes
-from tests.support.pcd_bytes import CODES, Field, Number, column, lzf_decode, lzf_encode, pcd
+from tests.support.cloud_bytes import CODES, Field, Number, column, lzf_decode, lzf_encode, pcd
+from tests.support.fuzzing import fuzz_in_children, print_outcomes
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 ALLOWED_BYTES = 100 << 20

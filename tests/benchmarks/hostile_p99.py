@@ -52,8 +52,7 @@ def main() -> int:
     options = parser.parse_args()
 
     # not before: every actor's process imports this module
-    from tests.benchmarks.hostile.play import every_scene, play
-    from tests.benchmarks.hostile.stage import Stage
+    from tests.benchmarks.hostile.stage import Stage, every_scene, play
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # daemons and actors end with this process
     scenes = every_scene()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.layers.build import build_layer
-from tests.support.pcl_program import built_pcl_program
+from tests.support.compiled_programs import built_pcl_program
 
 CELL_M = 20.0
 

@@ -47,13 +47,10 @@ import numpy as np
 import shmmap
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.catalogue import run_measure
-from tests.benchmarks.hostile.actors import Actor
-from tests.benchmarks.hostile.beside import OVER_ECHO_MS, Beside
-from tests.benchmarks.hostile.bystanders import works
+from tests.benchmarks.hostile.actors import Actor, works
+from tests.benchmarks.hostile.beside import OVER_ECHO_MS, Beside, Turns
 from tests.benchmarks.hostile.files import reloads
-from tests.benchmarks.hostile.report import Report
-from tests.benchmarks.hostile.stage import Stage, lift
-from tests.benchmarks.hostile.turns import Turns
+from tests.benchmarks.hostile.stage import Report, Stage, lift
 from tests.benchmarks.make_many_cells import CELL_METRES
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import DaemonProcess

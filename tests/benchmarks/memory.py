@@ -16,9 +16,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.support.client_programs import FollowingClient
 from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.following_client import FollowingClient
 from tests.support.process_costs import proportional_bytes, proportional_bytes_under
 
 _PRIVATE = """

@@ -20,8 +20,8 @@ from pathlib import Path
 
 from shmmap.dividing.divide import divide
 from tests.benchmarks.street_data import street
+from tests.support.compiled_programs import PclLeaves, build_pcl_leaves
 from tests.support.daemon_process import DaemonProcess
-from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 
 LIMIT_MS = 0.5
 LEAF_M = 2.0

@@ -22,7 +22,7 @@ from pathlib import Path
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, pose_from_matrix, voxel_cell
 
 from tests.benchmarks.ndt_clouds import Pair, city, scan_pair
-from tests.support.pcl_ndt import PclNdt, build_pcl_ndt
+from tests.support.compiled_programs import PclNdt, build_pcl_ndt
 
 
 def align_ms(

@@ -25,9 +25,8 @@ from typing import Any
 import numpy as np
 
 import shmmap
-from tests.support.bridge_process import BridgeProcess, bridge_environment
+from tests.support.bridge_process import BridgeProcess, bridge_environment, dds_domain
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.dds_domain import dds_domain
 from tests.support.divided_map import make_map
 
 SIZES = {"1 MB": (5.0, 4), "38 MB": (119.0, 144)}

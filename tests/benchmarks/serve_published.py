@@ -43,9 +43,9 @@ from shmmap.origin.remote.published_source import LayerSource, pack_source
 from shmmap.origin.remote.serving_store import ServedFrom
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from tests.benchmarks.hostile.stage import lift
+from tests.support.command_line import publish
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import Box, make_map
-from tests.support.publishing import publish
 from tests.support.slow_link import Plan, slow_link
 
 LIMIT = 1.25

@@ -42,9 +42,9 @@ import numpy as np
 import shmmap
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.make_many_cells import make_many_cells
-from tests.support.bucket_server import BucketServer, bucket_server
+from tests.support.command_line import publish
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.publishing import publish
+from tests.support.map_stores import BucketServer, bucket_server
 from tests.support.slow_link import Plan, SlowLink, slow_link
 
 SIDE: Final = 150

@@ -23,10 +23,9 @@ from shmmap.daemon.travel.places import places_of, until_needed
 from shmmap.geometry import Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import Intent
-from tests.benchmarks.slow_origin_counts import Counts, Query
 from tests.benchmarks.slow_origin_drives import Drive
 from tests.benchmarks.slow_origin_foresight import Foresight, Margin, Nothing, Policy, Truth
-from tests.benchmarks.slow_origin_model import SlowOrigin
+from tests.benchmarks.slow_origin_model import Counts, Query, SlowOrigin
 
 __all__ = ["ROWS", "Setting", "simulate"]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How often a vehicle waits for its map, in simulated time: the daemon's own policy beside a slow origin.
 
-    python -m tests.benchmarks.slow_origin_simulated [--poses FILE] [--picture FILE.svg]
+    python -m tests.benchmarks.slow_origin_simulated [--poses FILE]
 
 A vehicle asks for a circle of 200 m every 20 m; cells of 20 m are loaded by eight loaders, each load in a
 log-normal time, and fail in outages.  One row for each way of fetching ahead:
@@ -34,8 +34,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shmmap.origin.catalogue import Catalogue
-from tests.benchmarks.drive_pictures import drive_picture
-from tests.benchmarks.slow_origin_counts import Counts
 from tests.benchmarks.slow_origin_drives import (
     Drive,
     city_drive,
@@ -44,15 +42,13 @@ from tests.benchmarks.slow_origin_drives import (
     square_drive,
     town_drive,
 )
-from tests.benchmarks.slow_origin_model import OUTAGES, SlowOrigin
+from tests.benchmarks.slow_origin_model import OUTAGES, Counts, SlowOrigin
 from tests.benchmarks.slow_origin_run import ROWS, Setting, simulate
 
 MEANS_S = (0.05, 0.15, 0.4)
 MEMORY_CELLS = {10.0: 1000, 60.0: 2400}
 """By the time to be ridden out: the window has 356 cells, and what lies a minute ahead twice as many."""
 UTILISATION = 0.8
-PICTURE = "10 s / 120 s"
-"""Outages of the drives that are drawn."""
 
 
 class Case(NamedTuple):
@@ -118,12 +114,6 @@ def main() -> int:
     parser.add_argument("--poses", type=Path, metavar="FILE", help="a recorded drive: KITTI's or TUM's poses")
     parser.add_argument("--seeds", type=int, default=1, help="towns, cities and origins (default: 1)")
     parser.add_argument("--rows", default=",".join(ROWS), help="which rows (default: all)")
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        metavar="FILE.svg",
-        help="only draw three drives through the town, at 400 ms, with outages of 10 s",
-    )
     arguments = parser.parse_args()
     rows = arguments.rows.split(",")
     if set(rows) - set(ROWS):
@@ -134,12 +124,6 @@ def main() -> int:
     if arguments.poses is not None:
         _held.drives.append(recorded_drive(arguments.poses))
     _held.catalogues.extend(map(dense_catalogue, _held.drives))
-    if arguments.picture is not None:
-        shown = [row for row in ("none", "no route", "route") if row in rows]
-        drawn = {row: counts_of(Case(0, PICTURE, MEANS_S[-1], row, 0)) for row in shown}
-        picture = drive_picture(drawn, MEANS_S[-1], OUTAGES[PICTURE])
-        arguments.picture.write_text(picture, encoding="utf-8")
-        return 0
     cases = [
         Case(drive, outages, mean_s, row, drive)
         for drive in range(len(_held.drives))

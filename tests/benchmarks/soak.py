@@ -103,7 +103,7 @@ class Soak:
     def begin(self) -> None:
         """One more client."""
         self.numbers += 1
-        command = [sys.executable, "-m", "tests.support.wandering_client", self.one.endpoint]
+        command = [sys.executable, "-m", "tests.support.client_programs", "wander", self.one.endpoint]
         half = CELLS * self.made.size / 2
         self.clients.append(
             subprocess.Popen([*command, str(self.numbers), str(half), str(PAUSE_S / self.pace)], cwd=ROOT)

@@ -182,7 +182,7 @@ from shmmap_clients.ndt_scan_matcher import NdtMatcher
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
 from shmmap_clients.scans.scan_file import read_scan
 from tests.support.daemon_process import DaemonProcess
-from tests.support.town_drive import make_town_drive
+from tests.support.ndt_programs import make_town_drive
 scratch = tempfile.mkdtemp()
 drive = make_town_drive(Path(scratch), blocks=(3, 3), density=5.0, frames=4, step=15.0)
 one = DaemonProcess(drive.map_dir).start()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """An hour of driving over a published map of a million cells, over a mobile link that fails now and then.
 
-    python -m tests.benchmarks.vehicle_day [--minutes 20] [--at-once] [--picture DAY.svg]
+    python -m tests.benchmarks.vehicle_day [--minutes 20] [--at-once]
 
 The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects are generated on request
 (`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, at most 15 m/s)
@@ -272,7 +272,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the way, the link and its outages")
     parser.add_argument("--only", choices=KINDS, help="one of the two")
     parser.add_argument("--at-once", action="store_true", help="both drives at the same time")
-    parser.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw the drives")
     parser.add_argument(
         "--scratch", type=Path, help="directory for the disk tiers (default: a temporary one)"
     )
@@ -290,8 +289,6 @@ def main() -> None:
         )
     if not 0.0 < args.hours <= 1.0:
         parser.error("--hours: the way takes one hour")
-    if args.picture is not None and args.picture.suffix != ".svg":
-        parser.error(f"--picture: {args.picture} has to end in .svg")
     way = city_drive(args.seed, 45_000.0, BLOCKS)
     kinds = [args.only] if args.only else list(KINDS)
     print(f"load {os.getloadavg()[0]:.1f}; an hour takes {args.minutes:g} minutes", flush=True)
@@ -301,10 +298,6 @@ def main() -> None:
     for day in days:
         print(row(day))
     print(f"load {os.getloadavg()[0]:.1f}")
-    if args.picture is not None:
-        from tests.benchmarks.drive_pictures import day_picture
-
-        args.picture.write_text(day_picture(days, 60.0 / args.minutes), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import shmmap
 from tests.cpp.conftest import DaemonFactory
 from tests.support.autoware_node import NODE, TYPES, AutowareNode, compiled_with
-from tests.support.built_once import built_once
+from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import DaemonProcess, stop
 from tests.support.divided_map import DividedMap, make_map, random_points

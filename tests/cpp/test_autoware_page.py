@@ -17,8 +17,7 @@ import pytest
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap
-from tests.support.pages import read_page
-from tests.support.reader import Reader
+from tests.support.pages import Reader, read_page
 
 PAGE = read_page("clients/cpp/AUTOWARE.md")
 

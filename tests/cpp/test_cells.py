@@ -21,9 +21,9 @@ import pytest
 import shmmap
 from tests.cpp.conftest import DaemonFactory
 from tests.support.cpp_client import FLAGS, SOURCE, CppClient, CppProgram, compiled
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.open3d_package import open3d_or_skip
-from tests.support.patience import Patience
+from tests.support.skips import open3d_or_skip
 
 LAYERS = (
     "points", "crop(z_min=-1.0, z_max=3.0)", "denoise(neighbors=10)", "elevation(resolution=1.0)",
@@ -102,7 +102,7 @@ def test_what_it_lets_go_can_be_freed(
         (session,) = (it for it in python.stats().sessions if it.client == "cpp")
         assert session.cells == 0
         python.evict()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bool(python.stats().counters["zombies"])):
             pass
 

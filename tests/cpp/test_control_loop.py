@@ -13,8 +13,7 @@ import pytest
 
 import shmmap
 from tests.cpp.conftest import DaemonFactory
-from tests.support.built_once import built_once
-from tests.support.control_loop import ControlLoop, compiled_loop
+from tests.support.compiled_programs import ControlLoop, built_once, compiled_loop
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 

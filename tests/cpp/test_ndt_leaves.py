@@ -17,9 +17,8 @@ import pytest
 from shmmap.dividing.divide import divide
 from tests.benchmarks.layer_build import cells_of, city
 from tests.cpp.conftest import DaemonFactory
-from tests.support.built_once import built_once
+from tests.support.compiled_programs import PclLeaves, build_pcl_leaves, built_once
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.pcl_leaves import PclLeaves, build_pcl_leaves
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from shmmap.testing.environment import without_settings
 from tests.cpp.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.pages import read_page
-from tests.support.reader import Reader, Terminal
+from tests.support.pages import Reader, Terminal, read_page
 
 PAGE = read_page("clients/cpp/README.md")
 CPP = ROOT / "clients" / "cpp"

@@ -16,8 +16,8 @@ from shmmap.statistics.counters import COUNTERS
 from shmmap.statistics.reader import read_statistics
 from tests.cpp.conftest import DaemonFactory
 from tests.support.cpp_client import CppProgram
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 
 LAYERS = ("points", "ndt(leaf=2.0)")
 STATES = ("resident", "stale", "zombie")
@@ -42,7 +42,7 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
     with shmmap.connect(one.endpoint, name="somebody") as client:
         going = shmmap.Intent(1.5, 2.0, vx=5.0, route=((0.0, 0.0), (60.0, 0.0)))
         client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, intent=going)
-        waiting = Patience()
+        waiting = Deadline()
         seen = read_statistics(one.instance, one.shm_dir)
         while waiting(not (seen.clients and any(row.ahead for row in seen.cells))):
             seen = read_statistics(one.instance, one.shm_dir)

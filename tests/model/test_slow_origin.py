@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from shmmap.origin.catalogue import Catalogue
-from tests.benchmarks.slow_origin_counts import Counts
 from tests.benchmarks.slow_origin_drives import Drive, dense_catalogue, town_drive
-from tests.benchmarks.slow_origin_model import OUTAGES, SIGMA, Outages, SlowOrigin
+from tests.benchmarks.slow_origin_model import OUTAGES, SIGMA, Counts, Outages, SlowOrigin
 from tests.benchmarks.slow_origin_run import Setting, simulate
 
 

@@ -13,11 +13,11 @@ import pytest
 
 from shmmap.errors import ShmmapError
 from shmmap.testing.fixtures import judged_daemons
+from tests.support.command_line import Verbs
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.live_daemon import SETTINGS, LiveDaemon
+from tests.support.live_reference import LIVE_TOML, LiveDaemon
 from tests.support.map_stores import _buckets, buckets, web  # noqa: F401  fixtures
-from tests.support.publishing_verbs import Shmmap
 from tests.support.raw_client import RawClient
 
 RESOLUTION = 0.2  # that of ``live_drive``, which compiles kernels: before pytest has said where they are kept
@@ -80,9 +80,9 @@ def private_tmpfs(tmp_path: Path) -> Iterator[Callable[[str], str]]:
 
 
 @pytest.fixture
-def shmmap(tmp_path: Path) -> Shmmap:
+def shmmap(tmp_path: Path) -> Verbs:
     """The command line without a daemon, with a home of its own."""
-    return Shmmap(tmp_path)
+    return Verbs(tmp_path)
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def live_daemon(daemon: DaemonFactory, tmp_path: Path) -> LiveDaemon:
     ) -> DaemonProcess:
         file = tmp_path / "shmmap.toml"
         file.write_text(
-            SETTINGS.format(resolution=resolution, checkpoint=checkpoint, path=tmp_path / "lidar")
+            LIVE_TOML.format(resolution=resolution, checkpoint=checkpoint, path=tmp_path / "lidar")
         )
         one: DaemonProcess = daemon("", "--config", str(file), "--live-budget", "16M", *flags, start=start)
         return one
@@ -145,7 +145,7 @@ def dds() -> Iterator[int]:
     pytest.importorskip(
         "cyclonedds", reason="needs the package cyclonedds, which has no wheel for this machine"
     )
-    from tests.support.dds_domain import dds_domain
+    from tests.support.bridge_process import dds_domain
 
     with dds_domain() as number:
         yield number

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.accounts import DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
-from tests.support.attempts import ATTEMPTS
+from tests.support.accounts import ATTEMPTS, DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.mapping_process import MappingProcess

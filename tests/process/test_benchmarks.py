@@ -87,18 +87,18 @@ def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
         [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--list"],
         cwd=ROOT, check=True, capture_output=True, text=True,
     )  # fmt: skip
-    rows = [f"A{number}" for number in range(1, 23)] + ["B1", "B2", "B3"]
+    rows = [f"A{number}" for number in (*range(1, 10), 11, 12, 13, 16, 17, 21, 22)] + ["B3"]
     assert [line.split()[0] for line in done.stdout.splitlines()] == [*rows, "churn", "worst-five"]
 
 
 def test_a_scene_that_is_over_no_limit_ends_well() -> None:
     """One of the quick ones, which time cannot fail: it shows that scenes can be played."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--scene", "A18"],
+        [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--scene", "A16"],
         cwd=ROOT, check=False, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines()[-2].split() == ["A18", "-", "-", "-", "-", "-", "OK"]
+    assert done.stdout.splitlines()[-2].split() == ["A16", "-", "-", "-", "-", "-", "OK"]
 
 
 def test_the_page_marks_those_that_need_data() -> None:

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.support.mapping_process import MappingProcess
-from tests.support.memory_watch import MemoryWatch
-from tests.support.patience import Patience
+from tests.support.process_costs import MemoryWatch
 from tests.support.raw_client import RawCells, RawClient, RawHandle, circle
-from tests.support.segment_reader import map_segment
-from tests.support.served_cells import assert_same_points, names
+from tests.support.segment_reader import assert_same_points, map_segment, names
 
 Connect = Callable[..., RawClient]
 CELL_BYTES = 72 << 10  # 4200 points of 16 bytes, header, whole pages
@@ -135,7 +134,7 @@ def test_a_full_budget_names_who_fills_it(
         assert stranger.checksums()
         holder.drop_all()
     done: set[str] = set()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(done) < 12):  # once others let go it goes on, a few at a time as the budget allows
         reply = other.selected([i for i in ids[20:40] if i not in done][:8], wait=10.0)
         done |= {h.id for h in reply.cells}
@@ -255,7 +254,7 @@ def test_a_full_file_system_is_reported_and_survived(
     assert {f.code for f in reply.failed} == {"no_space"}
     assert len(holder.client.area(circle(0, 0, 5)).cells) == 4
     filler.unlink()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(bool(reply.failed)):
         reply = holder.client.area(circle(60, 60, 15), wait=10.0)
     assert names(reply.cells) == heavy_map.in_circle(60, 60, 15)

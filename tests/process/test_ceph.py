@@ -12,11 +12,10 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.bucket_server import BucketServer
-from tests.support.ceph import CEPH_PROGRAMS, CephServer
+from tests.support.command_line import publish
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.patience import Patience
-from tests.support.publishing import publish
+from tests.support.map_stores import CEPH_PROGRAMS, BucketServer, CephServer
 
 if not os.environ.get("SHMMAP_TEST_CEPH"):
     pytest.skip("SHMMAP_TEST_CEPH is not set", allow_module_level=True)
@@ -75,7 +74,7 @@ def test_daemons_of_the_store_are_killed_while_cells_are_fetched(
         assert [cell.version for cell in again] == [warm.version]
         if len(killed) > 1 or killed == ["client.rgw"]:
             ceph.repair()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not (found := client.area(ALL, wait=5.0)).complete):
             pass
         assert columns_of(found) == right

@@ -17,10 +17,9 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 
@@ -113,7 +112,7 @@ class Life:
 
     def check_books(self) -> None:
         """The daemon's sums are those of the files."""
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not self._books_agree()):
             pass
 

@@ -14,9 +14,8 @@ from shmmap import connect
 from shmmap.errors import SegmentCorrupt
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import TIMEOUT_S, DaemonProcess, counters, until
 from tests.support.divided_map import DividedMap
-from tests.support.waiting import PATIENCE_S, counters, until
 
 
 def remove_segments(one: DaemonProcess) -> int:
@@ -33,7 +32,7 @@ def tight(daemon: DaemonFactory, divided_map: DividedMap) -> tuple[DaemonProcess
         divided_map.change(name, number)
     one = daemon(divided_map.root, "--budget", "1M")
     with connect(one.endpoint) as client:
-        assert len(client.selected(list(divided_map.corners), wait=PATIENCE_S)) == 36
+        assert len(client.selected(list(divided_map.corners), wait=TIMEOUT_S)) == 36
     return one, one.segment_bytes()
 
 
@@ -44,7 +43,7 @@ def test_removed_segments_cost_no_memory(daemon: DaemonFactory, divided_map: Div
     assert 2 * nbytes + counters(one)["bytes_statistics"] > 1 << 20, "both together would not fit"
     cells = list(divided_map.corners)
     with connect(one.endpoint) as client:
-        held = client.selected(cells, wait=PATIENCE_S) if how.startswith("held") else ()
+        held = client.selected(cells, wait=TIMEOUT_S) if how.startswith("held") else ()
         if how.startswith("pinned"):
             client.pin(cells[:3])
         for _ in range(2 if how == "twice" else 1):
@@ -52,7 +51,7 @@ def test_removed_segments_cost_no_memory(daemon: DaemonFactory, divided_map: Div
             for name in one.segments()[:removed]:
                 os.unlink(f"{one.shm_dir}/{name}")
             with connect(one.endpoint) as another:  # it has nothing mapped
-                again = another.selected(cells, wait=PATIENCE_S)
+                again = another.selected(cells, wait=TIMEOUT_S)
             assert (len(again), again.failed, again.pending) == (36, (), ())
         assert all(len(cell.xyz) == 700 for cell in held), "who maps them keeps them"
         until(lambda: counters(one)["bytes_resident"] == nbytes, lambda: str(counters(one)))
@@ -80,22 +79,22 @@ def test_evict_all_after_a_cleaner(daemon: DaemonFactory, divided_map: DividedMa
         client.evict(None)
         until(lambda: counters(one)["bytes_resident"] == 0, lambda: str(counters(one)))
         until(lambda: counters(one)["bytes_zombie"] == 0, lambda: str(counters(one)))
-        assert len(client.selected(list(divided_map.corners), wait=PATIENCE_S)) == 36
+        assert len(client.selected(list(divided_map.corners), wait=TIMEOUT_S)) == 36
 
 
 def test_retired_segments_that_a_cleaner_removes(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     """What clients map counts until they let go, as the kernel says; a name is not needed for that."""
     one, nbytes = tight(daemon, divided_map)
     with connect(one.endpoint) as client:
-        held = list(client.selected(list(divided_map.corners)[:6], wait=PATIENCE_S))
+        held = list(client.selected(list(divided_map.corners)[:6], wait=TIMEOUT_S))
         client.evict(None)
         until(lambda: counters(one)["zombies"] == 6, lambda: str(counters(one)))
         remove_segments(one)
-        assert len(client.selected(list(divided_map.corners)[:6], wait=PATIENCE_S)) == 6, "loaded again"
+        assert len(client.selected(list(divided_map.corners)[:6], wait=TIMEOUT_S)) == 6, "loaded again"
         assert len(held) == 6
         del held
         until(lambda: counters(one)["bytes_zombie"] == 0, lambda: str(counters(one)))
-        assert len(client.selected(list(divided_map.corners), wait=PATIENCE_S)) == 36
+        assert len(client.selected(list(divided_map.corners), wait=TIMEOUT_S)) == 36
         until(lambda: counters(one)["bytes_resident"] == nbytes, lambda: str(counters(one)))
 
 
@@ -104,7 +103,7 @@ def test_a_damaged_segment_is_loaded_again(daemon: DaemonFactory, divided_map: D
     """Its cell fails at most until the daemon has looked, not until it is started again."""
     one = daemon(divided_map.root)
     with connect(one.endpoint) as client:
-        client.selected(["0_0.pcd"], wait=PATIENCE_S)
+        client.selected(["0_0.pcd"], wait=TIMEOUT_S)
         (name,) = one.segments()
         path = f"{one.shm_dir}/{name}"
         if how == "replaced":
@@ -115,7 +114,7 @@ def test_a_damaged_segment_is_loaded_again(daemon: DaemonFactory, divided_map: D
             os.truncate(path, 4096 if how == "cut" else 0)
     with connect(one.endpoint) as client:  # it has nothing mapped
         until(lambda: len(client.selected(["0_0.pcd"], wait=1.0)) == 1, lambda: one.log)
-        assert len(client.selected(["0_0.pcd"], wait=PATIENCE_S)[0].xyz) == 500
+        assert len(client.selected(["0_0.pcd"], wait=TIMEOUT_S)[0].xyz) == 500
     if how == "replaced":
         Path(path).unlink(missing_ok=True)  # it came after the daemon had looked: it is the other program's
     else:

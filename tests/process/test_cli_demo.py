@@ -24,9 +24,8 @@ from shmmap.demo.drive import Fleet, drive_through_outage
 from shmmap.demo.progress import Progress
 from shmmap.errors import BadRequest
 from shmmap.simulation.town import Town
-from tests.support.daemon_process import DaemonProcess, processes_marked, wait_ended
+from tests.support.daemon_process import DaemonProcess, Deadline, processes_marked, wait_ended
 from tests.support.demo_process import SMALL, Demo, until
-from tests.support.patience import Patience
 
 
 def test_demo_measures_and_draws(tmp_path: Path) -> None:
@@ -109,7 +108,7 @@ def test_a_killed_demo_leaves_no_process_and_no_memory(tmp_path: Path) -> None:
     until(demo, "Driving, 2 processes on the copy")
     demo.process.kill()
     demo.process.communicate()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(bool(processes_marked(demo.mark))):
         pass
     directories = [*Path("/dev/shm").glob(f"shmmap-test-{demo.process.pid}-*")]

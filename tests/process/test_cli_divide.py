@@ -22,8 +22,8 @@ from shmmap.origin.map_directory import open_map
 from tests.benchmarks.divide_large import FIELDS, generate
 from tests.support.clouds import expected_rows, map_rows, rows_of, xyzircaedt
 from tests.support.daemon_process import ROOT
+from tests.support.divided_map import read_pcd
 from tests.support.forked_programs import run_verb
-from tests.support.pcd_files import read_pcd
 
 KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "4"))
 

@@ -17,11 +17,9 @@ import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
-from tests.support.daemon_process import ROOT
-from tests.support.divided_map import DividedMap, random_points
+from tests.support.daemon_process import ROOT, Deadline
+from tests.support.divided_map import DividedMap, random_points, read_pcd
 from tests.support.forked_programs import run_verb
-from tests.support.patience import Patience
-from tests.support.pcd_files import read_pcd
 
 HEX = re.compile(r"[0-9a-f]{16}")
 
@@ -121,7 +119,7 @@ def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_ma
         assert "hint: " in done.stderr
     finally:
         os.kill(pid, signal.SIGCONT)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(json.loads(shmmap.run("health", "--json").stdout)["state"] != "healthy"):
         pass
     assert "0_0.pcd" in shmmap("ls")
@@ -189,7 +187,7 @@ def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
         "1 segment kept, pinned by an operator (see `shmmap unpin`):",
         "  20_0.pcd: points",
     ]
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(re.search(r'cells evicted count=1 bytes=\d+ of="1 request"', shmmap.daemon.log) is None):
         pass
     shmmap("unpin", "--all")

@@ -37,11 +37,10 @@ from shmmap.errors import (
 from shmmap.protocol.endpoint import SYSTEM_RUNTIME_DIR
 from shmmap.segment.attach import attach
 from tests.support.cpp_client import CppClient
-from tests.support.daemon_process import DaemonProcess, open_files
+from tests.support.daemon_process import DaemonProcess, Deadline, open_files
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.patience import Patience
 from tests.support.process_costs import descriptors
-from tests.support.served_cells import names
+from tests.support.segment_reader import names
 
 Factory = Callable[..., DaemonProcess]
 Connect = Callable[..., Any]
@@ -594,7 +593,7 @@ def test_who_left_without_a_goodbye(daemon: Factory, divided_map: DividedMap) ->
             keeper = shmmap.connect(one.endpoint, name=f"keeper {number}")
             kept.append(keeper.around(0, 0, 10))
             keeper.close()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(descriptors(one.pid) > before):
             watcher.stats()
         rows = {row.client: row for row in watcher.stats().sessions}

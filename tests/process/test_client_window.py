@@ -26,9 +26,8 @@ from shmmap.client.window.follower import WindowFollower
 from shmmap.client.window.retention import Departed
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
 from tests.support.cpp_client import CppWindow
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
 MakeWindow = Callable[..., Any]
@@ -148,7 +147,7 @@ def test_small_moves_ask_nothing(daemon: Factory, divided_map: DividedMap, make:
         assert window.move_to(20.0, 0).any
         assert_window(window, divided_map, 20, 0, 30)
         window.close()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(admin.stats().sessions) > 1):
             pass
 
@@ -190,7 +189,7 @@ def test_points_around_and_retention(daemon: Factory, divided_map: DividedMap, m
             assert admin.stats().counters["handles_sent"] == handed_out + len(first)
             assert all(a is b for a, b in zip(window.cells, first, strict=True)), "nothing was attached again"
         del first, near, window
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(admin.stats().sessions) > 1):
             pass
 
@@ -461,7 +460,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
         finally:
             gc.enable()
         over.get(timeout=LONG_S)
-        waits, released = Patience(), 0
+        waits, released = Deadline(), 0
         while waits((released := released + client.release()) < others):
             pass  # its thread leaves its last function
         assert np.isfinite(view).all()

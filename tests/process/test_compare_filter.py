@@ -22,9 +22,8 @@ from shmmap_clients.scans.trajectory import matrix_of, tum_line
 
 import shmmap
 from tests.support.daemon_process import DaemonProcess
-from tests.support.divided_map import DividedMap, random_points
+from tests.support.divided_map import DividedMap, random_points, read_pcd
 from tests.support.forked_programs import run_verb
-from tests.support.pcd_files import read_pcd
 
 Factory = Callable[..., DaemonProcess]
 PROGRAM = [sys.executable, "-m", "shmmap_clients.compare_map_filter"]

@@ -18,10 +18,9 @@ import pytest
 from shmmap import Box
 from shmmap import connect as connect_client
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -116,7 +115,7 @@ def test_a_client_in_a_container(
         freed = client.ask("evict")
         assert (freed[2], freed[3]) == (0, len(expected))
         os.kill(pid, signal.SIGKILL)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
             pass
 

@@ -19,11 +19,10 @@ from shmmap.errors import InternalError, StaleSocket
 from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, WORKER_STEPS
 from tests.process.conftest import DaemonFactory
 from tests.support.cpp_client import CppClient
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
-from tests.support.served_cells import assert_right, whole
+from tests.support.segment_reader import assert_right, whole
 
 STEPS_AT_START = (
     "daemon.lock",
@@ -127,7 +126,7 @@ def live(client: shmmap.Client, made: DividedMap) -> None:
 
 def connected(one: DaemonProcess) -> shmmap.Client:
     """Connect, again where the daemon has just died and is started again."""
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(True):
         with contextlib.suppress(StaleSocket):
             return shmmap.connect(one.endpoint, timeout=240.0, connect_timeout=240.0)
@@ -152,7 +151,7 @@ def test_daemon_and_worker(
         assert keeper.restarts == label.startswith("daemon.")
     with shmmap.connect(one.endpoint) as client:
         assert_right(whole(client, 0, 0, 500), divided_map, sorted(divided_map.corners))
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not _books_agree(one, client)):
             pass
         client.evict()
@@ -208,6 +207,6 @@ def test_client(
         assert other.evict().pinned == len(held)
         one.until_segments(len(held), lambda: other.stats())
         assert_right(whole(other, 0, 0, 30), divided_map, near)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(other.stats().sessions) > 1):
             pass

@@ -17,9 +17,8 @@ import shmmap
 from shmmap import kernel_cache
 from shmmap.layers.compiling import compile_kernels
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap
-from tests.support.waiting import until
 
 
 def empty(path: Path) -> None:

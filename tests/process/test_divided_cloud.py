@@ -17,11 +17,10 @@ import pytest
 
 from shmmap.dividing.divide import divide
 from tests.process.conftest import DaemonFactory
+from tests.support.cloud_bytes import write_las
 from tests.support.clouds import Columns, rows_of, xyzircaedt
-from tests.support.daemon_process import DaemonProcess, wait_ended
-from tests.support.las_files import write_las
-from tests.support.patience import LIMIT_S
-from tests.support.pcd_files import read_pcd
+from tests.support.daemon_process import LIMIT_S, DaemonProcess, wait_ended
+from tests.support.divided_map import read_pcd
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]

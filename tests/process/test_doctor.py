@@ -12,10 +12,9 @@ from typing import Any
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.command_line import doctor
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.doctor_verb import doctor
-from tests.support.patience import Patience
 
 
 def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) -> None:
@@ -74,7 +73,7 @@ def test_cells_that_cannot_be_loaded_are_named(daemon: DaemonFactory, divided_ma
 
 def _until(one: DaemonProcess, about: str, state: str) -> dict[str, Any]:
     """What is found about something, once the statistics tell it."""
-    waiting = Patience()
+    waiting = Deadline()
     found: dict[str, Any] = doctor(one)[1][about]
     while waiting(found["state"] != state):
         found = doctor(one)[1][about]

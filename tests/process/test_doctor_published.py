@@ -20,14 +20,12 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.accounts import STRANGER
-from tests.support.bucket_server import KEYS, BucketServer
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.command_line import doctor, publish
+from tests.support.compiled_programs import built_preload
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import make_map
-from tests.support.doctor_verb import doctor
-from tests.support.faulty_web import FaultyWeb, faulty_web
-from tests.support.patience import Patience
-from tests.support.preloaded import built_preload
-from tests.support.publishing import publish
+from tests.support.map_stores import KEYS, BucketServer
+from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -55,7 +53,7 @@ def states(found: dict[str, Any]) -> list[str]:
 
 
 def until_row(one: DaemonProcess, name: str, text: str) -> dict[str, Any]:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(text not in (found := rows(one))[name]["fact"]):
         pass
     return found

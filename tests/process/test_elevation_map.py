@@ -22,10 +22,9 @@ from shmmap_clients.elevation_map.surface import surface_heights
 import shmmap
 from shmmap.dividing.map_writer import MapWriter
 from shmmap.simulation.town import Town
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.forked_programs import run_verb
-from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
 LONG_S = 120.0
@@ -293,7 +292,7 @@ def test_a_signal_leaves_no_unfinished_file(daemon: Factory, tmp_path: Path, num
     words = ["--cache", f"{tmp_path}/cache", "--endpoint", one.endpoint, "--out", f"{tmp_path}/out/e.npz"]
     command = [sys.executable, "-m", "shmmap_clients.elevation_map", "build", "--quiet", *words]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not any((tmp_path / "out").iterdir())):
             time.sleep(0.01)
         assert process.poll() is None

@@ -14,13 +14,12 @@ from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.cpp_client import CppEventStream
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.patience import Patience
 
 pytestmark = pytest.mark.usefixtures("layer_kernels")
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 EAST = [(-160.0, 0.0), (160.0, 0.0)]
 Listen = Callable[[DaemonProcess], list[Any]]
 
@@ -40,7 +39,7 @@ def listen(
     opened: list[Any] = []
 
     def both(to: DaemonProcess) -> list[Any]:
-        opened.append(EventStream(to.endpoint, since=60, timeout=PATIENCE_S))
+        opened.append(EventStream(to.endpoint, since=60, timeout=TIMEOUT_S))
         opened.append(CppEventStream(cpp_program, to.endpoint, since=60))
         return opened
 
@@ -52,7 +51,7 @@ def listen(
 def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
     """Return the first event that fits."""
     while True:
-        happening = stream.next(PATIENCE_S)
+        happening = stream.next(TIMEOUT_S)
         assert happening is not None
         if fits(happening):
             return happening
@@ -60,7 +59,7 @@ def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
 
 def until_ahead(shmmap: Shmmap, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Read the counters of prefetching until they fit."""
-    waiting = Patience()
+    waiting = Deadline()
     told: dict[str, Any] = shmmap.json("status")["ahead"]
     while waiting(not fits(told)):
         told = shmmap.json("status")["ahead"]
@@ -87,8 +86,8 @@ def test_a_drive_through_a_time_without_the_files(
     assert shmmap.json("status")["ahead"]["prefetch_started"] == 0, "no client moves"
     marks = [Path(street.id(name) + ".offline") for name in street.corners]
     with MapWindow(one.endpoint, 6.0, name="driver") as window:
-        assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
-        fetched, waiting = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}, Patience()
+        assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=TIMEOUT_S).complete
+        fetched, waiting = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}, Deadline()
         while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --ride-out
             pass
         told = shmmap.json("status")["ahead"]
@@ -107,7 +106,7 @@ def test_a_drive_through_a_time_without_the_files(
 
         for mark in marks:
             mark.touch()
-        assert window.move_to(-100, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
+        assert window.move_to(-100, 0, vx=5.0, route=EAST, wait=TIMEOUT_S).complete
         told = until_ahead(shmmap, lambda ahead: bool(ahead["origin_out"]))
         assert told["cells_late"] == 0, "no client has noticed"
         assert told["prefetch_used"] == 4
@@ -121,7 +120,7 @@ def test_a_drive_through_a_time_without_the_files(
         assert "origin out of reach for" in " ".join(shmmap("status").split())
         assert "origin out of reach for" in " ".join(shmmap("top").split())
 
-        x, waiting = -60, Patience()
+        x, waiting = -60, Deadline()
         while waiting(not shmmap.json("status")["counters"]["cells_late"]):  # beyond what was fetched in time
             x = min(x + 20, 100)
             window.move_to(x, 0, vx=5.0, route=EAST)
@@ -135,7 +134,7 @@ def test_a_drive_through_a_time_without_the_files(
 
         for mark in marks:
             mark.unlink()
-        assert window.wait_until_current(PATIENCE_S)
+        assert window.wait_until_current(TIMEOUT_S)
         told = until_ahead(shmmap, lambda ahead: not ahead["origin_out"])
         assert told["last_outage_s"] > 0.0
         assert told["over_fetch"] > 1.0
@@ -156,9 +155,9 @@ def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path)
     one = daemon(street.root, "--prefetch-share", "0")
     shmmap = Shmmap(one, tmp_path)
     with MapWindow(one.endpoint, 6.0, background=False) as window:
-        window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S)
-        window.move_to(-110, 0, vx=5.0, route=EAST, wait=PATIENCE_S)
-        waiting = Patience()
+        window.move_to(-150, 0, vx=5.0, route=EAST, wait=TIMEOUT_S)
+        window.move_to(-110, 0, vx=5.0, route=EAST, wait=TIMEOUT_S)
+        waiting = Deadline()
         while waiting((finding := prefetching(shmmap))["advice"] != "raise --prefetch-share"):
             pass
     assert finding["fact"] == "off; moving clients waited for 2 cells in the last 10 min"
@@ -173,10 +172,10 @@ def test_load_times_by_what_was_done(daemon: DaemonFactory, divided_map: Divided
     names = ("load", "load_points", "load_computed", "load_cached")
 
     def counts(wanted: tuple[int, ...]) -> None:
-        with connect(one.endpoint, timeout=PATIENCE_S) as client:
+        with connect(one.endpoint, timeout=TIMEOUT_S) as client:
             for layer in ("voxel(leaf=2.0)", "points"):
-                client.area(Circle(0, 0, 1), layer, wait=PATIENCE_S).raise_for_failures()
-        waiting = Patience()
+                client.area(Circle(0, 0, 1), layer, wait=TIMEOUT_S).raise_for_failures()
+        waiting = Deadline()
         while waiting((found := shmmap.json("top")["latency_s"])["load"]["count"] < sum(wanted)):
             pass
         assert [found[name]["count"] for name in names] == [sum(wanted), *wanted]

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import shmmap
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 
 DaemonFactory = Callable[..., DaemonProcess]
 
@@ -28,7 +27,7 @@ def test_what_layers_need_is_compiled_once(
 ) -> None:
     kernels = tmp_path / "kernels"
     one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not marks(kernels)):
         pass
     made = compiled(kernels)
@@ -50,7 +49,7 @@ def test_a_daemon_that_ends_meanwhile_leaves_nothing(
     """The test's end looks for processes that are left."""
     kernels = tmp_path / "kernels"
     one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not list(kernels.glob("layers-*.lock"))):
         pass
     one.stop()

@@ -22,10 +22,9 @@ import pytest
 from shmmap_clients.scans.trajectory import read_trajectory
 
 from shmmap.simulation.town import Town
+from tests.support.cloud_bytes import write_las
 from tests.support.daemon_process import ROOT
-from tests.support.las_files import write_las
-from tests.support.pages import read_page
-from tests.support.reader import Reader, Terminal
+from tests.support.pages import Reader, Terminal, read_page, write_program
 
 README = read_page("README.md")
 INSTALL = read_page("shmmap/INSTALL.md")
@@ -50,12 +49,6 @@ def interpreter(name: str) -> Path | None:
         if asked.returncode == 0:  # pyenv puts programs on the path that start nothing
             return Path(asked.stdout.strip())
     return None
-
-
-def script(path: Path, text: str) -> None:
-    """Write a program of a shell."""
-    path.write_text(f"#!/bin/sh\n{text}\n")
-    path.chmod(0o755)
 
 
 @dataclass
@@ -119,7 +112,7 @@ def newcomer(
     home = tmp_path_factory.mktemp("newcomer")
     programs = home / "bin"
     programs.mkdir()
-    script(programs / "sudo", 'exec "$@"')
+    write_program(programs / "sudo", 'exec "$@"')
     if request.param == "installed":
         reader = Reader(home, [programs], {"PYTHONPATH": f"{ROOT}:{ROOT / 'clients'}"})
         _pretend_installed(home, programs)
@@ -130,7 +123,7 @@ def newcomer(
             python = Path(sys.base_prefix) / "bin" / "python3"
         if python is None:
             pytest.skip(f"no {request.param} on PATH or in ~/.pyenv")
-        script(programs / "python3", f'exec "{python}" "$@"')
+        write_program(programs / "python3", f'exec "{python}" "$@"')
         pip = {"PIP_CACHE_DIR": str(Path.home() / ".cache" / "pip"), "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
         kernels = {"NUMBA_CACHE_DIR": str(home / ".cache" / "kernels")}
         reader = Reader(home, [programs], pip | kernels)
@@ -155,10 +148,10 @@ def _pretend_installed(home: Path, programs: Path) -> None:
         "shmmap-pose-init": "shmmap_clients.pose_initializer",
     }
     for name, module in modules.items():
-        script(programs / name, f'exec "{sys.executable}" -m {module} "$@"')
-    script(programs / "python", f'exec "{sys.executable}" "$@"')
-    script(programs / "python3", '[ "$1 $2" = "-m venv" ]')
-    script(programs / "pip", '[ "$1" = install ]')
+        write_program(programs / name, f'exec "{sys.executable}" -m {module} "$@"')
+    write_program(programs / "python", f'exec "{sys.executable}" "$@"')
+    write_program(programs / "python3", '[ "$1 $2" = "-m venv" ]')
+    write_program(programs / "pip", '[ "$1" = install ]')
     (home / "opt").mkdir()
     (home / "opt" / "bin").symlink_to(programs)
 

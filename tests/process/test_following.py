@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.client_programs import FollowingClient
 from tests.support.cpp_client import CppFollower
-from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.support.following_client import FollowingClient
-from tests.support.pcd_files import read_pcd, write_pcd
+from tests.support.divided_map import DividedMap, make_map, random_points, read_pcd, write_pcd
 from tests.support.raw_client import RawClient
 
 Connect = Callable[..., RawClient]

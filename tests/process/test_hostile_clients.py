@@ -1,26 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clients that flood, never listen, lie about sizes or die in the middle: others notice nothing."""
+"""Clients that flood, lie, take all descriptors, memory or locks, or die: others notice nothing."""
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import pytest
 import zmq
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.accounts import GROUP, MEMBER, python_for_others
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
-from tests.support.patience import Patience
 from tests.support.process_costs import descriptors, peak_bytes, resident_bytes
-from tests.support.raw_client import RawClient, circle
+from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
 
@@ -81,7 +84,7 @@ def test_bytes_that_are_no_zeromq(daemon: DaemonFactory, connect: Connect, divid
             stranger.send(rng.randbytes(rng.randrange(1, 500)))
     for _ in range(50):
         assert len(client.area(circle(0, 0, 5)).cells) == 4
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > before):
         client.ask("stats")
 
@@ -142,17 +145,17 @@ def test_clients_that_die_are_forgotten(
     for process in dying[1:]:
         process.kill()
         process.communicate()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(client.ask("stats")[5]) > 2):
         pass
     for _ in range(20):
         assert len(client.ask("stats")[5]) == 2  # the stopped one is not reaped
     dying[0].kill()
     dying[0].communicate()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(client.ask("stats")[5]) > 1):
         pass
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > before):
         client.ask("stats")
 
@@ -172,27 +175,308 @@ def test_sessions_come_and_go_without_a_trace(
             client.ask("evict")
             if number % 4 == 0:
                 client.ask("reload")
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(bool(one.segments()) or len(client.ask("stats")[5]) > 1):
             client.ask("stats")
 
     busy()
     before, loaders = descriptors(one.pid), one.children()
     busy()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(descriptors(one.pid) > before):
         client.ask("stats")
     assert one.children() == loaders
 
 
-def test_two_signals_end_it_at_once(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_poses_that_are_not_finite(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    """Refused, and nobody's cells are lost in the queue for it."""
+    client = connect(daemon(divided_map.root))
+    nan, inf = float("nan"), float("inf")
+    for intent in ([nan, 0.0], [0.0, inf], [0.0, 0.0, nan], [0.0, 0.0, 0.0, 0.0, inf, [[0.0, nan]]]):
+        with pytest.raises(DaemonError) as failure:
+            client.area(circle(0, 0, 5), intent=intent)
+        assert failure.value.code == "bad_request"
+    assert len(client.area(circle(0, 0, 5)).cells) == 4
+
+
+# --- clients that take all descriptors or memory: they lose their connections, others notice nothing -
+
+LIMIT = 160
+
+_PRELUDE = """
+import socket, struct, sys, zmq
+from tests.support.raw_client import RawClient, circle
+from tests.support.message_pack import pack
+path = sys.argv[1]
+
+def connection():
+    one = socket.socket(socket.AF_UNIX)
+    one.connect(path)
+    return one
+
+def zmtp():
+    # what a DEALER says first, by hand: greeting (ZMTP 3.0, NULL), READY
+    one = connection()
+    one.sendall(b"\\xff" + bytes(8) + b"\\x7f\\x03\\x00NULL" + bytes(16 + 32))
+    body = b"\\x05READY\\x0bSocket-Type\\0\\0\\0\\6DEALER\\x08Identity\\0\\0\\0\\0"
+    one.sendall(b"\\x04" + bytes([len(body)]) + body)
+    answer = 64 + 2 + len(body)
+    while answer:  # nothing may be sent before the other side's READY
+        answer -= len(one.recv(answer))
+    return one
+
+def done(word="done"):
+    print(word, flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def hostile(one: DaemonProcess, program: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a hostile program until it says that it is done; it then stays as it is."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", _PRELUDE + program, one.endpoint],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def said(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def serves(client: RawClient) -> None:
+    for _ in range(20):
+        assert len(client.area(circle(0, 0, 5)).cells) == 4
+
+
+CROWDS = {
+    "that say nothing": """
+held = []
+try:
+    for number in range(2000):
+        one = socket.socket(socket.AF_UNIX)
+        one.settimeout(1.0)
+        one.connect(path)
+        held.append(one)
+except OSError:
+    pass
+done()
+""",
+    "with sessions": """
+held = []
+try:
+    for number in range(150):
+        held.append(RawClient(path, timeout=1.0))
+except TimeoutError:
+    pass
+done()
+""",
+}
+
+
+@pytest.mark.parametrize("crowd", CROWDS)
+def test_more_connections_than_descriptors(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, crowd: str
+) -> None:
+    """libzmq would abort on the first ``accept`` without a descriptor; newcomers still get in."""
+    one = daemon(divided_map.root, command=["prlimit", f"--nofile={LIMIT}:{LIMIT}"])
+    client = connect(one)
+    serves(client)
+    with hostile(one, CROWDS[crowd]) as process:
+        assert said(process) == "done"
+        serves(client)
+        assert descriptors(one.pid) < LIMIT
+        serves(connect(one))
+        assert f"connections ended pid={process.pid} count=" in one.log
+        serves(client)
+    waiting = Deadline()
+    while waiting(descriptors(one.pid) > LIMIT // 2):
+        client.ask("stats")
+
+
+def test_more_sessions_than_there_may_be(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """One process opens session after session on new connections: it displaces its own."""
     one = daemon(divided_map.root)
-    connect(one).area(circle(0, 0, 60))
-    pid = one.pid
-    one.send(signal.SIGTERM)
-    one.send(signal.SIGTERM)
-    assert wait_ended(pid)
-    assert one.process is not None
-    process, one.process = one.process, None
-    assert process.wait() == 0
-    assert one.leftovers() == []
+    client = connect(one)
+    serves(client)
+    program = """
+context = zmq.Context()
+for number in range(4200):
+    one = context.socket(zmq.DEALER)
+    one.linger = 0
+    one.connect("ipc://" + path)
+    one.send(pack(["hello", 1, 1, 0, "crowd"]))
+    assert one.poll(60000)
+    one.close()
+done()
+"""
+    with hostile(one, program) as process:
+        assert said(process) == "done"
+        serves(client)
+        serves(connect(one))
+        assert "sessions already" not in one.log
+    waiting = Deadline()
+    while waiting(len(client.ask("stats")[5]) > 2):
+        pass
+
+
+def test_replies_that_nobody_reads(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    client.area(circle(0, 0, 500))
+    before = resident_bytes(one.pid)
+    program = """
+one = zmtp()
+one.settimeout(20.0)
+def send(message):
+    body = pack(message)
+    one.sendall(b"\\x02" + struct.pack(">Q", len(body)) + body)
+send(["hello", 1, 1, 0, "deaf"])
+names = ["0_0.pcd"] * 3000
+try:
+    while True:
+        send(["selected", 1, names, ["points"], None])
+except OSError:
+    done("ended")
+"""
+    with hostile(one, program) as process:
+        assert said(process) == "ended"
+        serves(client)
+        assert f'connections ended pid={process.pid} count=1 reason="it left' in one.log
+    assert resident_bytes(one.pid) - before < 96 << 20
+
+
+def test_a_message_that_never_ends(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    """Frame after frame, each small enough: libzmq keeps them all until the last one comes."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    serves(client)
+    program = """
+one = zmtp()
+one.settimeout(60.0)
+frame = b"\\x03" + struct.pack(">Q", 1 << 20) + bytes(1 << 20)  # long frame, more to come
+try:
+    while True:
+        one.sendall(frame)
+except OSError:
+    done("ended")
+"""
+    with hostile(one, program) as process:
+        assert said(process) == "ended"
+        serves(client)
+        assert f"connections ended pid={process.pid} count=" in one.log
+        assert "it made the daemon take too much memory" in one.log
+    waiting = Deadline()
+    while waiting(resident_bytes(one.pid) > 400 << 20):
+        client.ask("stats")
+
+
+def test_a_process_that_asks_too_much_at_once(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """What waits beyond the limit is refused; the refusal says so, and later requests are served.
+
+    All replies together are fewer, and less, than what the daemon keeps for a client that does not read.
+    """
+    one = daemon(divided_map.root)
+    client = connect(one)
+    serves(client)
+    body = [client.send("selected", ["0_0.pcd"] * 500, ["points"], None) for _ in range(200)]
+    kinds = [client.receive() for _ in body]
+    refused = [reply for reply in kinds if reply[0] == "error"]
+    assert all(reply[2] == "busy" for reply in refused)
+    assert sorted(reply[1] for reply in kinds) == body
+    serves(client)
+
+
+# --- a member of the group takes every lock there is on everything it can open: nobody else notices --
+
+
+_LOCKS = """
+import fcntl, json, os, struct, sys
+found = {"locked": 0, "refused": []}
+held = []
+
+def attempt(what, action):
+    try:
+        return action()
+    except OSError:
+        found["refused"].append(what)
+
+for directory in sys.argv[1:]:
+    for name in sorted(os.listdir(directory)):
+        path = directory + "/" + name
+        if name.endswith((".sock", ".txt")) or os.path.isdir(path):
+            continue
+        fd = attempt("open " + name.rpartition(".")[2], lambda: os.open(path, os.O_RDONLY))
+        if fd is None:
+            continue
+        held.append(fd)
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        attempt("lease", lambda: fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_RDLCK))
+        attempt("write lock", lambda: fcntl.fcntl(fd, 37, struct.pack("@hhqqi4x", fcntl.F_WRLCK, 0, 0, 0, 0)))
+        for at in range(0, 3000, 3):  # two bytes each and a gap, or the kernel joins them
+            lock = struct.pack("@hhqqi4x", fcntl.F_RDLCK, 0, at, 2, 0)
+            attempt("read lock of " + name.rpartition(".")[2], lambda: fcntl.fcntl(fd, 37, lock))
+        found["locked"] += 1
+found["refused"] = sorted(set(found["refused"]))
+print(json.dumps(found), flush=True)
+sys.stdin.read()
+"""
+
+
+@contextmanager
+def member_with_locks(one: DaemonProcess) -> Iterator[dict[str, Any]]:
+    """Run the member; gives what it got."""
+    process = subprocess.Popen(
+        [
+            "setpriv", f"--reuid={MEMBER}", f"--regid={GROUP}", "--clear-groups", "--inh-caps=-all",
+            python_for_others(), "-I", "-c", _LOCKS, one.shm_dir, one.runtime_dir,
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd="/",
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        yield json.loads(process.stdout.readline())
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.root
+def test_locks_hold_nobody_up(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one: DaemonProcess = daemon(divided_map.root, "--group", str(GROUP), start=False)
+    os.chmod(one.runtime_dir, 0o755)
+    os.chmod(one.shm_dir, 0o1777)
+    one.start()
+    client = connect(one)
+    assert len(client.area(circle(0, 0, 500)).cells) == 36
+    with member_with_locks(one) as found:
+        assert found["locked"] == 36 + 1  # the segments and the statistics; no lock file of the daemon's
+        # of the statistics the daemon has a lock itself
+        assert found["refused"] == ["lease", "open lock", "read lock of statistics", "write lock"]
+        stats = client.ask("stats")
+        assert stats[6] == 36  # mapped by nobody known
+        assert client.ask("show", "0_0.pcd")[9][0][6][0][:2] == [0, 0]
+        evicted = client.ask("evict")
+        assert (evicted[2], evicted[3]) == (0, 36)
+        assert len(client.area(circle(0, 0, 500)).cells) == 36  # revived: it is all there still
+        one.kill()
+        one.start()
+        again = connect(one)
+        assert len(again.area(circle(0, 0, 500)).cells) == 36
+        assert again.ask("evict")[2:4] == [0, 36]
+    one.until_segments(0, lambda: again.ask("stats"))

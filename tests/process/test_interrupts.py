@@ -32,9 +32,8 @@ from shmmap.client import connection_watch
 from shmmap.client.connection_watch import running, start_thread
 from shmmap.client.window import follower
 from shmmap.errors import BadRequest
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 
 Factory = Callable[..., DaemonProcess]
 LONG_S = 60.0
@@ -100,7 +99,7 @@ def threads() -> set[str]:
 
 def await_end_of_threads(known: set[str]) -> None:
     """Wait until there is no thread but these: one that has said that it is over still has to end."""
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not threads() <= known):
         time.sleep(0.001)
 

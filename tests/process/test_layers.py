@@ -16,10 +16,10 @@ from shmmap.layers.contract import LayerTable
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.offered_kinds import install
-from tests.support.open3d_package import open3d_or_skip
+from tests.support.layer_oracles import install
 from tests.support.raw_client import DaemonError, RawCells, RawClient, RawHandle, circle, pack_versions
 from tests.support.segment_reader import read_segment
+from tests.support.skips import open3d_or_skip
 
 pytestmark = pytest.mark.usefixtures("layer_kernels")
 

@@ -29,9 +29,9 @@ from xxhash import xxh3_64_intdigest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
+from tests.support.client_programs import HeldRow, Holding, HoldingClient
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.support.holding_client import HeldRow, Holding, HoldingClient
 
 STEPS = int(os.environ.get("SHMMAP_TEST_STEPS", "120"))
 SEED = int(os.environ.get("SHMMAP_TEST_SEED", "1"))
@@ -108,7 +108,7 @@ class Life:
         if holder.stopped:
             return
         x, y, radius = self.random.uniform(-60, 60), self.random.uniform(-60, 60), self.random.uniform(1, 35)
-        answer = holder.process.tell([x, y, radius])
+        answer = holder.process.hold([x, y, radius])
         holder.known = True
         inside = {self.truth.made.id(name) for name in self.truth.made.in_circle(x, y, radius)}
         self._judge(holder, answer, inside)
@@ -132,7 +132,7 @@ class Life:
         """A holder drops everything."""
         holder = self._one(stopped=False)
         if holder is not None:
-            assert holder.process.tell([]).cells == ()
+            assert holder.process.hold([]).cells == ()
             holder.expected = {}
             holder.known = True
 
@@ -140,7 +140,7 @@ class Life:
         """A holder's bytes are the same as ever."""
         holder = self._one(stopped=False)
         if holder is not None:
-            assert {row.segment: row for row in holder.process.tell(None).cells} == holder.expected
+            assert {row.segment: row for row in holder.process.hold(None).cells} == holder.expected
 
     def kill(self) -> None:
         """A holder dies, stopped or not."""
@@ -249,7 +249,7 @@ class Life:
         while any(holder.stopped for holder in self.holders):
             self.go_on()
         for holder in self.holders:
-            assert {row.segment: row for row in holder.process.tell(None).cells} == holder.expected
+            assert {row.segment: row for row in holder.process.hold(None).cells} == holder.expected
         self.close()
         self.admin.evict()
         self.one.until_segments(0, self.admin.stats)

@@ -13,16 +13,16 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import shmmap
 from shmmap.statistics.cell_rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, wait_ended
-from tests.support.divided_map import DividedMap
+from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
+from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -53,6 +53,55 @@ def test_a_signal_while_cells_load_and_clients_wait(
     assert one.leftovers() == []
     reply = client.cells_reply(client.wait_for(request))  # whoever waits gets what there is
     assert len(reply.cells) + len(reply.pending) == 36
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_the_daemon_starts(
+    daemon: DaemonFactory, divided_map: DividedMap, number: signal.Signals
+) -> None:
+    """As soon as it has a name on disk, a signal must take it away again, wherever the start is by then."""
+    one = daemon(divided_map.root, start=False)
+    process = one.spawn()
+    while not [name for name in os.listdir(one.runtime_dir) if name.endswith(".lock")]:
+        assert process.poll() is None, one.log
+    process.send_signal(number)
+    assert process.wait(30) == 0, one.log
+    assert one.leftovers() == []
+    assert [name for name in os.listdir(one.runtime_dir) if name.endswith(".lock")] == []
+
+
+def test_signals_one_after_the_other_end_it_at_once(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """Whatever the first one's work has come to when the others arrive."""
+    for _ in range(5):
+        one = daemon(divided_map.root)
+        client = connect(one)
+        client.area(circle(0, 0, 60))
+        assert one.process is not None
+        process, one.process = one.process, None
+        while process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        assert process.returncode == 0, one.log
+        assert "Traceback" not in one.log
+        assert one.leftovers() == []
+        assert [name for name in os.listdir(one.runtime_dir) if name.endswith(".lock")] == []
+
+
+def test_a_burst_of_reload_signals(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    one = daemon(divided_map.root)
+    client = connect(one)
+    before = client.selected(["0_0.pcd"]).cells[0]
+    corner = divided_map.corners["0_0.pcd"]
+    divided_map.write_cell("0_0.pcd", corner, random_points(np.random.default_rng(4), corner, 40))
+    for _ in range(200):
+        one.send(signal.SIGHUP)
+    reply = client.selected(["0_0.pcd"])
+    while reply.cells[0].version == before.version:
+        reply = client.selected(["0_0.pcd"])
+    assert reply.cells[0].points == 40
+    assert client.ask("reload")[3:6] == [0, 0, 0]
+    assert 1 <= client.ask("stats")[4]["reloads"] <= 202
 
 
 def test_a_second_instance_is_refused_and_the_first_one_goes_on(
@@ -144,7 +193,7 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     os.waitid(os.P_PID, one.pid, os.WSTOPPED | os.WNOWAIT)
     assert read_statistics(one.instance, one.shm_dir).state == "stopped"
     one.send(signal.SIGCONT)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting((seen := read_statistics(one.instance, one.shm_dir)).counters["cells_resident"] < 12):
         client.ask("stats")
     assert [cell.id for cell in seen.cells] == sorted(divided_map.in_circle(0, 0, 25))
@@ -153,10 +202,10 @@ def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divid
     before = {cell.id: cell for cell in seen.cells}
     for _ in range(3):
         client.selected(["0_0.pcd"])
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(read_statistics(one.instance, one.shm_dir).counters["handles_sent"] < 15):
         client.ask("stats")
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(_row(one, "0_0.pcd").hits < before["0_0.pcd"].hits + 3):
         client.ask("stats")
     assert _row(one, "0_0.pcd").last_use_monotonic_ns > before["0_0.pcd"].last_use_monotonic_ns
@@ -266,7 +315,7 @@ def test_loaders_weigh_less_than_the_daemon(daemon: DaemonFactory, divided_map: 
         return [Path(f"/proc/{pid}/autogroup").read_text().split()[-1] for pid in pids]
 
     leaves = (1.0 + 0.01 * number for number in itertools.count())
-    waiting = Patience()
+    waiting = Deadline()
     with shmmap.connect(one.endpoint, shm_dir=one.shm_dir) as client:
         while waiting("5" not in weights(*one.loaders())):
             client.around(0, 0, 5, layers=f"voxel(leaf={next(leaves):.2f})", wait=60.0)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A daemon that a limit hinders says which one, whatever it hinders: at its start and at one cell."""
+"""Limits of processes: what a daemon or a client may not have is named, and what they take is little."""
 
 from __future__ import annotations
 
 import grp
+import json
 import os
 import re
 import resource
@@ -11,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +20,14 @@ import pytest
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.prerequisites import access_of_segments
-from shmmap.errors import ConfigError
+from shmmap.errors import ConfigError, LimitReached
+from shmmap.segment.process_limits import check_files, check_threads
+from shmmap.statistics.reader import read_statistics
 from shmmap.testing.environment import without_settings
-from tests.support.daemon_process import DaemonProcess
-from tests.support.divided_map import DividedMap, random_points
+from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.raw_client import RawClient, circle
 
 Factory = Callable[..., DaemonProcess]
 KIB = 1024
@@ -35,6 +41,9 @@ def started_under(limit: int, value: int, arguments: list[str]) -> tuple[int, st
         capture_output=True, text=True, check=False, env=without_settings(),
     )  # fmt: skip
     return done.returncode, done.stderr
+
+
+Connect = Callable[..., RawClient]
 
 
 @pytest.mark.parametrize(
@@ -72,6 +81,35 @@ def test_a_segment_that_the_limit_on_files_forbids(daemon: Factory, divided_map:
         assert failed.cell_id.endswith("/0_0.pcd")
         assert "RLIMIT_FSIZE is 1,048,576 bytes" in failed.message
         assert "ulimit -f" in failed.message
+        assert len(client.around(-30, -30, 5, wait=60)) == 4
+        for pid in (one.pid, *one.children()):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        waiting = Deadline()
+        while waiting(bool(cells.failed)):
+            cells = client.around(0, 0, 15, wait=60)
+        assert len(cells) == 4
+
+
+def test_statistics_that_cannot_be_written_end_nobody(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
+    """The limit lies before the counters and behind all that the log gets."""
+    one = daemon(divided_map.root)
+    client = connect(one)
+    warm = [handle.segment for handle in client.area(circle(0, 0, 5)).cells]
+    soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
+    told = 'statistics not written error="File too large"'
+    waiting = Deadline()
+    while waiting(told not in one.log):
+        os.sched_yield()
+    asked = client.ask("stats")[4]["requests"]
+    assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
+    resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (soft, hard))
+    waiting = Deadline()
+    while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
+        os.sched_yield()
+    assert one.log.count(told) == 1
 
 
 def test_a_daemon_with_limited_files_says_so_at_its_start(daemon: Factory, divided_map: DividedMap) -> None:
@@ -97,3 +135,311 @@ def test_a_group_that_the_daemon_s_user_is_not_in(monkeypatch: pytest.MonkeyPatc
     assert f"usermod -aG {group} 12345" in refused.value.hint
     monkeypatch.setattr(os, "getgroups", lambda: [12345, 0])
     assert access_of_segments(DaemonConfig(group=group)) == (0, 0o440)
+
+
+# --- clients in processes that may have no more descriptors or threads: refused by the limit's name --
+
+
+PROGRAM = """
+import os, resource, sys
+import shmmap
+endpoint = sys.argv[1]
+fds = []
+def leave_files(left):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (64, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+    try:
+        while True:
+            fds.append(os.dup(0))
+    except OSError:
+        for _ in range(left):
+            os.close(fds.pop())
+def free_files():
+    while fds:
+        os.close(fds.pop())
+def leave_threads(left):
+    import socket
+    with open("/proc/self/statm") as file:
+        now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_STACK, (8 << 20, 8 << 20))
+    most = now + left * (8 << 20) + (left + 1) * (1 << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (most, resource.getrlimit(resource.RLIMIT_AS)[1]))
+def tried(act):
+    try:
+        return act() or "works"
+    except shmmap.ShmmapError as error:
+        return f"{type(error).__name__}: {error}"
+"""
+
+
+def outcomes(code: str, one: DaemonProcess) -> list[str]:
+    """Run a program that must end by itself and say nothing on stderr; returns its lines."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM + code, one.endpoint],
+        capture_output=True, text=True, timeout=120, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout.splitlines()
+
+
+@pytest.fixture
+def one(daemon: Factory, tmp_path: Path) -> DaemonProcess:
+    served: DaemonProcess = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
+    return served
+
+
+def test_few_descriptors(one: DaemonProcess) -> None:
+    """With 0 to 12 of them left, for a client and for a window."""
+    lines = outcomes(
+        """
+shmmap.connect, shmmap.MapWindow
+def window():
+    with shmmap.MapWindow(endpoint, 50.0) as made:
+        made.move_to(0.0, 0.0)
+        return None if made.wait_until_current(60) else f"{made.error}"
+def client():
+    with shmmap.connect(endpoint) as made:
+        return None if made.around(0, 0, 50).complete else "incomplete"
+for act in client, window:
+    for left in range(13):
+        leave_files(left)
+        result = tried(act)
+        free_files()
+        print(left, result)
+""",
+        one,
+    )
+    assert len(lines) == 26
+    for line in lines:
+        left, _, result = line.partition(" ")
+        if int(left) >= 10:
+            assert result == "works", line
+        else:
+            assert result.startswith(
+                f"LimitReached: a connection to the daemon needs 10 more descriptors, {left} are left: "
+                "this process has as many files open as it may, 64 (RLIMIT_NOFILE)"
+            ), line
+
+
+def test_none_to_load_the_library_with(one: DaemonProcess) -> None:
+    (line,) = outcomes("leave_files(0); print(tried(lambda: shmmap.connect(endpoint)))", one)
+    assert line.startswith("LimitReached: shmmap.connect cannot be loaded: this process has as many files")
+
+
+def test_none_for_a_segment_and_for_a_window_of_a_client_that_is_there(one: DaemonProcess) -> None:
+    lines = outcomes(
+        """
+shmmap.MapWindow
+client = shmmap.connect(endpoint)
+leave_files(0)
+print(tried(lambda: client.around(0, 0, 50)))
+window = shmmap.MapWindow(client, 50.0)
+window.move_to(0.0, 0.0)
+while window.error is None:
+    pass
+print(tried(lambda: f"{type(window.error).__name__}: {window.error}"))
+free_files()
+print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 50).complete else "no"))
+""",
+        one,
+    )
+    for line in lines[:2]:
+        assert line.startswith(
+            "LimitReached: this process has as many files open as it may, 64 (RLIMIT_NOFILE)"
+        )
+    assert lines[2:] == ["True works"]
+
+
+def test_none_to_connect_again_with(one: DaemonProcess) -> None:
+    """The daemon is back, and this process may not open a socket: nobody blames the daemon."""
+    program = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM + """
+client = shmmap.connect(endpoint, timeout=1)
+print("connected", flush=True)
+while client.disconnected_since is None:
+    pass
+leave_files(0)
+print("lost", flush=True)
+input()
+print(tried(lambda: client.around(0, 0, 50)), flush=True)
+free_files()
+client.close()
+print(tried(lambda: None if shmmap.connect(endpoint).around(0, 0, 50).complete else "no"), flush=True)
+""", one.endpoint],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
+    )  # fmt: skip
+    assert program.stdout is not None
+    assert program.stdout.readline() == "connected\n"
+    one.stop()
+    assert program.stdout.readline() == "lost\n"
+    one.start()
+    rest, _ = program.communicate("\n", timeout=120)
+    refusal, after = rest.splitlines()
+    assert refusal.startswith("LimitReached: a connection to the daemon needs 1 more descriptors, 0 are left")
+    assert after == "works"
+    assert program.returncode == 0
+
+
+@pytest.mark.parametrize("left", range(5))
+def test_few_threads(one: DaemonProcess, left: int) -> None:
+    """Stacks of threads need address space, which an ordinary user can limit, too."""
+    client, window = outcomes(
+        f"""
+shmmap.connect, shmmap.MapWindow
+leave_threads({left})
+def client():
+    shmmap.connect(endpoint).close()
+def window():
+    shmmap.MapWindow(endpoint, 50.0).close()
+print(tried(client))
+print(tried(window))
+""",
+        one,
+    )
+    assert client == "works" if left >= 3 else client.startswith("LimitReached: ")
+    assert window == "works" if left >= 4 else window.startswith("LimitReached: ")
+    if left < 3:
+        assert "RLIMIT_NPROC" in client
+        assert "of address space (RLIMIT_AS)" in client
+
+
+@pytest.mark.root
+@pytest.mark.parametrize("left", range(4))
+def test_few_threads_of_a_user(one: DaemonProcess, left: int) -> None:
+    """Root is not limited: the program becomes a user that has no other processes."""
+    for path in (one.endpoint, str(Path(one.endpoint).parent)):
+        os.chmod(path, 0o777)
+    (line,) = outcomes(
+        f"""
+import socket
+shmmap.connect
+uid = 1_500_000_000 + os.getpid()
+threads = len(os.listdir("/proc/self/task"))
+resource.setrlimit(resource.RLIMIT_NPROC, (threads + {left}, threads + {left}))
+os.setresuid(uid, uid, uid)
+print(tried(lambda: shmmap.connect(endpoint).close()))
+""",
+        one,
+    )
+    if left == 3:
+        assert line == "works"
+    else:
+        assert line.startswith("LimitReached: ")
+        assert " processes and threads of this user (RLIMIT_NPROC)" in line
+
+
+def test_checking_leaves_nothing() -> None:
+    files, threads = len(os.listdir("/proc/self/fd")), set(os.listdir("/proc/self/task"))
+    check_files(8, "this")
+    check_threads(4, "this")
+    assert len(os.listdir("/proc/self/fd")) == files
+    assert set(os.listdir("/proc/self/task")) <= threads, "those of earlier tests may be ending"
+
+
+def test_the_error_is_one_of_ours() -> None:
+    assert shmmap.LimitReached is LimitReached
+    assert (LimitReached.code, LimitReached.exit_code) == ("limit_reached", 71)
+
+
+# --- what a client costs its process: descriptors, modules, memory -----------------------------------
+
+
+MANY = """
+import gc, json, os, resource, sys
+resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))
+import numpy as np
+import shmmap
+def mapped(shm_dir):
+    with open("/proc/self/maps") as maps:
+        return sum(shm_dir in line for line in maps)
+client = shmmap.connect(sys.argv[1], timeout=60)
+before = len(os.listdir("/proc/self/fd"))
+cells = client.area(shmmap.Box(-1e4, -1e4, 1e4, 1e4), wait=300)
+told = {
+    "complete": cells.complete,
+    "cells": len(cells),
+    "points": int(sum(len(cell.xyz) for cell in cells)),
+    "finite": all(bool(np.isfinite(cell.xyz).all()) for cell in cells),
+    "more_files": len(os.listdir("/proc/self/fd")) - before,
+    "mapped": mapped(client.welcome.shm_dir),
+}
+print(json.dumps(told), flush=True)
+sys.stdin.readline()
+del cells
+gc.collect()
+print(json.dumps([mapped(client.welcome.shm_dir), client.release()]), flush=True)
+sys.stdin.readline()
+"""
+
+
+def run(program: str, *arguments: str) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True, text=True, timeout=400, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    told: dict[str, Any] = json.loads(done.stdout)
+    return told
+
+
+def test_three_thousand_cells_with_a_thousand_descriptors(
+    daemon: Factory, connect: Connect, tmp_path: Path
+) -> None:
+    """Descriptors stay few on both sides; statistics and accounts stay right."""
+    made = make_map(tmp_path / "map", columns=60, rows=50, points=3)
+    one = daemon(made.root, "--session-quota", "1")
+    raw = connect(one)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", MANY, one.endpoint],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
+    )  # fmt: skip
+    assert holder.stdin is not None
+    assert holder.stdout is not None
+    try:
+        assert json.loads(holder.stdout.readline()) == {
+            "complete": True,
+            "cells": 3000,
+            "points": 9000,
+            "finite": True,
+            "more_files": 0,
+            "mapped": 3000,
+        }
+        assert len(os.listdir(f"/proc/{one.pid}/fd")) < 64
+        waiting = Deadline()
+        while waiting(len(read_statistics(one.instance, one.shm_dir).cells) < 3000):
+            raw.ask("stats")
+        seen = read_statistics(one.instance, one.shm_dir)
+        assert sorted(cell.id for cell in seen.cells) == sorted(made.corners)
+        assert sum(cell.bytes for cell in seen.cells) == one.segment_bytes()
+        assert raw.ask("evict")[2:4] == [0, 3000]
+        print(file=holder.stdin, flush=True)
+        assert json.loads(holder.stdout.readline()) == [0, 3000]
+        one.until_segments(0, lambda: raw.ask("stats"))
+        waiting = Deadline()
+        while waiting(bool(read_statistics(one.instance, one.shm_dir).cells)):
+            raw.ask("stats")
+    finally:
+        holder.kill()
+        holder.communicate()
+
+
+COST = """
+import json, re, sys
+import shmmap
+with shmmap.connect(sys.argv[1]) as client, shmmap.MapWindow(client, 30) as window:
+    window.move_to(0.0, 0.0, wait=60.0)
+    assert window.points_around(0.0, 0.0, 10.0).count()
+    with open("/proc/self/status") as status:
+        peak = int(re.search(r"VmHWM:\\s+(\\d+) kB", status.read())[1])
+    json.dump({
+        "modules": sorted({name.split(".")[0] for name in sys.modules}),
+        "megabytes": peak / 1024,
+    }, sys.stdout)
+"""
+
+
+def test_a_client_loads_nothing_heavy_and_fits_40_megabytes(daemon: Factory, tmp_path: Path) -> None:
+    one = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
+    told = run(COST, one.endpoint)
+    heavy = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "asyncio"}
+    assert not heavy & set(told["modules"])
+    assert told["megabytes"] < 40

@@ -19,13 +19,20 @@ import shmmap
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import ChunkInfo, LiveMap
 from tests.process.conftest import DaemonFactory
-from tests.support.accounts import ADMINS, DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
-from tests.support.attempts import ATTEMPTS
-from tests.support.daemon_process import DaemonProcess
+from tests.support.accounts import (
+    ADMINS,
+    ATTEMPTS,
+    DAEMON_UID,
+    GROUP,
+    MEMBER,
+    STRANGER,
+    as_user,
+    python_for_others,
+)
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, mapped_around, reference
 from tests.support.other_account import SCANS, as_client
-from tests.support.patience import Patience
 
 pytestmark = pytest.mark.root
 MAPPERS = ADMINS
@@ -113,7 +120,7 @@ def settled(live: LiveMap, scan: int) -> ChunkInfo:
     place = drive(scan + 1)[scan][1][:3, 3]
     here = ChunkKey(*np.floor(place / (64 * RESOLUTION)).astype(int).tolist())
     live.move_to(*place)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(near := mapped_around(live, here)) != 27):
         pass
     return next(one for one in near if one.key == here)
@@ -213,7 +220,7 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
         assert row.problem, "what it would be put back from is somebody else's"
         assert f"{undo} is not a file of this user" in row.problem or "Permission denied" in row.problem
         undo.unlink(missing_ok=True)  # root removes it itself
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(client.live_maps()[0].problem != ""):
             pass
         assert held(client.live("lidar")) == before

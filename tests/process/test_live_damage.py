@@ -24,15 +24,12 @@ import shmmap
 from shmmap.errors import BadRequest, CannotWrite, LiveInterrupted
 from shmmap.protocol.live import LiveMapRow
 from tests.process.conftest import DaemonFactory
+from tests.support.command_line import doctor
+from tests.support.daemon_process import Deadline
+from tests.support.disks import HangingDirectory
 from tests.support.divided_map import DividedMap
-from tests.support.doctor_verb import doctor
-from tests.support.hanging_directory import HangingDirectory
-from tests.support.live_daemon import SETTINGS, LiveDaemon
-from tests.support.live_drive import FILTER, RESOLUTION, drive
-from tests.support.live_reference import held, reference
-from tests.support.patience import Patience
-from tests.support.slow_occupancy import Voxel
-from tests.support.stored_live_map import stored_drive
+from tests.support.live_drive import FILTER, RESOLUTION, Voxel, drive
+from tests.support.live_reference import LIVE_TOML, LiveDaemon, held, reference, stored_drive
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ def settings(tmp_path: Path, *names: str) -> Path:
     file = tmp_path / "shmmap.toml"
     file.write_text(
         "".join(
-            SETTINGS.format(resolution=RESOLUTION, checkpoint=0.2, path=tmp_path / name).replace(
+            LIVE_TOML.format(resolution=RESOLUTION, checkpoint=0.2, path=tmp_path / name).replace(
                 "lidar]", f"{name}]"
             )
             for name in names
@@ -151,7 +148,7 @@ def rows(client: shmmap.Client) -> dict[str, LiveMapRow]:
 
 def until_problems(client: shmmap.Client, names: set[str]) -> dict[str, LiveMapRow]:
     """Ask until these maps have problems, and no others."""
-    waiting, found = Patience(), rows(client)
+    waiting, found = Deadline(), rows(client)
     while waiting({name for name, row in found.items() if row.problem} != names):
         found = rows(client)
     return found
@@ -252,7 +249,7 @@ def test_a_directory_that_begins_to_hang(
             mapper.add(*scans[0])
             mapper.wait_durable()
         hang(tmp_path / "lidar")
-        waiting = Patience()
+        waiting = Deadline()
         while waiting("its directory" not in rows(client)["lidar"].problem):
             pass
         with client.live("good").mapper("front", FILTER) as mapper:
@@ -277,7 +274,7 @@ def test_a_full_disk_at_the_start_and_at_the_end(
     served = daemon(divided_map.root, "--config", str(settings(tmp_path, "full")), "--live-budget", "16M")
     with shmmap.connect(served.endpoint, timeout=60.0) as client:
         assert points_are_served(client)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting("No space left" not in rows(client)["full"].problem):
             pass
         filler.unlink()
@@ -286,7 +283,7 @@ def test_a_full_disk_at_the_start_and_at_the_end(
             for points, pose in scans:
                 mapper.add(points, pose)
             mapper.wait_applied()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting("cannot be saved: No space left" not in rows(client)["full"].problem):
             pass
     assert served.stop() == CannotWrite.exit_code
@@ -309,7 +306,7 @@ def test_a_directory_that_is_moved_or_replaced(live_daemon: LiveDaemon, tmp_path
             (tmp_path / "lidar").rename(away)
             assert "moved or removed" in until_problems(client, {"lidar"})["lidar"].problem
             (tmp_path / "lidar").mkdir()
-            waiting = Patience()
+            waiting = Deadline()
             while waiting("another one is in its place" not in rows(client)["lidar"].problem):
                 pass
             mapper.add(*scans[1])
@@ -369,7 +366,7 @@ def test_a_mapper_that_met_a_full_tmpfs_goes_on_when_there_is_room(
         live = client.live("lidar")
         with live.mapper("front", FILTER, timeout_s=0.3) as mapper:
             mapper.add(*scans[0])
-            waiting = Patience()
+            waiting = Deadline()
             while waiting(mapper.applied < 1):
                 pass
             filler = shm / "filler"

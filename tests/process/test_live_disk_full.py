@@ -11,10 +11,9 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held, reference
-from tests.support.patience import Patience
 
 
 @pytest.mark.root
@@ -34,7 +33,7 @@ def test_a_disk_that_is_full(
             for points, pose in scans:
                 mapper.add(points, pose)
             mapper.wait_applied()
-            waiting = Patience()
+            waiting = Deadline()
             while waiting("cannot be saved: No space left" not in (status := live.status()).problem):
                 pass
             assert status.scans == len(scans)

@@ -14,9 +14,9 @@ from shmmap.chunks.voxels import voxel_centers
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.live_drive import RESOLUTION
+from tests.support.live_reference import stored_drive
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
-from tests.support.stored_live_map import stored_drive
 
 Connect = Callable[..., RawClient]
 

@@ -24,11 +24,10 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.live_drive import RESOLUTION, marked
 from tests.support.live_mapper import marks_of
 from tests.support.live_reference import held
-from tests.support.patience import Patience
 
 KILLS = int(os.environ.get("SHMMAP_TEST_KILLS", "6"))
 SCANS_A_KILL = 12
@@ -78,7 +77,7 @@ class Mapper:
 
     def until(self, number: int) -> None:
         """Hear until that many scans are applied."""
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(self.applied < number and not self.done):
             self.hear(0.05)
 
@@ -143,10 +142,10 @@ def test_whoever_is_killed_whenever(keep: Callable[[], DaemonProcess]) -> None:
             elif (pid := worker_of(one)) is not None:
                 os.kill(pid, signal.SIGKILL)
             killed[who] += 1
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not mapper.done):
             if mapper.hear(1.0):
-                waiting = Patience()
+                waiting = Deadline()
     finally:
         mapper.end()
     assert mapper.applied == mapper.last

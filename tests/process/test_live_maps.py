@@ -24,12 +24,9 @@ from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT
-from tests.support.live_daemon import LiveDaemon, worker_of
-from tests.support.live_drive import FILTER, RESOLUTION, drive, marked
-from tests.support.live_reference import held, mapped_around, reference
-from tests.support.patience import Patience
-from tests.support.slow_occupancy import walk
+from tests.support.daemon_process import ROOT, Deadline
+from tests.support.live_drive import FILTER, RESOLUTION, drive, marked, walk
+from tests.support.live_reference import LiveDaemon, held, mapped_around, reference, worker_of
 
 
 def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -> None:
@@ -53,7 +50,7 @@ def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -
         origin = np.array(drive()[-1][1][:3, 3])
         live.move_to(*origin)
         here = ChunkKey(*np.floor(origin / (64 * RESOLUTION)).astype(int).tolist())
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(mapped_around(live, here)) < 27):
             pass
         near = np.array(
@@ -269,7 +266,7 @@ def test_what_is_no_marks_is_refused_and_costs_only_its_sender(
         with pytest.raises(BadRequest, match="frame 'map', not 'odom'"):
             client.live("lidar", frame_id="odom")
     with shmmap.connect(one.endpoint) as client:  # their files are gone with their sessions
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(any(name.startswith(mine) for name in os.listdir(directory))):
             client.live("lidar")
 
@@ -307,7 +304,7 @@ def test_requests_that_wait_when_the_worker_dies_are_told(live_daemon: LiveDaemo
         thread.start()
         asked.wait()
         with shmmap.connect(one.endpoint) as second:
-            waiting = Patience()
+            waiting = Deadline()
             while waiting(len([row for row in second.stats().sessions if row.requests > 1]) < 1):
                 pass
             assert second.metadata() is not None  # nobody else waits for the worker
@@ -364,7 +361,7 @@ def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon
     one.environment["NUMBA_CACHE_DIR"] = str(tmp_path / "no_kernels")
     one.launch()
     beats: set[int] = set()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(beats) < 3):
         with StatisticsReader(one.instance, one.shm_dir) as statistics:
             seen = statistics.snapshot(tables=False)

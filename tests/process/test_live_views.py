@@ -23,11 +23,10 @@ from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.live_daemon import LiveDaemon, worker_of
 from tests.support.live_drive import FILTER, drive
-from tests.support.patience import Patience
+from tests.support.live_reference import LiveDaemon, worker_of
 
 
 @pytest.fixture
@@ -55,7 +54,7 @@ def until(stream: EventStream, wanted: Callable[[Any], bool]) -> Any:
 
 def after(one: DaemonProcess, told: Callable[[LiveRow], bool]) -> LiveRow:
     """Wait until the statistics tell this of the live map."""
-    waiting = Patience()
+    waiting = Deadline()
     with StatisticsReader(one.instance, one.shm_dir) as reader:
         while waiting(not (rows := reader.snapshot(cells=False).live) or not told(rows[0])):
             os.sched_yield()

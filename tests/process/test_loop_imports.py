@@ -11,13 +11,11 @@ import shmmap
 from shmmap import MapWindow
 from shmmap.errors import ShmmapError
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import Shmmap
-from tests.support.daemon_process import ROOT
+from tests.support.command_line import Shmmap, publish
+from tests.support.daemon_process import ROOT, Deadline
 from tests.support.divided_map import make_map
-from tests.support.patience import Patience
-from tests.support.publishing import publish
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 WATCH_IMPORTS = """
 import os, sys
 fd = os.open(os.environ["IMPORTS_SEEN"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
@@ -40,14 +38,14 @@ def test_nothing_is_imported_while_it_serves(daemon: DaemonFactory, tmp_path: Pa
 
     operator = Shmmap(one, tmp_path)
     with MapWindow(one.endpoint, 30.0, name="driver") as window, shmmap.connect(one.endpoint) as client:
-        route, waiting = [(-120.0, 0.0), (120.0, 0.0)], Patience()
+        route, waiting = [(-120.0, 0.0), (120.0, 0.0)], Deadline()
         x = -100.0
         while waiting(operator.json("status")["counters"]["prefetch_used"] == 0 or x < 100.0):
-            window.move_to(x, 0, vx=10.0, route=route, wait=PATIENCE_S)
+            window.move_to(x, 0, vx=10.0, route=route, wait=TIMEOUT_S)
             x = x + 10.0 if x < 100.0 else -100.0
         window.move_to(0, 0, vx=10.0, vy=1.0)
-        assert client.around(0, 0, radius=500, wait=PATIENCE_S).cells
-        assert client.selected(["0_0.pcd", "none"], layers="voxel(leaf=1.0)", wait=PATIENCE_S).failed
+        assert client.around(0, 0, radius=500, wait=TIMEOUT_S).cells
+        assert client.selected(["0_0.pcd", "none"], layers="voxel(leaf=1.0)", wait=TIMEOUT_S).failed
         with pytest.raises(ShmmapError):
             client.around(0, 0, radius=10, layers="no such layer")
         made.change("0_0.pcd", seed=7)
@@ -71,11 +69,11 @@ def test_python_tuf_is_never_imported_by_a_daemon(daemon: DaemonFactory, tmp_pat
     one = daemon(store, "--trust", str(keys / "ROOT.json"), "--poll", "1", environment=environment)
     before = len(seen.read_text().splitlines())
     with shmmap.connect(one.endpoint) as client:
-        first = client.around(0, 0, radius=500, wait=PATIENCE_S).map_version
+        first = client.around(0, 0, radius=500, wait=TIMEOUT_S).map_version
         made.change("0_0.pcd", seed=7)
         publish(made.root, store, "--sign", str(keys))
-        waiting = Patience()
-        while waiting(client.around(0, 0, radius=500, wait=PATIENCE_S).map_version == first):
+        waiting = Deadline()
+        while waiting(client.around(0, 0, radius=500, wait=TIMEOUT_S).map_version == first):
             pass
         (store / "timestamp.json").unlink()
         with pytest.raises(ShmmapError):

@@ -21,7 +21,7 @@ from shmmap.errors import Offline
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.store import PROBE
 from tests.support.made_map import CELL_M, SHARD_M, MadeMap, serve_made_map
-from tests.support.published_map_reader import PublishedMapReader
+from tests.support.published_maps import PublishedMapReader
 from tests.support.slow_link import Plan, slow_link
 
 AWAY = [(0.0, 1e12)]

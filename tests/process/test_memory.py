@@ -6,8 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.process.conftest import DaemonFactory
+from tests.support.client_programs import FollowingClient
 from tests.support.divided_map import make_map
-from tests.support.following_client import FollowingClient
 from tests.support.process_costs import proportional_bytes, proportional_bytes_under
 
 PROCESSES = 8

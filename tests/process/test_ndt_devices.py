@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.ndt_programs import TownDrive, make_town_drive
 from tests.support.opencl_device import need_device
-from tests.support.town_drive import TownDrive, make_town_drive
 
 NDT = ["-m", "shmmap_clients.ndt_scan_matcher"]
 POSE_INIT = ["-m", "shmmap_clients.pose_initializer"]
@@ -77,7 +77,7 @@ def test_a_drive_goes_on_without_a_device_that_hangs(
     drive: TownDrive, daemon: DaemonFactory, tmp_path: Path
 ) -> None:
     one = daemon(drive.map_dir)
-    hanging = ["-m", "tests.support.hanging_device", "program"]
+    hanging = ["-m", "tests.support.opencl_device", "program"]
     words = [*follow(drive, one, tmp_path / "lines"), "--backend", "opencl", "--deadline", "2"]
     code, summary, err = run(*hanging, *words, "--fallback", "numba")
     assert summary is not None, err

@@ -28,11 +28,9 @@ import shmmap
 from shmmap.protocol.events import Evicted, Loaded
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import stop
-from tests.support.drive_sender import PERIOD_S, to_and_fro
+from tests.support.daemon_process import Deadline, stop
 from tests.support.forked_programs import run_verb
-from tests.support.patience import Patience
-from tests.support.town_drive import TownDrive, make_town_drive
+from tests.support.ndt_programs import PERIOD_S, TownDrive, make_town_drive, to_and_fro
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.ndt_scan_matcher"]
 
@@ -78,7 +76,7 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     words += ["--plot", str(tmp_path / "out.svg"), "--publish", address, "--listener-wait", "60", "--json"]
     words += ["--json-lines", str(tmp_path / "out.jsonl"), "--route", str(drive.truth)]
     listener = subprocess.Popen(
-        [sys.executable, "-m", "tests.support.pose_listener", address, "36"],
+        [sys.executable, "-m", "tests.support.ndt_programs", "listen", address, "36"],
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -124,7 +122,7 @@ def test_scans_and_odometry_come_from_another_process(
     words += ["--map-radius", "200", "--tum", str(tmp_path / "out.tum"), "--json"]
     sender = subprocess.Popen(
         [
-            *(sys.executable, "-m", "tests.support.drive_sender"),
+            *(sys.executable, "-m", "tests.support.ndt_programs", "send"),
             *(drive.scans, drive.truth, scans, odometry, poses),
         ]
     )
@@ -204,7 +202,7 @@ def test_a_map_that_is_long_in_coming_is_waited_for(drive: TownDrive, daemon: Da
     parent = one.loaders_parent()
     stop(parent)
     stopped = [parent, *one.stop_loaders()]
-    waiting = Patience()
+    waiting = Deadline()
     with (
         StatisticsReader(one.instance, one.shm_dir) as statistics,
         MapUpdater(one.endpoint, rules) as maps,
@@ -246,7 +244,7 @@ def test_the_daemon_fetches_what_lies_ahead(
 
         maps.map_at(x, y, vx=5.0)
         until(Loaded)
-        before, waiting = statistics.snapshot(tables=False).counters["requests"], Patience()
+        before, waiting = statistics.snapshot(tables=False).counters["requests"], Deadline()
         while waiting(statistics.snapshot(tables=False).counters["requests"] < before + 4):  # one a second
             pass
         client.evict(cell.id)
@@ -289,6 +287,7 @@ def test_without_a_daemon_the_program_says_so(drive: TownDrive, tmp_path: Path) 
 def test_many_clients_share_one_map(daemon: DaemonFactory, tmp_path: Path) -> None:
     town = make_town_drive(tmp_path, blocks=(4, 4), density=4.0, frames=8, step=12.0)
     one = daemon(town.map_dir)
+    localize = [sys.executable, "-m", "tests.support.ndt_programs", "localize"]
     clients = []
     for number, pose in enumerate(town.poses):
         guess = pose + np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.02])
@@ -299,7 +298,7 @@ def test_many_clients_share_one_map(daemon: DaemonFactory, tmp_path: Path) -> No
                 words,
                 scan,
                 subprocess.Popen(
-                    [sys.executable, "-m", "tests.support.ndt_client", one.endpoint, scan, words, "1000"],
+                    [*localize, one.endpoint, scan, words, "1000"],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     text=True,

@@ -15,7 +15,7 @@ from shmmap_clients.scans.trajectory import tum_line
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.forked_programs import run_verb
-from tests.support.town_drive import TownDrive, make_town_drive
+from tests.support.ndt_programs import TownDrive, make_town_drive
 
 BEFORE, GONE, FRAMES = 7, 6, 20
 KEPT = [*range(BEFORE), *range(BEFORE + GONE, FRAMES)]

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import ROOT, until
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.waiting import until
 
 UID = 50000 + os.getpid() % 10000  # of each process that tests another one
 PLACE = Path(f"/tmp/shmmap-{UID}")  # what is tested

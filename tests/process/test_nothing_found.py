@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.cloud_bytes import write_las
 from tests.support.command_line import Shmmap
-from tests.support.divided_map import DividedMap, make_map
-from tests.support.las_files import write_las
-from tests.support.patience import Patience
-from tests.support.pcd_files import read_pcd
+from tests.support.daemon_process import Deadline
+from tests.support.divided_map import DividedMap, make_map, read_pcd
 
 FAR = ("--circle", "9000,-70,5")
 MAP = "the map spans x -60 .. 60 m, y -60 .. 60 m"
@@ -64,7 +63,7 @@ def test_what_is_empty_and_yet_an_answer(shmmap: Shmmap) -> None:
     names = [cell["id"] for cell in held]
     assert shmmap.json("query", "--circle", "0,0,5", "--held", *names)["cells"] == []
     assert shmmap("unpin", "--circle", "0,0,5") == "nothing is pinned\n"
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not shmmap.json("ls")["cells"]):  # the table is written a few times a second
         pass
     done = shmmap.run("ls", "--circle", "-50,-50,5")
@@ -160,7 +159,7 @@ def test_a_client_that_asks_for_more_than_its_part(daemon: DaemonFactory, tmp_pa
 
 def until(shmmap: Shmmap, word: str) -> list[str]:
     """Lines of `status`, once one begins with a word: the statistics follow a few times a second."""
-    waiting = Patience()
+    waiting = Deadline()
     lines: list[str] = []
     while waiting(not any(line.startswith(word) for line in lines)):
         lines = shmmap("status").splitlines()

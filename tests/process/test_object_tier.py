@@ -27,7 +27,7 @@ USER = """
 import random, sys
 from tests.process.test_object_tier import LIMIT, objects
 from shmmap.origin.remote.object_tier import ObjectTier
-from tests.support.trimming import wait_for_trimming
+from tests.support.map_stores import wait_for_trimming
 cache, seed, rounds = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 tier, made, random_ = ObjectTier(cache, limit_bytes=LIMIT), objects(), random.Random(seed)
 hits = 0

@@ -27,15 +27,15 @@ from shmmap.client.map_listing import MapListing
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.patience import Patience
 
 DEADLINE_S = 60.0
 
 
 def after(shmmap: Shmmap, told: Callable[[dict[str, int]], bool]) -> dict[str, int]:
     """Wait for a beat that tells this; returns its counters."""
-    waiting = Patience()
+    waiting = Deadline()
     with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
         while waiting(not told(reader.snapshot(tables=False).counters)):
             os.sched_yield()
@@ -44,7 +44,7 @@ def after(shmmap: Shmmap, told: Callable[[dict[str, int]], bool]) -> dict[str, i
 
 def until_shown(shmmap: Shmmap, count: int) -> None:
     """Wait until the table of what is in memory has so many rows: it follows what happens a little later."""
-    waiting = Patience()
+    waiting = Deadline()
     with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
         while waiting(len(reader.snapshot().cells) < count):
             os.sched_yield()
@@ -137,7 +137,7 @@ def test_tail_follows(shmmap: Shmmap, divided_map: DividedMap) -> None:
     ) as tail:  # fmt: skip
         try:
             assert tail.stdout is not None
-            waiting = Patience()
+            waiting = Deadline()
             seen: list[str] = []
             with client_library.connect(shmmap.daemon.endpoint, name="driver") as client:
                 while waiting("loaded" not in seen):

@@ -15,9 +15,8 @@ import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.accounts import ADMINS, GROUP, MEMBER
-from tests.support.daemon_process import ROOT, DaemonProcess, wait_ended
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline, wait_ended
 from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -29,7 +28,7 @@ def pins(client: RawClient) -> dict[str, str]:
 
 
 def wait_for_pins(client: RawClient, expected: dict[str, str]) -> None:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(pins(client) != expected):
         client.ask("stats")
 
@@ -84,7 +83,7 @@ def test_a_pinned_cell_that_changes_is_loaded_again(
     before = one.segments()
     divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(99), (0, 0), 700))
     assert client.ask("reload")[3] == 1
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(one.segments() == before or pins(client) != {"0_0.pcd": "resident"}):
         client.ask("stats")
 

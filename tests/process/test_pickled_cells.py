@@ -25,10 +25,9 @@ import pytest
 import shmmap
 from shmmap.client import handed_over
 from shmmap.errors import BadRequest, StaleHandle
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
 from tests.support.pages import read_page
-from tests.support.patience import Patience
 from tests.support.process_costs import mappings_under
 
 Factory = Callable[..., DaemonProcess]
@@ -119,7 +118,7 @@ def evicted(client: shmmap.Client) -> bytes:
     """Return a cell that was pickled, and dropped and evicted since."""
     data = pickle.dumps(client.selected("0_0.pcd", wait=60)[0])
     client.evict()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(attaches(data)):
         pass
     return data

@@ -15,9 +15,9 @@ import pytest
 import shmmap
 from shmmap.daemon.host.inotify import NAME_GONE, Inotify
 from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -36,7 +36,7 @@ def test_evicting_everything_frees_what_nobody_maps(
         assert (evicted[2], evicted[3]) == (len(handles) - 2, 2)
         one.until_segments(2, lambda: client.ask("stats"))
         assert all(name.endswith(".zombie") for name in one.segments())
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(client.ask("stats")[4]["zombies"] != 2):  # gauges are written a few times a second
             pass
         os.kill(reader.pid, signal.SIGSTOP)
@@ -66,13 +66,13 @@ def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unk
         one.start()
         client.hello()
         # while a loader compares it with its checksums, who else has it cannot be told
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((stats := client.ask("stats"))[6] == 0):
             pass
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
         client.ask("evict")
         assert len(one.segments()) == 1
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((stats := client.ask("stats"))[6] == 0):
             pass
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
@@ -112,12 +112,12 @@ def test_names_removed_behind_the_daemon_s_back(
         for handle in handles if at_once else handles[:1]:
             os.unlink(client.path(handle))
         again = client.area(circle(0, 0, 25)).cells
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not all(Path(client.path(handle)).exists() for handle in again)):
             again = client.area(circle(0, 0, 25)).cells
         assert again[0].segment != handles[0].segment
         assert reader.checksums() == [expected]
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(client.ask("stats")[4]["bytes_resident"] != one.segment_bytes()):
         pass
 
@@ -152,7 +152,7 @@ def test_a_retired_segment_goes_when_its_reader_does_without_a_request(
         client.ask("evict")
         assert len(one.segments()) == 1
         events.add(one.shm_dir, NAME_GONE)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(bool(one.segments())):
         select.select([events.fd], [], [], 1.0)
         events.read()

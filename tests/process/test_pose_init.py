@@ -18,7 +18,7 @@ from shmmap_clients.scans.scan_file import read_scan
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.forked_programs import run_verb
-from tests.support.town_drive import TownDrive, make_town_drive
+from tests.support.ndt_programs import TownDrive, make_town_drive
 
 
 @pytest.fixture(scope="module")

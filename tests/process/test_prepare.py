@@ -21,7 +21,7 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, wait_ended
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.forked_programs import run_verb
-from tests.support.offered_kinds import install
+from tests.support.layer_oracles import install
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 

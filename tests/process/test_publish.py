@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from shmmap.layers.build import build_layer
-from tests.support.bucket_server import BucketServer
+from tests.support.clouds import cloud_file, xyzircaedt
+from tests.support.command_line import Verbs, files_of, locked, make_older
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.published_map_reader import PublishedMapReader, columns_of
-from tests.support.publishing import make_older
-from tests.support.publishing_verbs import Shmmap, files_of, locked
+from tests.support.map_stores import BucketServer
+from tests.support.published_maps import PublishedMapReader, columns_of
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -41,7 +41,7 @@ def _stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Where the town is published, and where two more versions of it are."""
     folder = tmp_path_factory.mktemp("published")
     made = make_map(folder / "town", columns=2, rows=2, points=300)
-    run = Shmmap(folder)
+    run = Verbs(folder)
     run("publish", made.root, folder / "one", "--id-prefix", "/store/")
     shutil.copytree(folder / "one", folder / "three")
     for seed in (1, 2):
@@ -82,9 +82,7 @@ def check(store: Path, town: DividedMap, prefix: str = "/store/") -> PublishedMa
 
 
 @pytest.mark.usefixtures("layer_kernels")
-def test_another_reader_finds_every_layer_bit_by_bit(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path
-) -> None:
+def test_another_reader_finds_every_layer_bit_by_bit(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
     done = shmmap.json("publish", town.root, tmp_path / "store", "--layer", NDT, "voxel(leaf=1.0)")
     assert (done["changed"], done["version"], done["cells"], done["failed"]) == (True, 1, 4, [])
     assert done["layers"] == ["points", NDT, "voxel(leaf=1.0)"]
@@ -102,7 +100,7 @@ def test_another_reader_finds_every_layer_bit_by_bit(
 
 
 def test_the_same_map_is_nothing_changed_wherever_it_lies(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
+    shmmap: Verbs, town: DividedMap, tmp_path: Path, buckets: BucketServer
 ) -> None:
     """Objects that the server receives: none, none, none; of one changed cell five."""
     url = buckets.url("received")
@@ -162,7 +160,7 @@ def recompressed(store: Path) -> None:
     (store / f"versions/{current['version']}.json").write_text(json.dumps({**entry, **current}))
 
 
-def test_after_another_release_of_zstd_no_cell_is_sent(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+def test_after_another_release_of_zstd_no_cell_is_sent(shmmap: Verbs, town: DividedMap, store: Path) -> None:
     before = PublishedMapReader(store)
     recompressed(store)
     versions = {cell_id: cell.versions for cell_id, cell in check(store, town).cells.items()}
@@ -173,7 +171,7 @@ def test_after_another_release_of_zstd_no_cell_is_sent(shmmap: Shmmap, town: Div
     check(store, town)
 
 
-def test_cells_that_come_move_and_go(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+def test_cells_that_come_move_and_go(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
     store = tmp_path / "store"
     shmmap("publish", town.root, store, "--id-prefix", "/city/")
     points = town.points("0_0.pcd")
@@ -187,7 +185,7 @@ def test_cells_that_come_move_and_go(shmmap: Shmmap, town: DividedMap, tmp_path:
     assert "begin with /city/" in errors
 
 
-def test_one_cloud_is_a_map(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+def test_one_cloud_is_a_map(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
     shmmap("publish", town.pcd_dir / "0_0.pcd", f"file://{tmp_path}/store/", "--id-prefix", "/one/")
     (cell,) = PublishedMapReader(tmp_path / "store").cells.values()
     assert cell.points == 300
@@ -195,7 +193,7 @@ def test_one_cloud_is_a_map(shmmap: Shmmap, town: DividedMap, tmp_path: Path) ->
     assert shmmap.json("publish", tmp_path / "back", tmp_path / "store")["changed"] is False
 
 
-def test_names_of_any_language_in_folders_of_their_own(shmmap: Shmmap, tmp_path: Path) -> None:
+def test_names_of_any_language_in_folders_of_their_own(shmmap: Verbs, tmp_path: Path) -> None:
     town = make_map(tmp_path / "town", columns=1, rows=1, points=50)
     points = town.points("0_0.pcd")
     for folder, name, corner in (("süd", "straße 1.pcd", (-20, 0)), ("nord/a", "'x': y.pcd", (20, 0))):
@@ -216,7 +214,7 @@ def test_names_of_any_language_in_folders_of_their_own(shmmap: Shmmap, tmp_path:
 
 
 def test_a_map_that_was_copied_without_its_history_goes_on(
-    shmmap: Shmmap, town: DividedMap, three: Path
+    shmmap: Verbs, town: DividedMap, three: Path
 ) -> None:
     shutil.rmtree(three / "versions")
     rows = shmmap.json("versions", three)["versions"]
@@ -229,7 +227,7 @@ def test_a_map_that_was_copied_without_its_history_goes_on(
     check(three, town)
 
 
-def test_a_cell_that_cannot_be_read_publishes_nothing(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+def test_a_cell_that_cannot_be_read_publishes_nothing(shmmap: Verbs, town: DividedMap, store: Path) -> None:
     before = (store / "CURRENT").read_bytes()
     (town.pcd_dir / "0_0.pcd").write_bytes(b"# .PCD v0.7\nnot a cloud\n")
     done = shmmap.json("publish", town.root, store, code=1)
@@ -239,7 +237,7 @@ def test_a_cell_that_cannot_be_read_publishes_nothing(shmmap: Shmmap, town: Divi
     assert "the current version stays" in shmmap("publish", town.root, store, code=1)
 
 
-def test_what_is_damaged_in_the_store_is_sent_again(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+def test_what_is_damaged_in_the_store_is_sent_again(shmmap: Verbs, town: DividedMap, store: Path) -> None:
     for damaged in (store / "blobs/sha256").iterdir():
         damaged.write_bytes(b"")
     assert "has 0 bytes" in shmmap("publish", town.root, store, code=65)
@@ -260,7 +258,7 @@ PUBLISH_STEPS = (
 
 @pytest.mark.parametrize("label", PUBLISH_STEPS)
 def test_killed_anywhere_the_current_version_is_whole(
-    label: str, shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+    label: str, shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
 ) -> None:
     before = make_map(tmp_path / "before", columns=2, rows=2, points=300)
     for seed, name in enumerate(list(town.corners)[:2]):
@@ -277,7 +275,7 @@ def test_killed_anywhere_the_current_version_is_whole(
 
 
 def test_killed_while_cells_are_sent_it_goes_on(
-    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
 ) -> None:
     before = make_map(tmp_path / "before", columns=2, rows=2, points=300)
     for seed, name in enumerate(town.corners):
@@ -295,7 +293,7 @@ def test_killed_while_cells_are_sent_it_goes_on(
 
 
 def test_a_worker_that_is_killed_costs_nothing(
-    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
 ) -> None:
     for seed, name in enumerate(town.corners):
         town.change(name, seed)
@@ -307,7 +305,7 @@ def test_a_worker_that_is_killed_costs_nothing(
 
 
 def test_of_two_publishers_one_wins_and_the_other_learns_it(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
+    shmmap: Verbs, town: DividedMap, tmp_path: Path, buckets: BucketServer
 ) -> None:
     other = make_map(tmp_path / "other", columns=2, rows=2, points=300, seed=9)
     url = buckets.url("raced")
@@ -323,7 +321,7 @@ def test_of_two_publishers_one_wins_and_the_other_learns_it(
     assert back in (files_of(town.pcd_dir), files_of(other.pcd_dir))
 
 
-def before_its_switch(shmmap: Shmmap, town: DividedMap, store: Path) -> subprocess.Popen[str]:
+def before_its_switch(shmmap: Verbs, town: DividedMap, store: Path) -> subprocess.Popen[str]:
     """A publisher of version 2 that waits for the store's lock."""
     process = shmmap.start("publish", town.root, store)
     while not (store / "versions/2.json").exists():
@@ -332,7 +330,7 @@ def before_its_switch(shmmap: Shmmap, town: DividedMap, store: Path) -> subproce
     return process
 
 
-def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+def test_the_slower_of_two_publishers_changes_nothing(shmmap: Verbs, town: DividedMap, store: Path) -> None:
     """It is stopped before its switch, while the other one publishes."""
     town.change("0_0.pcd", seed=1)
     with locked(store):
@@ -351,7 +349,7 @@ def test_the_slower_of_two_publishers_changes_nothing(shmmap: Shmmap, town: Divi
     assert shmmap.json("publish", town.root, store)["version"] == 4
 
 
-def test_an_interrupted_run_says_how_to_go_on(shmmap: Shmmap, town: DividedMap, store: Path) -> None:
+def test_an_interrupted_run_says_how_to_go_on(shmmap: Verbs, town: DividedMap, store: Path) -> None:
     town.change("0_0.pcd", seed=1)
     with locked(store):
         process = before_its_switch(shmmap, town, store)
@@ -364,7 +362,7 @@ def test_an_interrupted_run_says_how_to_go_on(shmmap: Shmmap, town: DividedMap, 
 
 @pytest.mark.root
 def test_a_full_disk_leaves_the_current_version(
-    shmmap: Shmmap, town: DividedMap, store: Path, private_tmpfs: Callable[[str], str]
+    shmmap: Verbs, town: DividedMap, store: Path, private_tmpfs: Callable[[str], str]
 ) -> None:
     small = Path(private_tmpfs("200k")) / "store"
     shutil.copytree(store, small)
@@ -380,7 +378,7 @@ def test_a_full_disk_leaves_the_current_version(
 # --- versions -----------------------------------------------------------------------------------------
 
 
-def test_going_back_is_a_new_number(shmmap: Shmmap, town: DividedMap, three: Path, tmp_path: Path) -> None:
+def test_going_back_is_a_new_number(shmmap: Verbs, town: DividedMap, three: Path, tmp_path: Path) -> None:
     before = make_map(tmp_path / "before", columns=2, rows=2, points=300)
     for label in ("restore.entry", "restore.looked", "version.switch"):
         shmmap("versions", three, "--rollback", "1", code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
@@ -402,7 +400,7 @@ def test_going_back_is_a_new_number(shmmap: Shmmap, town: DividedMap, three: Pat
 
 
 def test_a_version_that_is_not_whole_does_not_come_back(
-    shmmap: Shmmap, town: DividedMap, three: Path, store: Path
+    shmmap: Verbs, town: DividedMap, three: Path, store: Path
 ) -> None:
     """An object that version 1 has and version 3 has not is gone."""
     first = {cell.columns["points"]["xyz"].tobytes() for cell in PublishedMapReader(store).cells.values()}
@@ -420,7 +418,7 @@ def test_a_version_that_is_not_whole_does_not_come_back(
 
 @pytest.mark.parametrize("label", ["", "prune.entry", "prune.listed", "prune.object"])
 def test_pruning_takes_what_only_old_versions_have(
-    label: str, shmmap: Shmmap, town: DividedMap, three: Path, tmp_path: Path
+    label: str, shmmap: Verbs, town: DividedMap, three: Path, tmp_path: Path
 ) -> None:
     names = set(os.listdir(three / "blobs/sha256"))
     if not label:
@@ -447,7 +445,7 @@ def test_pruning_takes_what_only_old_versions_have(
 
 
 def test_pruning_spares_what_is_young_and_what_is_being_published(
-    shmmap: Shmmap, town: DividedMap, store: Path
+    shmmap: Verbs, town: DividedMap, store: Path
 ) -> None:
     make_older(store, 99, 1)
     town.change("0_0.pcd", seed=1)
@@ -466,7 +464,7 @@ def test_pruning_spares_what_is_young_and_what_is_being_published(
 
 
 def test_what_a_daemon_keeps_on_the_disk_is_not_fetched(
-    shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
 ) -> None:
     """And nothing that is fetched is put there."""
     from shmmap.origin.remote.object_tier import ObjectTier  # needs zstandard
@@ -490,7 +488,7 @@ def test_what_a_daemon_keeps_on_the_disk_is_not_fetched(
 
 
 def test_fetched_files_have_every_field_bit_by_bit(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path, web: tuple[str, Path]
+    shmmap: Verbs, town: DividedMap, tmp_path: Path, web: tuple[str, Path]
 ) -> None:
     url, folder = web
     shmmap("publish", town.root, folder / "town")
@@ -509,8 +507,7 @@ def test_fetched_files_have_every_field_bit_by_bit(
     assert not list(tmp_path.glob(".*fetching*"))
 
 
-def test_a_divided_cloud_keeps_its_frame(shmmap: Shmmap, tmp_path: Path) -> None:
-    from tests.support.clouds import cloud_file, xyzircaedt
+def test_a_divided_cloud_keeps_its_frame(shmmap: Verbs, tmp_path: Path) -> None:
 
     columns = xyzircaedt(500)
     for axis, shift in (("x", 390_000), ("y", 5_820_000)):
@@ -530,7 +527,7 @@ def test_a_divided_cloud_keeps_its_frame(shmmap: Shmmap, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("label", ["fetch.cell:3", "fetch.whole", "fetch.renamed"])
 def test_a_fetch_that_is_killed_goes_on(
-    label: str, shmmap: Shmmap, town: DividedMap, store: Path, tmp_path: Path
+    label: str, shmmap: Verbs, town: DividedMap, store: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "back"
     shmmap("fetch", store, out, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
@@ -541,7 +538,7 @@ def test_a_fetch_that_is_killed_goes_on(
     assert files_of(out / "pointcloud_map.pcd") == files_of(town.pcd_dir)
 
 
-def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Shmmap, store: Path, tmp_path: Path) -> None:
+def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Verbs, store: Path, tmp_path: Path) -> None:
     blobs = store / "blobs/sha256"
     largest = max(blobs.iterdir(), key=lambda path: path.stat().st_size)
     whole = largest.read_bytes()
@@ -561,7 +558,7 @@ def test_what_is_damaged_or_gone_is_not_fetched(shmmap: Shmmap, store: Path, tmp
 # --- wrong usage and what is missing ------------------------------------------------------------------
 
 
-def test_urls_that_cannot_be_meant(shmmap: Shmmap, town: DividedMap) -> None:
+def test_urls_that_cannot_be_meant(shmmap: Verbs, town: DividedMap) -> None:
     for url, says in (
         ("s3://key:hunter2@maps/town", "may hold a secret"),
         ("ftp://maps/town", "cannot lie at ftp://"),
@@ -574,7 +571,7 @@ def test_urls_that_cannot_be_meant(shmmap: Shmmap, town: DividedMap) -> None:
 
 
 def test_what_is_wrong_is_said_before_anything_is_sent(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, tmp_path: Path
 ) -> None:
     store = tmp_path / "store"
     assert "unknown layer 'ntd'" in shmmap("publish", town.root, store, "--layer", "ntd(leaf=2.0)", code=2)
@@ -583,7 +580,7 @@ def test_what_is_wrong_is_said_before_anything_is_sent(
     assert not store.exists()
 
 
-def test_a_store_that_does_not_answer(shmmap: Shmmap) -> None:
+def test_a_store_that_does_not_answer(shmmap: Verbs) -> None:
     pytest.importorskip("obstore", reason="obstore is not installed")
     errors = shmmap(
         "versions",
@@ -601,7 +598,7 @@ def test_a_store_that_does_not_answer(shmmap: Shmmap) -> None:
 
 @pytest.mark.parametrize("package", ["obstore", "zstandard"])
 def test_without_the_packages_a_url_says_what_to_install(
-    package: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
+    package: str, shmmap: Verbs, town: DividedMap, tmp_path: Path
 ) -> None:
     (tmp_path / "without").mkdir()
     (tmp_path / "without" / f"{package}.py").write_text(f"raise ModuleNotFoundError(name={package!r})\n")

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.support.command_line import Verbs
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.open3d_package import open3d_or_skip
-from tests.support.published_map_reader import PublishedMapReader
-from tests.support.publishing_verbs import Shmmap
+from tests.support.published_maps import PublishedMapReader
+from tests.support.skips import open3d_or_skip
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -28,7 +28,7 @@ def options(layers: tuple[str, ...]) -> list[str]:
 
 
 def test_points_are_rounded_and_layers_are_of_the_rounded_points(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, tmp_path: Path
 ) -> None:
     open3d_or_skip()
     layers = (*LAYERS, "normals(radius=2.0)")  # which looks into the neighbour
@@ -62,7 +62,7 @@ def test_points_are_rounded_and_layers_are_of_the_rounded_points(
                 assert columns[name].tobytes() == other[name].tobytes(), (layer, name)
 
 
-def test_the_encoding_stays_until_another_is_named(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+def test_the_encoding_stays_until_another_is_named(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
     store = tmp_path / "store"
 
     def publish(*words: str) -> tuple[int, bool, str, int]:
@@ -80,7 +80,7 @@ def test_the_encoding_stays_until_another_is_named(shmmap: Shmmap, town: Divided
     assert "invalid choice" in shmmap("publish", town.root, store, "--encoding", "cm", code=2)
 
 
-def test_cells_that_have_to_stay_exact_do(shmmap: Shmmap, tmp_path: Path) -> None:
+def test_cells_that_have_to_stay_exact_do(shmmap: Verbs, tmp_path: Path) -> None:
     """A cell of 100 m beside one of 20 m, say: one map, both kinds."""
     town = make_map(tmp_path / "town", columns=2, rows=1, points=500)
     wide = town.points("0_0.pcd")

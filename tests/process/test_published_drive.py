@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.command_line import publish
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.faulty_web import faulty_web
-from tests.support.patience import Patience
-from tests.support.publishing import publish
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
+from tests.support.web_servers import faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -143,6 +143,6 @@ def test_every_reply_is_the_set_difference(
 
 
 def until_back(driver: Driver, x: float, states: dict[int, State]) -> None:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not driver.step(x, states, 5.0)):
         pass

@@ -14,13 +14,10 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import Shmmap
-from tests.support.daemon_process import DaemonProcess
+from tests.support.command_line import Shmmap, publish
+from tests.support.daemon_process import DaemonProcess, Deadline, counters
 from tests.support.divided_map import make_map
-from tests.support.faulty_web import FaultyWeb, faulty_web
-from tests.support.patience import Patience
-from tests.support.publishing import publish
-from tests.support.waiting import counters
+from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -40,7 +37,7 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
 
 def until(one: DaemonProcess, is_so: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
     """Wait for counters of which ``is_so`` is true; returns them."""
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not is_so(counters(one))):
         time.sleep(0.02)
     return counters(one)
@@ -79,7 +76,7 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
         CELLS,
     )
     taken_ns = counts["published_taken_unix_ns"]
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not list(one.state_dir.rglob("*.taken"))):
         time.sleep(0.02)
 
@@ -110,7 +107,7 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
     before_ns = time.time_ns()
     web.refuse()
     with shmmap.connect(one.endpoint) as client:
-        waiting = Patience()
+        waiting = Deadline()
         while waiting([failure.code for failure in client.area(ALL, wait=5.0).failed] != ["offline"]):
             time.sleep(0.05)
     counts = until(one, lambda counts: counts["origin_out"] == 1 and counts["fetches_failed"] > 2)
@@ -169,7 +166,7 @@ def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
     shutil.rmtree(one.cache_dir)
     with shmmap.connect(one.endpoint) as client:
         evict_all(one, client)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(client.area(ALL, wait=5.0).failed) != CELLS):
             evict_all(one, client)  # the counters were of before, and what was evicted was used again
     until(one, lambda counts: counts["origin_out"] == 1)

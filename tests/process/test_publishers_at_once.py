@@ -15,7 +15,7 @@ from shmmap.errors import BadRequest, InstanceBusy, MapMissing, ShmmapError
 from shmmap.origin.map_directory import open_map
 from tests.process.conftest import Meanwhile
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.published_map_reader import PublishedMapReader
+from tests.support.published_maps import PublishedMapReader
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
 from tests.support.raw_client import DaemonError, RawClient, circle
-from tests.support.segment_reader import map_segment, parse
-from tests.support.served_cells import assert_same_points, names
+from tests.support.segment_reader import assert_same_points, map_segment, names, parse
 
 Connect = Callable[..., RawClient]
 
@@ -76,7 +75,7 @@ def test_the_signal(daemon: DaemonFactory, connect: Connect, divided_map: Divide
     divided_map.change("0_0.pcd", 5)
     one.send(signal.SIGHUP)
     reply = client.selected(["0_0.pcd"])
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(reply.map_version == old.map_version):
         reply = client.selected(["0_0.pcd"])
     assert_same_points(client, reply.cells[0], divided_map)
@@ -158,7 +157,7 @@ def test_old_versions_stay_while_somebody_maps_them(
         new = client.selected(["0_0.pcd"]).cells[0]
         assert new.segment != old.segment
         assert reader.checksums() == before
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not any(name.endswith(".zombie") for name in one.segments())):
             client.ask("stats")
         assert len(one.segments()) == 2

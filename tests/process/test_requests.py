@@ -13,8 +13,8 @@ from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
 from tests.support.message_pack import pack
-from tests.support.raw_client import DaemonError, RawClient, circle, square
-from tests.support.served_cells import assert_same_points, names
+from tests.support.raw_client import DaemonError, RawClient, circle
+from tests.support.segment_reader import assert_same_points, names
 
 Connect = Callable[..., RawClient]
 
@@ -32,20 +32,6 @@ def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMa
     assert client.budget_bytes > 0
 
 
-def test_area_answers_bit_identical_cells(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
-    for x, y, radius in ((0.0, 0.0, 25.0), (-60.0, 60.0, 0.0), (13.0, -7.5, 40.0), (500.0, 0.0, 10.0)):
-        reply = client.area(circle(x, y, radius))
-        assert names(reply.cells) == divided_map.in_circle(x, y, radius)
-        assert (reply.pending, reply.failed, reply.removed) == ([], [], [])
-        for handle in reply.cells:
-            assert_same_points(client, handle, divided_map)
-        squared = client.area(square(x, y, radius))
-        assert names(squared.cells) == divided_map.in_square(x, y, radius)
-
-
 def test_heights_leave_out_cells_once_they_are_known(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
@@ -55,18 +41,6 @@ def test_heights_leave_out_cells_once_they_are_known(
     assert everything == divided_map.in_circle(0, 0, 25)
     assert client.area(circle(0, 0, 25, (100.0, 200.0)), wait=None).cells == []
     assert names(client.area(circle(0, 0, 25, (4.0, 4.5)), wait=None).cells) == everything
-
-
-def test_selected_keeps_order_and_duplicates(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
-    asked = ["20_20.pcd", divided_map.id("0_0.pcd"), "20_20.pcd", "nowhere.pcd", "-60_-60.pcd"]
-    reply = client.selected(asked)
-    assert names(reply.cells) == ["20_20.pcd", "0_0.pcd", "20_20.pcd", "-60_-60.pcd"]
-    assert reply.cells[0] == reply.cells[2]
-    assert [(f.id, f.code) for f in reply.failed] == [("nowhere.pcd", "unknown_cell")]
-    assert client.selected([]).cells == []
 
 
 def test_differential_is_the_set_difference_at_every_step(
@@ -117,20 +91,6 @@ def test_differential_removes_what_it_does_not_know(
     assert (len(reply.cells), reply.removed) == (len(first.cells), [])
 
 
-def test_without_waiting_the_rest_is_pending_and_comes_later(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
-    wanted = divided_map.in_circle(0, 0, 40)
-    first = client.area(circle(0, 0, 40), wait=None)
-    pending = {i.rsplit("/", 1)[1] for i, _ in first.pending}
-    assert pending | set(names(first.cells)) == set(wanted)
-    assert pending
-    assert names(client.area(circle(0, 0, 40)).cells) == wanted
-    again = client.area(circle(0, 0, 40), wait=None)
-    assert (names(again.cells), again.pending) == (wanted, [])
-
-
 def test_metadata_pages(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     client = connect(daemon(divided_map.root))
     rows: list[list[Any]] = []
@@ -149,24 +109,6 @@ def test_metadata_pages(daemon: DaemonFactory, connect: Connect, divided_map: Di
         assert row[6] == (divided_map.pcd_dir / name).stat().st_size
     part = client.ask("metadata", circle(0, 0, 25))
     assert [(client.id_prefix + r[0]).rsplit("/", 1)[1] for r in part[4]] == divided_map.in_circle(0, 0, 25)
-
-
-def test_show_and_stats(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    client = connect(daemon(divided_map.root), name="visitor")
-    handle = client.selected(["0_0.pcd"]).cells[0]
-    shown = client.ask("show", "0_0.pcd")
-    assert shown[2:4] == [divided_map.id("0_0.pcd"), handle.version]
-    (segment,) = shown[9]
-    assert segment[:4] == ["points", handle.version, handle.segment, "resident"]
-    stats = client.ask("stats")
-    assert stats[4]["handles_sent"] == 1
-    assert stats[4]["loads_finished"] == 1
-    (session,) = stats[5]
-    assert session[0] == client.session
-    assert session[4] == "visitor"
-    with pytest.raises(DaemonError) as failure:
-        client.ask("show", "nowhere")
-    assert failure.value.code == "unknown_cell"
 
 
 NONSENSE: list[list[Any]] = [

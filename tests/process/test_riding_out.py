@@ -13,12 +13,10 @@ import pytest
 import shmmap
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.command_line import publish
+from tests.support.daemon_process import DaemonProcess, Deadline, counters
 from tests.support.divided_map import DividedMap, random_points
-from tests.support.faulty_web import FaultyWeb, faulty_web
-from tests.support.patience import Patience
-from tests.support.publishing import publish
-from tests.support.waiting import counters
+from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -27,7 +25,7 @@ SIZE, ROAD_M, SHARDS = 20, 1400, 20
 SPEED, RIDE_OUT_S, RADIUS, STEP = 20.0, 30.0, 6.0, 20
 ROUTE = [(0.0, 10.0), (float(ROAD_M), 10.0)]
 DRIVEN_M = int(SPEED * RIDE_OUT_S)
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture
@@ -50,7 +48,7 @@ def in_memory(one: DaemonProcess) -> set[str]:
 
 
 def until_in_memory(one: DaemonProcess, *names: str) -> None:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not set(names) <= in_memory(one)):
         time.sleep(0.02)
 
@@ -59,7 +57,7 @@ def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
     """Drive through the outage, no faster than a vehicle could."""
     for x in range(STEP, DRIVEN_M, STEP):
         until_in_memory(one, f"{x - STEP}_0.pcd", f"{x}_0.pcd")
-        update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S)
+        update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S)
         assert update.complete, (x, update.failed)
     counts = counters(one)
     assert counts["cells_late"] == 0
@@ -67,7 +65,7 @@ def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
 
 
 def until_out(one: DaemonProcess) -> None:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not counters(one)["origin_out"]):
         time.sleep(0.02)
 
@@ -77,7 +75,7 @@ def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, we
     words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--catalogue-budget", "64K")
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
-        assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S).complete
+        assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S).complete
         until_in_memory(one, *(f"{x}_0.pcd" for x in range(0, DRIVEN_M + SIZE, SIZE)))
         web.refuse()
         until_out(one)
@@ -89,8 +87,8 @@ def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: 
     words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--budget", "2M", "--prefetch-share", "0.2")
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
-        assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=PATIENCE_S).complete
-        wanted, waiting = DRIVEN_M // SIZE + 1, Patience()
+        assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S).complete
+        wanted, waiting = DRIVEN_M // SIZE + 1, Deadline()
         cells = Path(one.cache_dir)
         while waiting(sum(path.is_file() for path in cells.rglob("objects/cells/*/*")) < wanted):
             time.sleep(0.05)

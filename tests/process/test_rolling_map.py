@@ -22,13 +22,10 @@ from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
 import shmmap
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.forked_programs import run_verb
-from tests.support.live_daemon import LiveDaemon, worker_of
-from tests.support.live_drive import FILTER, RESOLUTION, drive
-from tests.support.live_reference import held, reference
-from tests.support.patience import Patience
-from tests.support.slow_occupancy import Voxel
+from tests.support.live_drive import FILTER, RESOLUTION, Voxel, drive
+from tests.support.live_reference import LiveDaemon, held, reference, worker_of
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.rolling_map"]
 LONG_S = 120.0
@@ -272,7 +269,7 @@ def test_the_picture_shows_what_is_chosen(live_daemon: LiveDaemon, words: Words,
         assert all(word in text for word in seen)
         assert not any(word in text for word in unseen)
     # what nobody waits for is not saved within an hour; the picture may come before it is applied
-    waiting = Patience()
+    waiting = Deadline()
     while waiting("dirty: newer than on disk" not in texts(picture)):
         done = run(*words(one, "--picture", str(picture), "--quiet", "--wait", "0", scans=3))
         assert done.returncode == 0
@@ -317,7 +314,7 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
             assert process.stderr.readline() == f"waiting for scans from {source}\n"
             for number, scan in enumerate(scans):
                 if number == 5:
-                    waiting = Patience()
+                    waiting = Deadline()
                     while waiting(scans_of(one) < number):  # more on their way, and it would wait for them
                         pass
                     one.kill()

@@ -20,14 +20,27 @@ from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
 from shmmap_clients.ros_bridge.messages.standard import PointCloud2
 
 from tests.process.conftest import DaemonFactory
-from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment
+from tests.support.bridge_process import (
+    PROGRAM,
+    BridgeProcess,
+    bridge_environment,
+    built_cyclone_peer,
+    built_fast_peer,
+)
 from tests.support.daemon_process import DaemonProcess
-from tests.support.dds_programs import built_cyclone_peer, built_fast_peer
 from tests.support.divided_map import DividedMap
 from tests.support.pages import read_page
-from tests.support.ros_maps import KINDS, NAMES, asked, reload
-from tests.support.ros_peer import RosPeer
-from tests.support.ros_reply import Reply, expected, from_lines, from_message
+from tests.support.ros_peer import (
+    KINDS,
+    NAMES,
+    Reply,
+    RosPeer,
+    asked,
+    expected,
+    from_lines,
+    from_message,
+    reload,
+)
 
 Ask = Callable[..., Reply]
 

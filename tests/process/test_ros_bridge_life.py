@@ -20,13 +20,10 @@ from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, S
 from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
 
 from tests.process.conftest import DaemonFactory
-from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment
+from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment, built_fast_peer
 from tests.support.daemon_process import DaemonProcess, stop
-from tests.support.dds_programs import built_fast_peer
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.ros_maps import NAMES, asked, reload
-from tests.support.ros_peer import RosPeer
-from tests.support.ros_reply import from_message
+from tests.support.ros_peer import NAMES, RosPeer, asked, from_message, reload
 
 CLIENTS = int(os.environ.get("SHMMAP_TEST_ROS_CLIENTS", "40"))
 """How many clients come and go; the full number is 1000."""
@@ -191,7 +188,7 @@ def test_a_client_that_has_stopped_holds_up_nobody(
     """All clients of a service read the same replies; one that has stopped acknowledges none of them."""
     town = make_map(tmp_path / "large", columns=2, rows=2, points=20_000)
     with BridgeProcess(daemon(town.root), dds):
-        words = [sys.executable, "-m", "tests.support.ros_listener", str(dds)]
+        words = [sys.executable, "-m", "tests.support.ros_peer", str(dds)]
         pipe = subprocess.PIPE
         with subprocess.Popen(
             words, stdin=pipe, stdout=pipe, text=True, env=bridge_environment()

@@ -18,10 +18,9 @@ from shmmap_clients.ros_bridge.messages.standard import PointCloud2
 
 import shmmap
 from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment
-from tests.support.daemon_process import DaemonProcess
-from tests.support.live_daemon import LiveDaemon
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.live_drive import FILTER, RESOLUTION, drive
-from tests.support.patience import Patience
+from tests.support.live_reference import LiveDaemon
 from tests.support.ros_peer import RosPeer
 
 Voxel = tuple[int, int, int]
@@ -66,7 +65,7 @@ def test_services_give_every_voxel(live_daemon: LiveDaemon, dds: int, peer: RosP
                 for kind, service in SERVICES.items():
                     client = peer.client(f"/shmmap/live/{prefix}_{kind}_voxels", service)
                     there, reply, now = of_kind(one, scope), None, None
-                    waiting = Patience()
+                    waiting = Deadline()
                     while waiting(reply is None or there != now):  # chunks leave memory, too
                         there = of_kind(one, scope)
                         reply = client.call(structure_needs_at_least_one_member=0)

@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, wait_ended
+from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 from tests.support.raw_client import RawClient, circle
 
 Connect = Callable[..., RawClient]
@@ -69,7 +68,7 @@ def test_a_whole_life(
     for _ in range(3):
         assert manager.until("WATCHDOG=1") == ["WATCHDOG=1"]
     connect(one).area(circle(0, 0, 5))
-    waiting = Patience()
+    waiting = Deadline()
     while waiting("4 of 36 cells" not in manager.until("STATUS=")[0]):
         pass
     assert "1 client" in manager.heard[-1][0]

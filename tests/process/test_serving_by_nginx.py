@@ -13,11 +13,10 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.command_line import publish
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.nginx import Nginx, free_port, needed_nginx, web_server
-from tests.support.patience import Patience
-from tests.support.publishing import publish
+from tests.support.web_servers import Nginx, free_port, needed_nginx, web_server
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -82,7 +81,7 @@ def test_polls_are_answered_by_not_modified(daemon: DaemonFactory, town: Town, t
     log = tmp_path / "asked.log"
     town.restart(f"access_log {log};")
     daemon(town.url, "--poll", "1")
-    waiting = Patience()
+    waiting = Deadline()
     while waiting('/town/CURRENT HTTP/1.1" 304' not in log.read_text()):
         time.sleep(0.05)
 
@@ -100,7 +99,7 @@ def test_transfers_that_are_cut_off_are_begun_again(daemon: DaemonFactory, town:
     asking = threading.Thread(target=ask_all, args=(one, answers))
     asking.start()
     try:
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not town.nginx.connections()):
             time.sleep(0.01)
         town.nginx.kill()
@@ -135,7 +134,7 @@ def test_objects_cut_short_or_changed_are_refused_until_they_are_whole(
         del cells
         for path, data in whole.items():
             path.write_bytes(data)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
             with suppress(shmmap.ShmmapError):
                 client.reload()

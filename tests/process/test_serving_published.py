@@ -21,18 +21,16 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.bucket_server import KEYS, BucketServer
+from tests.support.command_line import health, make_older, publish, verb
+from tests.support.compiled_programs import built_preload
 from tests.support.cpp_client import CppClient
-from tests.support.daemon_process import ROOT, DaemonProcess
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, make_map, random_points
-from tests.support.faulty_web import FaultyWeb, faulty_web
-from tests.support.open3d_package import open3d_or_skip
-from tests.support.patience import Patience
-from tests.support.preloaded import built_preload
-from tests.support.publishing import make_older, publish
+from tests.support.map_stores import KEYS, BucketServer
 from tests.support.raw_client import DaemonError, RawClient, circle
-from tests.support.served_cells import names
-from tests.support.statistics_verbs import health, verb
+from tests.support.segment_reader import names
+from tests.support.skips import open3d_or_skip
+from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
@@ -224,11 +222,11 @@ def test_one_loader_fetches_many_objects_at_once(daemon: DaemonFactory, web: Fau
     web.fault = stall
     with shmmap.connect(one.endpoint) as client:
         client.area(ALL, wait=None)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(asked) < 9):
             time.sleep(0.01)
         web.heal()
-        again = Patience()
+        again = Deadline()
         while again(not client.area(ALL, wait=5.0).complete):
             pass
 
@@ -258,20 +256,20 @@ def test_an_origin_out_of_reach_costs_only_what_is_not_here(
         assert len(cold.failed) == 5
         assert {cell.id for cell in cold} == {cell.id for cell in warm}
         assert client.around(0.0, 0.0, 1.0, wait=60.0).complete, "what is here is served all the while"
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((said := health(one))[0] != 1):
             time.sleep(0.05)
         assert "out of reach" in said[1]
         assert "out of reach for" in verb(one, "status")[1]
         logged = one.log.count("load failed")
-        until = Patience()
+        until = Deadline()
         while until(offline_codes(client.area(ALL, wait=30.0)) != {"offline"}):
             pass
         assert one.log.count("load failed") == logged, "it is said once"
         if how == "refuse":
             web.listen()
         web.heal()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not client.area(ALL, wait=5.0).complete):
             time.sleep(0.05)
         while waiting((said := health(one))[0] != 0):
@@ -291,7 +289,7 @@ def test_credentials_that_expire_cost_only_what_is_not_here(
         assert (len(cold), offline_codes(cold)) == (4, {"offline"})
         assert all("the credentials have expired" in failure.message for failure in cold.failed)
         assert client.around(0.0, 0.0, 1.0, wait=60.0).complete
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((said := health(one))[0] != 1):
             time.sleep(0.05)
         assert "(`shmmap doctor`)" in said[1]
@@ -299,7 +297,7 @@ def test_credentials_that_expire_cost_only_what_is_not_here(
             time.sleep(0.05)
         assert re.search(r"out of reach reason=.*the credentials have expired", one.log)
         web.heal()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not client.area(ALL, wait=5.0).complete):
             time.sleep(0.05)
     for secret in (KEYS["AWS_ACCESS_KEY_ID"], KEYS["AWS_SECRET_ACCESS_KEY"]):
@@ -313,7 +311,7 @@ def test_bodies_that_end_early_are_no_cells(daemon: DaemonFactory, web: FaultyWe
         cells = client.area(ALL, wait=60.0)
         assert (len(cells), offline_codes(cells)) == (0, {"offline"})
         web.heal()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not client.area(ALL, wait=5.0).complete):
             time.sleep(0.05)
 
@@ -348,7 +346,7 @@ def test_a_damaged_object_costs_its_cell_by_name(
             assert re.search("blobs/sha256/[0-9a-f]{64}", failure.message)
         for path, data in damaged.items():
             path.write_bytes(data)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
             time.sleep(0.05)
         assert {cell.id.rsplit("/", 1)[1] for cell in cells} == set(town.corners)
@@ -358,7 +356,7 @@ def test_a_body_that_stalls_is_gone_on_with(daemon: DaemonFactory, web: FaultyWe
     one = daemon(web.url)
     web.fault = lambda path: "stall body" if path.startswith("blobs/") else ""
     with shmmap.connect(one.endpoint) as client:
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not client.area(ALL, wait=30.0).complete):  # a busy machine may take too long for it
             time.sleep(0.05)
     assert 206 in {status for _path, status in web.requests()}
@@ -398,7 +396,7 @@ def test_another_version_is_taken_and_unchanged_cells_stay(
         publish(town.root, web.folder, "--layer", NDT)
         if how == "reload":
             assert client.reload().map_version
-        waiting = Patience()
+        waiting = Deadline()
         cells = client.area(ALL, wait=30.0)
         while waiting({cell.id for cell in cells} == before.keys()):
             time.sleep(0.02)
@@ -429,7 +427,7 @@ def test_a_version_never_goes_back(
             client.reload()
         assert "--accept-version 1" in refused.value.hint
         assert client.area(ALL, wait=60.0).map_version == served
-        waiting = Patience()
+        waiting = Deadline()
         while waiting("is refused, older" not in health(one)[1]):
             time.sleep(0.05)
         (web.folder / "CURRENT").write_bytes(second)
@@ -455,7 +453,7 @@ def test_a_link_lost_half_way_keeps_the_old_version_whole(
         assert {(cell.id, cell.version) for cell in cells} == before
         assert cells.complete
         web.heal()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting({(cell.id, cell.version) for cell in client.area(ALL, wait=30.0)} == before):
             time.sleep(0.05)
 
@@ -482,7 +480,7 @@ def test_a_version_that_was_pruned_is_served_as_far_as_it_is_here(
         assert len(cells.failed) == 8
         assert all("is not there" in failure.message for failure in cells.failed)
         client.reload()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
             pass
         assert len(cells) == 9
@@ -493,7 +491,7 @@ def test_a_version_that_was_pruned_is_served_as_far_as_it_is_here(
 
 def test_polls_are_conditional(daemon: DaemonFactory, web: FaultyWeb) -> None:
     one = daemon(web.url, "--poll", "1")
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(("CURRENT", 304) not in web.requests()):
         time.sleep(0.05)
     assert "reload done" not in one.log
@@ -505,7 +503,7 @@ def test_tags_that_differ_each_time_are_no_other_version(daemon: DaemonFactory, 
     one = daemon(web.url, "--poll", "1")
     web.requests()
     polls: list[tuple[str, int]] = []
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(polls.count(("CURRENT", 200)) < 3):
         polls += web.requests()
         time.sleep(0.05)
@@ -524,7 +522,7 @@ def test_a_tag_that_stays_hides_a_version_from_polls_and_not_from_a_reload(
         publish_change()
         web.requests()
         polls = 0
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(polls < 2):
             polls += web.requests().count(("CURRENT", 304))
             time.sleep(0.05)
@@ -577,7 +575,7 @@ def test_pages_out_of_reach_are_not_waited_for_and_come_by_themselves(
     one = daemon(web.url)
     with shmmap.connect(one.endpoint) as client:
         assert client.around(10.0, 10.0, 15.0, wait=30.0).complete
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((far := client.around(640.0 * 20 + 10, 10.0, 15.0, wait=30.0)).covered):
             pass
         assert len(far) == 0
@@ -637,7 +635,7 @@ def test_a_start_without_a_link_serves_what_was_taken(
         again = client.area(ALL, layers=PUBLISHED, wait=60.0)
         assert again.complete
         assert {(cell.id, cell.layer, cell.version) for cell in again} == versions
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(health(one)[0] != 1):
             time.sleep(0.05)
     publish_change()
@@ -658,7 +656,7 @@ def test_a_start_with_nothing_on_the_disk_and_without_a_link(daemon: DaemonFacto
         nothing = client.area(ALL, wait=30.0)
         assert (len(nothing), nothing.covered) == (0, False)
         web.listen()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not client.area(ALL, wait=5.0).complete):
             time.sleep(0.02)
 
@@ -681,7 +679,7 @@ def test_killed_while_it_takes_a_version(
     one.environment["SHMMAP_TEST_CRASH"] = f"{step}:1:{tmp_path}/reached"
     publish_change()
     one.start()
-    raw, waiting = connect(one, timeout=1.0), Patience()
+    raw, waiting = connect(one, timeout=1.0), Deadline()
     while waiting(not (tmp_path / "reached").exists()):
         with suppress(TimeoutError, DaemonError):
             raw.ask("reload")
@@ -715,7 +713,7 @@ def test_an_older_offer_is_no_reason_not_to_start(
     one.stop()
     (web.folder / "CURRENT").write_bytes(first)
     one.start()
-    waiting = Patience()
+    waiting = Deadline()
     with shmmap.connect(one.endpoint) as client:
         assert client.map_version == served
         while waiting("is refused, older" not in health(one)[1]):
@@ -732,7 +730,7 @@ def test_an_older_offer_is_no_reason_not_to_start(
 
 def until_remembered(one: DaemonProcess) -> None:
     """Wait until the daemon has written down what it has taken."""
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not list(one.state_dir.rglob("*.taken"))):
         time.sleep(0.02)
 

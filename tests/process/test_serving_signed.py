@@ -17,21 +17,17 @@ import shmmap
 from shmmap.doctor.signed_map import trust_problems
 from shmmap.errors import Offline, ShmmapError
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, DaemonProcess, stop
+from tests.support.command_line import Verbs, doctor, health, verb
+from tests.support.compiled_programs import built_preload
+from tests.support.daemon_process import ROOT, DaemonProcess, Deadline, counters, stop
 from tests.support.divided_map import make_map
-from tests.support.doctor_verb import doctor
-from tests.support.faulty_web import FaultyWeb, faulty_web
-from tests.support.patience import Patience
-from tests.support.preloaded import built_preload
-from tests.support.publishing_verbs import Shmmap as Verbs
-from tests.support.statistics_verbs import health, verb
-from tests.support.waiting import counters
+from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 pytest.importorskip("tuf", reason="tuf is not installed")
 
-from tests.support.signed_map import Signed, in_days
+from tests.support.published_maps import Signed, in_days
 
 ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 DAY_S = 86400
@@ -125,14 +121,14 @@ def problems(one: DaemonProcess) -> str:
 
 
 def until_remembered(one: DaemonProcess) -> None:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not list(one.state_dir.rglob("*.taken"))):
         time.sleep(0.02)
 
 
 def until_polled(web: FaultyWeb, times: int) -> list[tuple[str, int]]:
     """Wait for ``times`` requests of the timestamp; returns all requests."""
-    asked, waiting = web.requests(), Patience()
+    asked, waiting = web.requests(), Deadline()
     while waiting(sum(path == "timestamp.json" for path, _ in asked) < times):
         time.sleep(0.02)
         asked += web.requests()
@@ -238,7 +234,7 @@ def test_a_new_version_is_taken_when_it_is_signed(
     assert ("timestamp.json", 304) in asked, "polls are conditional"
     assert len(verified) <= 2, "and verify nothing that has not changed"
     offer("two")
-    waiting = Patience()
+    waiting = Deadline()
     while waiting((now := versions_of(one)) == before):
         time.sleep(0.05)
     assert [cell for cell in now if now[cell] != before[cell]] == ["/town/0_0.pcd"]
@@ -260,7 +256,7 @@ def test_what_is_refused_later_is_said_once_and_what_was_taken_is_served(
     }  # fmt: skip
     for number, (name, change) in enumerate(changes.items(), 1):
         change(web, keys, offer)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(f"is refused, {name}" not in problems(one)):
             time.sleep(0.02)
         web.requests()
@@ -274,12 +270,12 @@ def test_what_is_refused_later_is_said_once_and_what_was_taken_is_served(
         web.folder.mkdir()
         offer("two")
         sign_timestamp_of(Signed(web.folder, keys), version=10 * number)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(problems(one) != "" or counters(one)["last_reload_failed"] != 0):
             time.sleep(0.02)
     offer("equal")
     sign_timestamp_of(Signed(web.folder, keys), version=100)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting("is refused, altered" not in problems(one)):
         time.sleep(0.02)
     assert "offers another map as version 2" in one.log
@@ -298,7 +294,7 @@ def test_a_refusal_is_seen_by_every_verb_also_after_a_restart(
     until_remembered(one)
     whole = (web.folder / "timestamp.json").read_bytes()
     flip(web.folder / "timestamp.json")
-    waiting = Patience()
+    waiting = Deadline()
     for _ in range(2):
         while waiting(says not in problems(one)):
             time.sleep(0.02)
@@ -331,7 +327,7 @@ def test_an_altered_object_of_the_root_is_said_once_and_taken_once_it_is_whole(
     root = Signed(made_once / "two", keys).current["root"]
     web.fault = lambda path: "corrupt" if path.endswith(root) else ""
     offer("two")
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(health(one)[0] == 0):
         time.sleep(0.05)
     until_polled(web, 4)
@@ -349,7 +345,7 @@ def test_signed_again_it_is_valid_for_longer_also_after_a_restart(
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     served = versions_of(one)
     expires = sign_timestamp(web, keys, expires=in_days(5)).timestamp.signed.expires.timestamp()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(counters(one)["published_expires_unix_ns"] != int(expires * 1e9)):
         time.sleep(0.05)
     assert "reload done" not in one.log
@@ -374,7 +370,7 @@ def test_rotated_keys_are_followed_from_the_first_root(
         run("versions", web.folder, "--rotate", role, "--sign", keys)
         made.change("0_0.pcd", seed=10 + number)
         assert run.json("publish", made.root, web.folder, "--sign", keys)["version"] == number
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(versions_of(one) == before):
             time.sleep(0.05)
     while waiting(health(one)[0] != 0):  # what was read in the midst of a change is read again
@@ -430,7 +426,7 @@ def test_another_root_of_trust_while_it_runs(
     (keys / "ROOT.json").unlink()
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError, match=r"ROOT\.json: No such"):
         client.reload()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting("cannot be taken" not in health(one)[1]):
         time.sleep(0.05)
     assert versions_of(one) == served
@@ -486,7 +482,7 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
             web.refuse()
         one.start()
         assert versions_of(one) == served
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(since not in (said := health(one, clock(1.01)))[1]):
             time.sleep(0.05)
         assert said[0] == 1
@@ -502,7 +498,7 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
     for name in clock(0):
         del one.environment[name]
     one.start()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(health(one)[0] != 0):
         time.sleep(0.05)
 
@@ -512,7 +508,7 @@ def test_a_clock_a_day_behind(daemon: DaemonFactory, web: FaultyWeb, keys: Path,
     sign_timestamp(web, keys, expires=in_days(1))
     one = daemon(web.url, *trusting(keys), "--poll", "1", environment=clock(-1))
     assert len(versions_of(one)) == 2
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not counters(one)["published_signed_unix_ns"]):
         time.sleep(0.02)
     text = verb(one, "doctor", "--json", env=clock(-1))[1]
@@ -563,7 +559,7 @@ def test_it_may_be_killed_or_hang(daemon: DaemonFactory, web: FaultyWeb, keys: P
     web.fault = catch(signal.SIGKILL)
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError):
         client.reload()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting("cannot be taken" not in problems(one)):
         time.sleep(0.02)
     assert "ended with signal SIGKILL" in one.log
@@ -572,7 +568,7 @@ def test_it_may_be_killed_or_hang(daemon: DaemonFactory, web: FaultyWeb, keys: P
     web.heal()
     caught.clear()
     web.fault = catch(signal.SIGSTOP)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not caught):  # on a busy machine the time can be over before it asks for anything
         with shmmap.connect(one.endpoint) as client, pytest.raises(Offline, match="not read within 4 s"):
             client.reload()
@@ -582,7 +578,7 @@ def test_it_may_be_killed_or_hang(daemon: DaemonFactory, web: FaultyWeb, keys: P
     os.kill(caught[0], signal.SIGKILL)
     web.heal()
     with shmmap.connect(one.endpoint) as client:
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(versions_of(one) == served):
             with suppress(ShmmapError):  # the one before is not over, or the machine is slow
                 client.reload()
@@ -593,7 +589,7 @@ def test_it_may_be_killed_or_hang(daemon: DaemonFactory, web: FaultyWeb, keys: P
 
 def test_a_daemon_ends_while_it_verifies(daemon: DaemonFactory, web: FaultyWeb, keys: Path) -> None:
     one = daemon(web.url, *trusting(keys), "--poll", "1")
-    waiting = Patience()
+    waiting = Deadline()
     asked: list[str] = []
 
     def fault(path: str) -> str:

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.bucket_server import BucketServer
+from tests.support.command_line import Verbs, locked
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.publishing_verbs import Shmmap, locked
+from tests.support.map_stores import BucketServer
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("tuf", reason="tuf is not installed")
 
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.verify_version import verify_version
-from tests.support.signed_map import Signed, in_days, read_signed
+from tests.support.published_maps import Signed, in_days, read_signed
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def town(tmp_path: Path) -> DividedMap:
 def _signed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("signed")
     made = make_map(folder / "town", columns=2, rows=1, points=100)
-    Shmmap(folder)("publish", made.root, folder / "store", "--sign", folder / "keys")
+    Verbs(folder)("publish", made.root, folder / "store", "--sign", folder / "keys")
     return folder
 
 
@@ -72,7 +72,7 @@ def test_the_first_time_makes_keys_that_no_other_user_reads(store: Path, keys: P
 
 
 def test_versions_are_signed_and_what_is_the_same_is_not_signed_again(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
     (keys / "root.pem").unlink()  # off line
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
@@ -88,7 +88,7 @@ def test_versions_are_signed_and_what_is_the_same_is_not_signed_again(
     assert read_signed(store, keys).version == 3
 
 
-def test_a_map_that_was_not_signed_becomes_signed(shmmap: Shmmap, town: DividedMap, tmp_path: Path) -> None:
+def test_a_map_that_was_not_signed_becomes_signed(shmmap: Verbs, town: DividedMap, tmp_path: Path) -> None:
     shmmap("publish", town.root, tmp_path / "store")
     done = shmmap.json("publish", town.root, tmp_path / "store", "--sign", tmp_path / "keys")
     assert not done["changed"]
@@ -96,7 +96,7 @@ def test_a_map_that_was_not_signed_becomes_signed(shmmap: Shmmap, town: DividedM
 
 
 def test_a_signed_map_is_not_changed_without_its_keys(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     town.change("0_0.pcd", seed=1)
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
@@ -120,7 +120,7 @@ def test_a_signed_map_is_not_changed_without_its_keys(
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o622])
 def test_a_key_that_others_can_use_is_refused(
-    mode: int, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+    mode: int, shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
     town.change("0_0.pcd", seed=1)
     (keys / "targets.pem").chmod(mode)
@@ -131,7 +131,7 @@ def test_a_key_that_others_can_use_is_refused(
     assert read_signed(store, keys).version == 1
 
 
-def test_a_key_that_is_none_or_another_one(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> None:
+def test_a_key_that_is_none_or_another_one(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     town.change("0_0.pcd", seed=1)
     whole = (keys / "targets.pem").read_bytes()
     (keys / "targets.pem").write_bytes((keys / "online.pem").read_bytes())
@@ -149,7 +149,7 @@ def test_a_key_that_is_none_or_another_one(shmmap: Shmmap, town: DividedMap, sto
     read_signed(store, keys)
 
 
-def test_a_refresh_signs_what_runs_out(shmmap: Shmmap, store: Path, keys: Path) -> None:
+def test_a_refresh_signs_what_runs_out(shmmap: Verbs, store: Path, keys: Path) -> None:
     for name in ("root.pem", "targets.pem"):
         (keys / name).unlink()
     done = shmmap.json("versions", store, "--refresh", "--sign", keys)
@@ -169,7 +169,7 @@ def test_a_refresh_signs_what_runs_out(shmmap: Shmmap, store: Path, keys: Path) 
 
 
 def test_publishing_the_same_signs_targets_again_before_they_run_out(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
     Signed(store, keys).write("targets", expires=in_days(100))
     assert not shmmap.json("publish", town.root, store, "--sign", keys)["changed"]
@@ -178,9 +178,7 @@ def test_publishing_the_same_signs_targets_again_before_they_run_out(
     assert signed.targets.signed.expires > in_days(364)
 
 
-def test_damaged_metadata_is_not_built_upon(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
-) -> None:
+def test_damaged_metadata_is_not_built_upon(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     town.change("0_0.pcd", seed=1)
     for name in ("timestamp.json", "1.snapshot.json", "1.targets.json"):
         whole = (store / name).read_bytes()
@@ -200,7 +198,7 @@ def test_damaged_metadata_is_not_built_upon(
     "label", ["sign.keys", "sign.root", "sign.metadata", "sign.timestamp", "sign.signed"]
 )
 def test_killed_the_first_time_it_goes_on(
-    label: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
+    label: str, shmmap: Verbs, town: DividedMap, tmp_path: Path
 ) -> None:
     words = ("publish", town.root, tmp_path / "store", "--sign", tmp_path / "keys")
     shmmap(*words, code=-signal.SIGKILL, env={"SHMMAP_TEST_CRASH": label})
@@ -225,7 +223,7 @@ def test_killed_the_first_time_it_goes_on(
     ],
 )
 def test_killed_anywhere_one_version_is_signed_and_whole(
-    label: str, verb: str, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+    label: str, verb: str, shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     before = 1
     if verb == "rollback":
@@ -250,7 +248,7 @@ def test_killed_anywhere_one_version_is_signed_and_whole(
 
 
 @pytest.mark.parametrize("label", ["sign.metadata", "sign.timestamp", "sign.repaired"])
-def test_a_refresh_that_is_killed(label: str, shmmap: Shmmap, store: Path, keys: Path) -> None:
+def test_a_refresh_that_is_killed(label: str, shmmap: Verbs, store: Path, keys: Path) -> None:
     Signed(store, keys).write("snapshot", expires=in_days(1))
     (store / "CURRENT").unlink()
     words = ("versions", store, "--refresh", "--sign", keys)
@@ -260,7 +258,7 @@ def test_a_refresh_that_is_killed(label: str, shmmap: Shmmap, store: Path, keys:
     assert read_signed(store, keys).snapshot.signed.expires > in_days(29)
 
 
-def test_entry_and_current_are_repaired(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> None:
+def test_entry_and_current_are_repaired(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     for seed, damage in enumerate(("entry", "other entry", "no current", "later")):
         town.change("0_0.pcd", seed=seed)
         shmmap("publish", town.root, store, "--sign", keys)
@@ -281,7 +279,7 @@ def test_entry_and_current_are_repaired(shmmap: Shmmap, town: DividedMap, store:
 
 
 def test_of_two_publishers_one_wins(
-    shmmap: Shmmap, town: DividedMap, tmp_path: Path, buckets: BucketServer
+    shmmap: Verbs, town: DividedMap, tmp_path: Path, buckets: BucketServer
 ) -> None:
     url, keys = buckets.url("two_publishers"), tmp_path / "keys"
     shmmap("publish", town.root, url, "--sign", keys, env=buckets.environment)
@@ -300,7 +298,7 @@ def test_of_two_publishers_one_wins(
     assert rows["current"] == done["version"] == 1 + codes.count(0)
 
 
-def before_its_timestamp(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> subprocess.Popen[str]:
+def before_its_timestamp(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> subprocess.Popen[str]:
     """A publisher that has written its snapshot and waits for the store's lock."""
     slow = shmmap.start("publish", town.root, store, "--sign", keys)
     while not (store / "2.snapshot.json").exists():
@@ -310,7 +308,7 @@ def before_its_timestamp(shmmap: Shmmap, town: DividedMap, store: Path, keys: Pa
 
 
 def test_a_refresh_that_comes_between_costs_nothing(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
     town.change("0_0.pcd", seed=1)
     with locked(store):
@@ -323,7 +321,7 @@ def test_a_refresh_that_comes_between_costs_nothing(
 
 
 def test_the_slower_of_two_publishers_changes_nothing(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
     town.change("0_0.pcd", seed=1)
     with locked(store):
@@ -352,7 +350,7 @@ def key_of(keys: Path, name: str) -> bytes:
 
 @pytest.mark.parametrize("role", ["root", "targets", "snapshot", "timestamp"])
 def test_a_rotated_key_signs_from_then_on_and_vehicles_follow(
-    role: str, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path
+    role: str, shmmap: Verbs, town: DividedMap, store: Path, keys: Path
 ) -> None:
     trust = ("--trust", keys / "ROOT.json")
     assert shmmap.json("versions", store, *trust)["current"] == 1
@@ -412,7 +410,7 @@ def test_a_rotated_key_signs_from_then_on_and_vehicles_follow(
     ],
 )
 def test_a_rotation_killed_anywhere_leaves_a_valid_map(
-    role: str, label: str, shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+    role: str, label: str, shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     first = (keys / "ROOT.json").read_bytes()
 
@@ -438,7 +436,7 @@ def test_a_rotation_killed_anywhere_leaves_a_valid_map(
     assert taken(2)
 
 
-def test_what_a_rotation_needs(shmmap: Shmmap, store: Path, keys: Path, tmp_path: Path) -> None:
+def test_what_a_rotation_needs(shmmap: Verbs, store: Path, keys: Path, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
     (keys / "root.pem").rename(tmp_path / "root.pem")
     errors = shmmap("versions", store, "--rotate", "targets", "--sign", keys, code=78)
@@ -453,7 +451,7 @@ def test_what_a_rotation_needs(shmmap: Shmmap, store: Path, keys: Path, tmp_path
     assert not list(keys.glob("*.next.pem"))
 
 
-def test_a_key_that_is_lost_is_rotated(shmmap: Shmmap, town: DividedMap, store: Path, keys: Path) -> None:
+def test_a_key_that_is_lost_is_rotated(shmmap: Verbs, town: DividedMap, store: Path, keys: Path) -> None:
     (keys / "online.pem").unlink()
     assert "No such file" in shmmap("versions", store, "--refresh", "--sign", keys, code=78)
     shmmap("versions", store, "--rotate", "timestamp", "--sign", keys)
@@ -464,7 +462,7 @@ def test_a_key_that_is_lost_is_rotated(shmmap: Shmmap, town: DividedMap, store: 
 
 
 def test_a_publisher_with_the_old_key_leaves_a_valid_map(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     """Its run began before the rotation, and ends in the midst of it, or after."""
     old = Path(shutil.copytree(keys, tmp_path / "old"))
@@ -488,7 +486,7 @@ def test_a_publisher_with_the_old_key_leaves_a_valid_map(
 
 @pytest.mark.parametrize("package", ["tuf", "cryptography"])
 def test_without_the_packages_it_says_what_to_install(
-    package: str, shmmap: Shmmap, town: DividedMap, tmp_path: Path
+    package: str, shmmap: Verbs, town: DividedMap, tmp_path: Path
 ) -> None:
     (tmp_path / "without").mkdir()
     (tmp_path / "without" / f"{package}.py").write_text(f"raise ModuleNotFoundError(name={package!r})\n")

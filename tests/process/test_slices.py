@@ -18,13 +18,13 @@ import pytest
 from shmmap.dividing.progress import NoProgress
 from shmmap.errors import InstanceBusy, MapDataError, ShmmapError
 from tests.process.conftest import Meanwhile
-from tests.support.bucket_server import BucketServer
+from tests.support.command_line import Verbs
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.offered_kinds import install
-from tests.support.open3d_package import open3d_or_skip
-from tests.support.published_map_reader import PublishedMapReader
-from tests.support.publishing_verbs import Shmmap
+from tests.support.layer_oracles import install
+from tests.support.map_stores import BucketServer
+from tests.support.published_maps import PublishedMapReader
+from tests.support.skips import open3d_or_skip
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -37,14 +37,14 @@ from shmmap.publishing import joining, prune
 from tests.support.message_pack import pack, unpack
 
 LAYERS = ("sample(every=2)", "around(radius=3.0)")
-"""Neither is compiled; the second looks into neighbours, as tests.support.offered_kinds makes it."""
+"""Neither is compiled; the second looks into neighbours, as tests.support.layer_oracles makes it."""
 DAY_S = 86_400
 
 
 class Town:
     """A published town of four shards, and the commands that make slices of it."""
 
-    def __init__(self, folder: Path, made: DividedMap, shmmap: Shmmap, kept: Path) -> None:
+    def __init__(self, folder: Path, made: DividedMap, shmmap: Verbs, kept: Path) -> None:
         self.folder = folder
         self.kept = kept
         self.made = made
@@ -123,7 +123,7 @@ def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
     """A folder with the town and kinds of layers, where it is published; root and map version with layers."""
     folder = tmp_path_factory.mktemp("sliced")
     made = make_map(folder / "town", columns=2, rows=2, points=300)
-    shmmap = Shmmap(folder)
+    shmmap = Verbs(folder)
     shmmap.environment["PYTHONPATH"] = f"{install(folder / 'kinds')}:{ROOT}"
     one_go = Town(folder, made, shmmap, folder)
     one_go.url = folder / "one"
@@ -134,7 +134,7 @@ def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
 
 
 @pytest.fixture
-def town(tmp_path: Path, _made: tuple[Path, str, str], shmmap: Shmmap) -> Town:
+def town(tmp_path: Path, _made: tuple[Path, str, str], shmmap: Verbs) -> Town:
     """The town, published without layers."""
     folder, _, _ = _made
     shmmap.environment["PYTHONPATH"] = f"{folder / 'kinds'}:{ROOT}"
@@ -585,7 +585,7 @@ def pack_part_of(town: Town, run: str, **changes: Any) -> bytes:
 
 def test_a_signed_map_is_joined_with_its_keys(town: Town, root: str) -> None:
     pytest.importorskip("tuf", reason="tuf is not installed")
-    from tests.support.signed_map import read_signed
+    from tests.support.published_maps import read_signed
 
     keys = town.folder / "keys"
     town.shmmap("publish", town.made.root, town.url, "--sign", keys)
@@ -607,7 +607,7 @@ def test_a_signed_map_is_joined_with_its_keys(town: Town, root: str) -> None:
 @pytest.mark.parametrize("label", ["sign.metadata", "sign.timestamp", "sign.signed", "sign.switch"])
 def test_a_join_that_is_killed_while_it_signs_is_finished(label: str, town: Town, root: str) -> None:
     pytest.importorskip("tuf", reason="tuf is not installed")
-    from tests.support.signed_map import read_signed
+    from tests.support.published_maps import read_signed
 
     run, keys = town.slices(2), town.folder / "keys"
     town.shmmap("publish", town.made.root, town.url, "--sign", keys)

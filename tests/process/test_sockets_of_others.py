@@ -16,8 +16,8 @@ from shmmap import connect
 from shmmap.testing.process_watch import wait_ended
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
+from tests.support.daemon_process import counters, until
 from tests.support.divided_map import DividedMap
-from tests.support.waiting import counters, until
 
 
 @pytest.mark.parametrize("which", ["requests", "events"])

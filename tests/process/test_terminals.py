@@ -14,9 +14,8 @@ import pytest
 
 from shmmap import EventStream
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
+from tests.support.daemon_process import DaemonProcess, next_reload, until
 from tests.support.divided_map import DividedMap
-from tests.support.waiting import next_reload, until
 
 AT_TERMINAL = """\
 import fcntl, os, sys, termios

@@ -10,20 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.bucket_server import BucketServer
+from tests.support.command_line import Verbs, files_of
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.publishing_verbs import Shmmap, files_of
+from tests.support.map_stores import BucketServer
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("tuf", reason="tuf is not installed")
 
-from tests.support.signed_map import Signed, in_days
+from tests.support.published_maps import Signed, in_days
 
 
 @pytest.fixture
-def shmmap(tmp_path: Path) -> Shmmap:
-    run = Shmmap(tmp_path)
+def shmmap(tmp_path: Path) -> Verbs:
+    run = Verbs(tmp_path)
     run.environment["XDG_STATE_HOME"] = str(tmp_path / "state")
     return run
 
@@ -33,7 +33,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The town signed, with one version and with two; and signed by others."""
     folder = tmp_path_factory.mktemp("verified")
     made = make_map(folder / "town", columns=2, rows=1, points=100)
-    run = Shmmap(folder)
+    run = Verbs(folder)
     run("publish", made.root, folder / "one", "--sign", folder / "keys", "--id-prefix", "/store/")
     shutil.copytree(folder / "one", folder / "two")
     made.change("0_0.pcd", seed=1)
@@ -61,7 +61,7 @@ def keys(tmp_path: Path, made_once: Path) -> Path:
 
 
 def test_what_is_signed_is_fetched_whatever_current_says(
-    shmmap: Shmmap, town: DividedMap, store: Path, keys: Path, tmp_path: Path
+    shmmap: Verbs, town: DividedMap, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     trust = ("--trust", keys / "ROOT.json")
     for number, current in enumerate(("as it is", "older", "damaged", "none")):
@@ -123,7 +123,7 @@ REFUSALS: dict[str, tuple[str, Callable[[Signed], object]]] = {
 
 @pytest.mark.parametrize("name", REFUSALS)
 def test_what_is_refused_has_a_name(
-    name: str, shmmap: Shmmap, store: Path, keys: Path, tmp_path: Path
+    name: str, shmmap: Verbs, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     cause, change = REFUSALS[name]
     change(Signed(store, keys))
@@ -133,14 +133,14 @@ def test_what_is_refused_has_a_name(
     assert not (tmp_path / "back").exists()
 
 
-def test_a_map_that_is_not_signed(shmmap: Shmmap, town: DividedMap, keys: Path, tmp_path: Path) -> None:
+def test_a_map_that_is_not_signed(shmmap: Verbs, town: DividedMap, keys: Path, tmp_path: Path) -> None:
     shmmap("publish", town.root, tmp_path / "plain")
     errors = shmmap("versions", tmp_path / "plain", "--trust", keys / "ROOT.json", code=65)
     assert "refused, unsigned: timestamp.json is not there" in errors
     assert "--sign KEYDIR" in errors
 
 
-def test_a_map_that_others_signed(shmmap: Shmmap, made_once: Path, keys: Path, tmp_path: Path) -> None:
+def test_a_map_that_others_signed(shmmap: Verbs, made_once: Path, keys: Path, tmp_path: Path) -> None:
     errors = shmmap("versions", made_once / "other", "--trust", keys / "ROOT.json", code=65)
     assert "refused, foreign root:" in errors
     # also where the right root was put in front of it
@@ -155,7 +155,7 @@ def test_a_map_that_others_signed(shmmap: Shmmap, made_once: Path, keys: Path, t
 
 
 def test_what_is_older_than_what_was_seen(
-    shmmap: Shmmap, store: Path, keys: Path, made_once: Path, tmp_path: Path
+    shmmap: Verbs, store: Path, keys: Path, made_once: Path, tmp_path: Path
 ) -> None:
     trust = ("--trust", keys / "ROOT.json")
     assert shmmap.json("versions", store, *trust)["current"] == 2
@@ -171,14 +171,14 @@ def test_what_is_older_than_what_was_seen(
 
 
 def test_an_altered_root_of_the_map_is_not_fetched(
-    shmmap: Shmmap, store: Path, keys: Path, tmp_path: Path
+    shmmap: Verbs, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     flip(store / "blobs/sha256" / Signed(store, keys).current["root"])
     errors = shmmap("fetch", store, tmp_path / "back", "--trust", keys / "ROOT.json", code=65)
     assert "its SHA-256 is not its name" in errors
 
 
-def test_a_root_of_trust_that_is_none(shmmap: Shmmap, store: Path, keys: Path, tmp_path: Path) -> None:
+def test_a_root_of_trust_that_is_none(shmmap: Verbs, store: Path, keys: Path, tmp_path: Path) -> None:
     for content in (
         b"",
         b"{}",
@@ -193,7 +193,7 @@ def test_a_root_of_trust_that_is_none(shmmap: Shmmap, store: Path, keys: Path, t
         assert "--trust" in shmmap(*words, "--trust", keys / "ROOT.json", code=2)
 
 
-def test_from_a_bucket(shmmap: Shmmap, town: DividedMap, buckets: BucketServer, tmp_path: Path) -> None:
+def test_from_a_bucket(shmmap: Verbs, town: DividedMap, buckets: BucketServer, tmp_path: Path) -> None:
     url, keys = buckets.url("verified"), tmp_path / "made"
     shmmap("publish", town.root, url, "--sign", keys, env=buckets.environment)
     trust = ("--trust", keys / "ROOT.json")
@@ -210,7 +210,7 @@ def test_from_a_bucket(shmmap: Shmmap, town: DividedMap, buckets: BucketServer, 
 
 
 def test_without_the_package_it_says_what_to_install(
-    shmmap: Shmmap, store: Path, keys: Path, tmp_path: Path
+    shmmap: Verbs, store: Path, keys: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "without").mkdir()
     (tmp_path / "without" / "tuf.py").write_text("raise ModuleNotFoundError(name='tuf')\n")

@@ -17,8 +17,12 @@ import pytest
 import shmmap
 from shmmap.segment.pins import lock_slot
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess
-from tests.support.damage import (
+from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.divided_map import DividedMap, random_points
+from tests.support.mapping_process import MappingProcess
+from tests.support.raw_client import RawCells, RawClient, circle
+from tests.support.segment_reader import read_segment
+from tests.support.segments import (
     damage_header,
     damage_payload,
     damage_publish_block,
@@ -26,11 +30,6 @@ from tests.support.damage import (
     punch,
     shorten,
 )
-from tests.support.divided_map import DividedMap, random_points
-from tests.support.mapping_process import MappingProcess
-from tests.support.patience import Patience
-from tests.support.raw_client import RawCells, RawClient, circle
-from tests.support.segment_reader import read_segment
 
 Connect = Callable[..., RawClient]
 EVERYTHING = circle(0, 0, 500)
@@ -123,7 +122,7 @@ def test_a_waiting_request_is_answered_by_the_next_life(
         found: list[shmmap.CellSet] = []
         thread = threading.Thread(target=lambda: found.append(client.around(40, 40, 15, wait=60.0)))
         thread.start()
-        waiting = Patience()
+        waiting = Deadline()
         with shmmap.connect(one.endpoint) as watcher:
             while waiting(watcher.stats().counters["loads_started"] == loads):
                 pass

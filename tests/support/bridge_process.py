@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ros-bridge`` as a process: what it says, and its ends."""
+"""``shmmap-ros-bridge`` as a process, a DDS domain of its own, and peers to compile."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 
 from tests.support.daemon_process import ROOT, DaemonProcess
-from tests.support.dds_domain import URI
-
-__all__ = ["PROGRAM", "BridgeProcess", "bridge_environment"]
 
 PROGRAM = [sys.executable, "-m", "shmmap_clients.ros_bridge"]
 WITHIN_S = 60.0
@@ -125,3 +126,76 @@ class BridgeProcess:
         with self._news:
             self._silent = True
             self._news.notify_all()
+
+
+# A DDS domain for one test: no other test of this machine is in it, and nothing leaves the machine
+
+
+_DOMAINS: Final = range(1, 100)  # the ports of higher ones are given to whoever asks for any port
+_LOCKS: Final = Path("/tmp")
+
+FIRST_PORT: Final = 7400
+"""Of domain 0; each domain has 250 (DDSI-RTPS, 9.6.1)."""
+
+URI: Final = (
+    "<CycloneDDS><Domain Id='any'>"
+    "<General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
+    "<AllowMulticast>false</AllowMulticast></General>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>"
+    "<Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
+    "</Domain></CycloneDDS>"
+)
+"""Settings of CycloneDDS: the loopback interface alone, no multicast."""
+
+
+@contextmanager
+def dds_domain() -> Iterator[int]:
+    """Have a domain to oneself; the kernel gives it back whatever becomes of this process."""
+    for number in _DOMAINS:
+        fd = os.open(
+            _LOCKS / f"shmmap-test-dds-domain-{os.getuid()}-{number}.lock", os.O_RDWR | os.O_CREAT, 0o600
+        )
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(fd)
+            continue
+        try:
+            yield number
+        finally:
+            os.close(fd)
+        return
+    raise AssertionError("a hundred tests use DDS at once")
+
+
+# The peers of ``tests/support/dds_peers``, compiled where what they need is installed
+
+
+_SOURCES = Path(__file__).parent / "dds_peers"
+
+
+def built_cyclone_peer(folder: Path) -> Path | None:
+    """The peer over Debian's CycloneDDS; None where it cannot be built."""
+    if not (shutil.which("idlc") and shutil.which("gcc") and Path("/usr/include/dds/dds.h").exists()):
+        return None
+    # -t: no type information, as in the ROS distributions whose mapping this is
+    subprocess.run(["idlc", "-t", "-l", "c", str(_SOURCES / "autoware.idl")], cwd=folder, check=True)
+    program = folder / "cyclone_peer"
+    sources = [str(_SOURCES / "cyclone_peer.c"), "autoware.c"]
+    subprocess.run(
+        ["gcc", "-O1", "-Wall", "-Wextra", "-Werror", "-I.", *sources, "-lddsc", "-o", str(program)],
+        cwd=folder,
+        check=True,
+    )
+    return program
+
+
+def built_fast_peer(folder: Path) -> Path | None:
+    """The peer over Fast DDS; None where it cannot be built."""
+    if not (shutil.which("g++") and Path("/usr/include/fastdds/dds/topic/TopicDataType.hpp").exists()):
+        return None
+    program = folder / "fast_peer"
+    flags = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror"]
+    source = str(_SOURCES / "fast_peer.cpp")
+    subprocess.run(["g++", *flags, source, "-lfastrtps", "-lfastcdr", "-o", str(program)], check=True)
+    return program

@@ -17,7 +17,7 @@ from shmmap.dividing.divide import divide
 from shmmap.dividing.report import DividedMap
 from shmmap.dividing.settings import DivideSettings
 from shmmap.formats.pcd.writer import write_pcd
-from tests.support.pcd_files import read_pcd
+from tests.support.divided_map import read_pcd
 
 Columns = dict[str, NDArray[Any]]
 Row = tuple[Any, ...]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Connections for tests of what stands on them."""
+"""Connections and sessions without sockets."""
 
 from __future__ import annotations
 
@@ -8,10 +8,20 @@ from types import SimpleNamespace
 from typing import cast
 
 from shmmap.daemon.transport.connection import Connection, Peer
-
-__all__ = ["of"]
+from shmmap.daemon.transport.sessions import Session
+from shmmap.protocol.messages import Intent
 
 
 def of(peer: Peer | None = None, reply: Callable[[bytes], None] | None = None) -> Connection:
     """Return what a session knows of its connection: whose it is, and where replies go."""
     return cast("Connection", SimpleNamespace(peer=peer or Peer(), session=None, reply=reply))
+
+
+# Clients that say where they are, without sockets
+
+
+def says(session: Session, intent: Intent, now_s: float) -> None:
+    """Do what the daemon does when a request with an intent comes."""
+    session.intent = session.told = intent
+    session.says_where, session.last_request_s = True, now_s
+    session.sessions.moved[session] = None

@@ -27,19 +27,6 @@ from shmmap.errors import CellError
 from shmmap.protocol import events
 from tests.support.daemon_process import ROOT
 
-__all__ = [
-    "FLAGS",
-    "INCLUDE",
-    "SOURCE",
-    "CppCell",
-    "CppClient",
-    "CppEventStream",
-    "CppFollower",
-    "CppProgram",
-    "CppWindow",
-    "compiled",
-]
-
 INCLUDE: Final = ROOT / "clients" / "cpp" / "include"
 SOURCE: Final = ROOT / "tests" / "support" / "cpp_client.cpp"
 FLAGS: Final = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wpedantic", "-Werror", f"-I{INCLUDE}")
@@ -513,7 +500,7 @@ class CppEventStream:
 
 
 class CppFollower:
-    """As `tests.support.following_client.FollowingClient`: it is sent poses, and says what it sees."""
+    """As `tests.support.client_programs.FollowingClient`: it is sent poses, and says what it sees."""
 
     def __init__(self, program: Path, endpoint: str, mode: str) -> None:
         self._mode = mode

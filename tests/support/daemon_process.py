@@ -1,29 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon that users test with, and what only our own tests do to it."""
+"""The daemon that users test with, what only our own tests do to it, and waiting for it."""
 
 from __future__ import annotations
 
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from shmmap import EventStream
+from shmmap.protocol import events as e
+from shmmap.statistics.reader import read_statistics
 from shmmap.testing import daemon_process
 from shmmap.testing.daemon_process import READY_S, STOP_S
 from shmmap.testing.process_watch import open_files, processes_marked, wait_ended, wait_readable
 from tests.support.forked_programs import ROOT, fork_program
-from tests.support.patience import Patience
 
 __all__ = [
     "READY_S",
     "ROOT",
     "STOP_S",
+    "TIMEOUT_S",
     "DaemonProcess",
+    "Deadline",
+    "counters",
+    "next_reload",
     "open_files",
     "processes_marked",
     "stop",
+    "until",
     "wait_ended",
     "wait_readable",
 ]
@@ -41,7 +49,7 @@ def _parent_of(pid: int) -> int:
 def stop(pid: int) -> None:
     """SIGSTOP a process, and wait until it stands still."""
     os.kill(pid, signal.SIGSTOP)
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(_stat(pid)[0] != "T"):
         os.sched_yield()
 
@@ -111,6 +119,52 @@ class DaemonProcess(daemon_process.DaemonProcess):
 
     def until_segments(self, at_most: int, ask: Callable[[], object]) -> None:
         """Ask until no more are left (the daemon looks at retired ones by itself)."""
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(self.segments()) > at_most):
             ask()
+
+
+# A limit for loops that ask until something has happened: a defect fails one test, not the whole run
+
+
+LIMIT_S = 240.0
+
+
+class Deadline:
+    """``while waiting(not_yet): ask()``, with ``waiting = Deadline()`` before the loop."""
+
+    def __init__(self) -> None:
+        self._end_s = time.monotonic() + LIMIT_S
+
+    def __call__(self, not_yet: bool) -> bool:
+        """Return ``not_yet``; AssertionError once that has been so for too long."""
+        assert not not_yet or time.monotonic() < self._end_s, f"it did not happen within {LIMIT_S:.0f} s"
+        return not_yet
+
+
+# Waiting for what a daemon does by itself: by what it tells, not for a time
+
+
+TIMEOUT_S = 60.0
+
+
+def until(done: Callable[[], object], why: Callable[[], str]) -> None:
+    """Wait until something is so; ``why`` says what is instead."""
+    end_s = time.monotonic() + TIMEOUT_S
+    while not done():
+        assert time.monotonic() < end_s, why()
+        time.sleep(0.02)
+
+
+def counters(one: DaemonProcess) -> dict[str, int]:
+    """What its statistics say now."""
+    return dict(read_statistics(one.instance, one.shm_dir).counters)
+
+
+def next_reload(stream: EventStream) -> e.Reloaded:
+    """Wait until the map has been read again."""
+    while True:
+        happening = stream.next(60.0)
+        assert happening is not None, "no reload was told of"
+        if isinstance(happening, e.Reloaded):
+            return happening

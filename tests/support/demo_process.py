@@ -21,8 +21,6 @@ from shmmap.demo import demo_town, live_drive
 from shmmap.simulation.lidar import Lidar
 from tests.support.daemon_process import ROOT, processes_marked
 
-__all__ = ["SMALL", "SMALL_LIVE", "Demo", "until"]
-
 SMALL: Final = demo_town.DemoSettings(
     blocks=(3, 2), density=4.0, radius=60.0, length=20.0, onward=12, localized=10.0, counts=(1, 2)
 )

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
+import math
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from tests.support.pcd_files import read_pcd, write_pcd
 
 Box = tuple[float, float, float, float]
 
@@ -110,3 +110,83 @@ def make_map(
             made.write_cell(f"{corner[0]}_{corner[1]}.pcd", corner, random_points(rng, corner, points, size))
     made.write_metadata()
     return made
+
+
+# A small PCD writer and reader for tests, independent of shmmap's
+
+
+_KIND = {"f": "F", "i": "I", "u": "U"}
+
+
+def write_pcd(path: Path, columns: dict[str, NDArray[Any]]) -> None:
+    """Write one-dimensional columns, in order, as a binary PCD; in place, without a temporary file."""
+    names = list(columns)
+    rows = len(columns[names[0]])
+    record = np.zeros(rows, dtype=[(name, columns[name].dtype) for name in names])
+    for name in names:
+        record[name] = columns[name]
+    lines = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(names),
+        "SIZE " + " ".join(str(columns[n].dtype.itemsize) for n in names),
+        "TYPE " + " ".join(_KIND[columns[n].dtype.kind] for n in names),
+        "COUNT " + " ".join("1" for _ in names),
+        f"WIDTH {rows}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {rows}",
+        "DATA binary",
+    ]
+    path.write_bytes("\n".join(lines).encode() + b"\n" + record.tobytes())
+
+
+def read_pcd(path: Path) -> dict[str, NDArray[Any]]:
+    """Read a binary PCD without padding; a field of k > 1 values becomes (N, k)."""
+    data = path.read_bytes()
+    end = data.index(b"\n", data.index(b"DATA ")) + 1
+    keys = {}
+    for line in data[:end].decode("ascii", "replace").splitlines():
+        if line and not line.startswith("#"):
+            key, *values = line.split()
+            keys[key.upper()] = values
+    assert keys["DATA"] == ["binary"]
+    kinds = {"F": "f", "I": "i", "U": "u"}
+    described = zip(keys["FIELDS"], keys["TYPE"], keys["SIZE"], keys["COUNT"], strict=True)
+    dtype = np.dtype(
+        [
+            (n, f"<{kinds[t]}{s}", (int(k),)) if k != "1" else (n, f"<{kinds[t]}{s}")
+            for n, t, s, k in described
+        ]
+    )
+    record = np.frombuffer(data, dtype, int(keys["POINTS"][0]), end)
+    return {name: np.ascontiguousarray(record[name]) for name in keys["FIELDS"]}
+
+
+def write_ascii(path: Path, points: int) -> Path:
+    """Write a file that needs more memory than it is long: "1 2 3" is 6 bytes, three floats are 12."""
+    head = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
+    path.write_text(f"{head}POINTS {points}\nDATA ascii\n" + "1 2 3\n" * points)
+    return path
+
+
+# Autoware's test of which cells an area touches, ported from autoware_map_loader's utils.cpp
+
+
+Rectangle = tuple[float, float, float, float]
+
+
+def f32(value: float) -> float:
+    """Round to float32 without numpy."""
+    rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    return rounded
+
+
+def cylinder_and_box_overlap_exists(x: float, y: float, radius: float, box: Rectangle) -> bool:
+    """Both clauses; messages carry float32, the arithmetic is double."""
+    x, y, radius = f32(x), f32(y), f32(radius)
+    min_x, min_y, max_x, max_y = map(f32, box)
+    if min_x - radius <= x <= max_x + radius and min_y - radius <= y <= max_y + radius:
+        return True
+    corners = ((min_x, min_y), (min_x, max_y), (max_x, min_y), (max_x, max_y))
+    return any(math.hypot(x - cx, y - cy) <= radius for cx, cy in corners)

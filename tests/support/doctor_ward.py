@@ -13,8 +13,6 @@ from shmmap.doctor.patient import Machine, Patient
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["IDENTITY", "USER", "Ward", "snapshot"]
-
 USER = 61005
 IDENTITY = DaemonIdentity(
     pid=4242, start_time_ticks=1, pid_namespace=1, epoch=1, instance="default",

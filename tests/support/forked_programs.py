@@ -27,8 +27,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
 
-__all__ = ["ROOT", "fork_program", "forking", "run_verb"]
-
 ROOT: Final = Path(__file__).resolve().parents[2]
 
 _AT_START: Final = ("PYTHON", "LD_", "LC_", "LANG", "NUMBA_")

@@ -19,8 +19,6 @@ from shmmap.chunks.marking import ScanFilter
 from tests.benchmarks.street_data import street
 from tests.support.daemon_process import DaemonProcess
 
-__all__ = ["FILTER", "MAP", "POINTS", "Beside", "Scan", "live_daemon", "percentiles", "scans_of_the_street"]
-
 POINTS = 120_000
 """Of each scan: a recorded one that has fewer has some of them twice."""
 RESOLUTION = 0.2

@@ -14,6 +14,8 @@ import mmap
 import os
 import sys
 import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +33,6 @@ from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.live_map import LiveMap
 from shmmap.daemon.live.map_files import MapFiles, MapSettings
 from shmmap.daemon.live.paging.records import Limits
-from tests.support.slow_occupancy import Voxel
 
 RESOLUTION = 0.2
 SETTINGS = MapSettings(resolution=RESOLUTION)
@@ -126,6 +127,91 @@ def main() -> None:
     made.close()
     folder.close()
     print(f"evicted {len(given_up)}\nmost {most}\ndone", flush=True)
+
+
+# -- a rolling map that is right because it is slow: one dictionary, one voxel after the other, no chunks
+
+
+Voxel = tuple[int, int, int]
+
+
+def walk(start: Voxel, end: Voxel) -> list[Voxel]:
+    """Voxels of a ray, its end excluded: one a step of the longest axis."""
+    delta = [abs(b - a) for a, b in zip(start, end, strict=True)]
+    sign = [-1 if b < a else 1 for a, b in zip(start, end, strict=True)]
+    longest = max(delta)
+    error, at, found = [0, 0, 0], list(start), []
+    for _ in range(longest):
+        found.append((at[0], at[1], at[2]))
+        for axis in range(3):
+            error[axis] += delta[axis]
+            if 2 * error[axis] >= longest:
+                at[axis] += sign[axis]
+                error[axis] -= longest
+    return found
+
+
+@dataclass
+class SlowOccupancy:
+    """Log-odds by voxel; a voxel that is not there is unknown."""
+
+    resolution: float
+    hit: int = 847
+    miss: int = -405
+    clamp_min: int = -1992
+    clamp_max: int = 3476
+    min_range: float = 0.5
+    max_range: float = 5.0
+    min_z: float = -2.0
+    max_z: float = 2.0
+    voxels: dict[Voxel, int] = field(default_factory=dict)
+
+    def voxel(self, x: float, y: float, z: float) -> Voxel:
+        """The voxel that a point lies in."""
+        inverse = 1.0 / self.resolution
+        return math.floor(x * inverse), math.floor(y * inverse), math.floor(z * inverse)
+
+    def marks(
+        self, points: Iterable[Iterable[float]], pose: list[list[float]]
+    ) -> tuple[set[Voxel], set[Voxel]]:
+        """Voxels that a scan hits, and those that it passes through."""
+        near: set[Voxel] = set()
+        far: set[Voxel] = set()
+        origin = [row[3] for row in pose]
+        for point in points:
+            p = [float(value) for value in point]
+            if not all(map(math.isfinite, p)) or not self.min_z <= p[2] <= self.max_z:
+                continue
+            if p[0] * p[0] + p[1] * p[1] + p[2] * p[2] < self.min_range * self.min_range:
+                continue
+            to = [row[0] * p[0] + row[1] * p[1] + row[2] * p[2] + row[3] for row in pose]
+            d = [a - b for a, b in zip(to, origin, strict=True)]
+            squared = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+            if squared >= self.max_range * self.max_range:
+                length = math.sqrt(squared)
+                cut = [o + part / length * self.max_range for o, part in zip(origin, d, strict=True)]
+                far.add(self.voxel(*cut))
+            else:
+                near.add(self.voxel(*to))
+        start = self.voxel(*origin)
+        passed = far - near
+        for end in near | far:
+            passed.update(walk(start, end))
+        return near, passed - near
+
+    def add(self, hits: Iterable[Voxel], misses: Iterable[Voxel]) -> None:
+        """Add evidence; what comes to 0 is unknown."""
+        for voxels, worth in ((hits, self.hit), (misses, self.miss)):
+            for voxel in voxels:
+                value = min(max(self.voxels.get(voxel, 0) + worth, self.clamp_min), self.clamp_max)
+                if value:
+                    self.voxels[voxel] = value
+                else:
+                    self.voxels.pop(voxel, None)
+
+    def insert(self, points: Iterable[Iterable[float]], pose: list[list[float]]) -> None:
+        """Take a scan in."""
+        self.add(*self.marks(points, pose))
 
 
 if __name__ == "__main__":

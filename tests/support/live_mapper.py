@@ -15,9 +15,7 @@ from shmmap.chunks.marks import Marks, encode_marks
 from shmmap.client.live.mapper import _Marked, _Sender
 from tests.support.live_drive import SCANS, drive, marked
 
-__all__ = ["marks_of"]
-
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 
 
 def marks_of(number: int, all_marks: list[Marks]) -> Marks:
@@ -29,7 +27,7 @@ def main() -> None:
     """Send scans, one after the other."""
     endpoint, first, last = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     all_marks, poses = marked(), [pose for _, pose in drive()]
-    sender = _Sender(endpoint, "lidar", "front", "", PATIENCE_S, PATIENCE_S, resume=False)
+    sender = _Sender(endpoint, "lidar", "front", "", TIMEOUT_S, TIMEOUT_S, resume=False)
     opened = sender.opened
     for number in range(first, last + 1):
         data = encode_marks(marks_of(number, all_marks), opened.map_id, opened.mapper, number)
@@ -40,7 +38,7 @@ def main() -> None:
         if sender.error is not None:
             raise sender.error
         print(f"applied {number}", flush=True)
-    sender.save(PATIENCE_S)
+    sender.save(TIMEOUT_S)
     print("done", flush=True)
     sender.end()
 

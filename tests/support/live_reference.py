@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a live map must hold after the drive of `tests.support.live_drive`, from the slow reference."""
+"""Live maps: what one holds after the drive of `tests.support.live_drive`, as files, in a daemon."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 import shmmap
+from shmmap.chunks.chunk_file import encode_chunk
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import ChunkInfo, LiveMap
-from tests.support.live_drive import FILTER, RESOLUTION
-from tests.support.slow_occupancy import SlowOccupancy, Voxel
-
-__all__ = ["held", "mapped_around", "reference"]
+from shmmap.daemon.live.folder import Folder
+from shmmap.daemon.live.map_files import MapFiles, MapSettings
+from tests.support.chunk_memory import ChunkMemory
+from tests.support.daemon_process import DaemonProcess
+from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, SlowOccupancy, Voxel, drive
 
 Scan = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -44,3 +48,58 @@ def held(live: LiveMap, scope: str = "all", area: shmmap.Box | None = None) -> d
 def mapped_around(live: LiveMap, here: ChunkKey) -> list[ChunkInfo]:
     """Return the chunks in memory that touch this one, itself among them; 27 once all have been loaded."""
     return [one for one in live.chunks() if one.key.distance(here) <= 1 and one.state != "loading"]
+
+
+# The directory of a live map in which a short drive is saved
+
+
+def stored_drive(
+    directory: Path,
+    scans: int = 6,
+    *,
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    settings: MapSettings = SETTINGS,
+    codec: str = "zlib",
+) -> dict[Voxel, int]:
+    """Map a drive, moved by metres, and save it; returns all voxels known."""
+    folder = Folder(directory)
+    files = MapFiles(folder, settings)
+    memory = ChunkMemory(RESOLUTION, settings.occupancy, files.map_id)
+    marker = Marker(RESOLUTION, FILTER)
+    for number, (points, pose) in enumerate(drive(scans), 1):
+        pose[:3, 3] += shift
+        memory.apply(marker.mark(points, pose)[0], scan=number)
+    for key, view in memory.chunks.items():
+        files.save(key, encode_chunk(view, codec))
+    files.write_manifest()
+    folder.close()
+    return memory.voxels()
+
+
+def contents(directory: Path) -> dict[str, bytes]:
+    """Every file below a directory."""
+    return {
+        str(path.relative_to(directory)): path.read_bytes()
+        for path in sorted(directory.rglob("*"))
+        if path.is_file()
+    }
+
+
+# A daemon that keeps one live map
+
+
+LIVE_TOML = """\
+[live.lidar]
+resolution = {resolution}
+linger_s = 0.05
+checkpoint_s = {checkpoint}
+path = "{path}"
+"""
+
+LiveDaemon = Callable[..., DaemonProcess]
+
+
+def worker_of(one: DaemonProcess) -> int:
+    """Id of the live worker."""
+    (found,) = (pid for pid in one.children() if b"live.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return found

@@ -46,13 +46,11 @@ from shmmap.origin.remote.published_index import (
 )
 from shmmap.origin.remote.published_object import bare_object, blob_path
 from shmmap.origin.remote.zstd_frame import LEVEL, pack_frame
-from tests.support.faulty_web import faulty_web
-from tests.support.line_process import LineProcess, line_process
+from tests.support.slow_link import LineProcess, line_process
+from tests.support.web_servers import faulty_web
 
 if TYPE_CHECKING:
     from hashlib import _Hash
-
-__all__ = ["CELL_M", "SHARD_M", "MadeMap", "ServedMadeMap", "serve_made_map"]
 
 CELL_M: Final = 20.0
 SHARD_CELLS: Final = 32

@@ -26,8 +26,6 @@ from tests.support.daemon_process import ROOT
 from tests.support.live_drive import FILTER, RESOLUTION, drive
 from tests.support.live_reference import held
 
-__all__ = ["SCANS", "as_client"]
-
 SCANS = 3
 
 

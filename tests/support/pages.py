@@ -1,15 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages of the repository as their readers use them: named blocks of commands and programs, and links."""
+"""Pages of the repository as their readers use them: named blocks, links, commands typed at a terminal."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.support.daemon_process import ROOT
-
-__all__ = ["Page", "all_pages", "heading_anchor", "read_page"]
+from shmmap.testing.environment import without_settings
+from tests.support.daemon_process import ROOT, Deadline, processes_marked, wait_ended, wait_readable
 
 _BLOCK = re.compile(r"^<!-- ([\w-]+) -->\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -67,3 +77,164 @@ def all_pages() -> list[str]:
     folders = (".github", "clients", "shmmap", "systemd", "tests")
     found = [path for folder in folders for path in (ROOT / folder).rglob("*.md")]
     return sorted(str(path.relative_to(ROOT)) for path in [*ROOT.glob("*.md"), *found])
+
+
+# --- a reader who follows a page: a home, terminals, and commands typed as they stand -----------------
+
+_SERVE_S = 180.0  # a cloud is divided and kernels are compiled before a first daemon is ready
+
+
+class Terminal:
+    """A shell of a reader, which keeps directory and environment from one command to the next."""
+
+    def __init__(self, environment: dict[str, str], cwd: Path, state: Path) -> None:
+        self._environment = environment
+        self._cwd = cwd
+        self._state = state
+
+    def _script(self, command: str) -> str:
+        state = shlex.quote(str(self._state))
+        return (
+            f"[ -e {state} ] && . {state}; set -eu\n"
+            f'trap \'{{ export -p; printf "cd %q\\n" "$PWD"; }} >{state}\' EXIT\n{command}\n'
+        )
+
+    def run(self, command: str) -> str:
+        """Run one command to its end; return what it printed."""
+        done = subprocess.run(
+            ["bash", "-c", self._script(command)],
+            cwd=self._cwd,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+    def python(self, program: Sequence[str]) -> str:
+        """Run a program of a page with the terminal's ``python``."""
+        path = self._state.with_suffix(".py")
+        path.write_text("\n".join(program) + "\n", encoding="utf-8")
+        return self.run(f"python {shlex.quote(str(path))}")
+
+    @contextlib.contextmanager
+    def web_server(self, command: str, port: int) -> Iterator[None]:
+        """Run a web server from when it listens until the end of the block."""
+        server = subprocess.Popen(
+            ["bash", "-c", self._script(command).replace(command, f"exec {command}")],
+            cwd=self._cwd, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            waiting = Deadline()
+            with socket.socket() as probe:
+                while waiting(probe.connect_ex(("127.0.0.1", port)) != 0):
+                    assert server.poll() is None, command
+                    time.sleep(0.01)
+            yield
+        finally:
+            server.kill()
+            server.wait()
+
+    @contextlib.contextmanager
+    def serving(self, command: str) -> Iterator[None]:
+        """Run a daemon from its readiness until it is stopped with Ctrl-C."""
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+            address = f"\0{self._state}"  # abstract: no path is too long, nothing is left
+            ready.bind(address)
+            script = self._script(command).replace(command, f"exec {command}")
+            log = self._state.with_suffix(".log")
+            with log.open("w") as output:
+                daemon = subprocess.Popen(
+                    ["bash", "-c", script],
+                    cwd=self._cwd,
+                    env=self._environment | {"NOTIFY_SOCKET": "@" + address[1:]},
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                )
+            try:
+                fd = os.pidfd_open(daemon.pid)
+                came = wait_readable([ready.fileno(), fd], _SERVE_S)
+                os.close(fd)
+                assert came == [ready.fileno()], f"{command}: the daemon did not get ready\n{log.read_text()}"
+                yield
+            finally:
+                daemon.send_signal(signal.SIGINT)
+                ended = wait_ended(daemon.pid)
+                if not ended:
+                    daemon.kill()
+                code = daemon.wait()
+            assert ended, f"{command}: Ctrl-C did not end it"
+            assert code == 0, f"{command}: {code}\n{log.read_text()}"
+
+
+class Reader:
+    """A reader to whom nothing is configured.
+
+    Parameters
+    ----------
+    home
+        An empty directory: home, and where the first terminal opens.
+    path
+        Directories of programs that come before the system's.
+    variables
+        Further variables of the environment.
+    """
+
+    def __init__(self, home: Path, path: Sequence[Path], variables: dict[str, str] | None = None) -> None:
+        self.home = home
+        self.mark = f"{home.name}.{os.getpid()}"
+        self.shm_dir = Path(tempfile.mkdtemp(prefix="shmmap-reader-", dir="/dev/shm"))
+        self._run_dir = Path(tempfile.mkdtemp(prefix="shmmap-reader-"))  # short: it holds sockets
+        self._terminals = 0
+        directories = [str(one) for one in path] + os.environ["PATH"].split(":")
+        self._environment = {
+            **{name: value for name, value in without_settings().items() if name != "PYTHONPATH"},
+            "PATH": ":".join(directories),
+            "HOME": str(home),
+            "XDG_RUNTIME_DIR": str(self._run_dir),
+            "XDG_CACHE_HOME": str(home / ".cache"),
+            "SHMMAP_SHM_DIR": str(self.shm_dir),
+            "SHMMAP_TEST_RUN": self.mark,
+            **(variables or {}),
+        }
+        self._environment.pop("VIRTUAL_ENV", None)
+
+    def terminal(self, cwd: Path | None = None) -> Terminal:
+        """Open a terminal."""
+        self._terminals += 1
+        state = self._run_dir / f"terminal{self._terminals}"
+        return Terminal(self._environment, cwd or self.home, state)
+
+    def leave(self) -> None:
+        """Remove what the reader had; fails where a process or a segment was left behind."""
+        try:
+            waiting = Deadline()
+            while waiting(bool(processes_marked(self.mark))):  # on a busy machine they take a moment to end
+                os.sched_yield()
+            assert list(self.shm_dir.iterdir()) == []
+        finally:
+            shutil.rmtree(self.shm_dir)
+            shutil.rmtree(self._run_dir)
+
+
+def write_program(path: Path, text: str) -> None:
+    """Write a program of a shell."""
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+
+
+@contextlib.contextmanager
+def reader_with_programs(home: Path, **variables: str) -> Iterator[Reader]:
+    """Have a reader whose ``shmmap``, ``python`` and ``python3`` are this tree's and this interpreter's."""
+    programs = home / "bin"
+    programs.mkdir()
+    for name, words in (("shmmap", "-m shmmap.cli"), ("python", ""), ("python3", "")):
+        write_program(programs / name, f'exec "{sys.executable}" {words} "$@"')
+    reader = Reader(home, [programs], {"PYTHONPATH": str(ROOT), **variables})
+    try:
+        yield reader
+    finally:
+        reader.leave()

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-__all__ = ["SVG", "png_pixels", "rasters"]
-
 SVG = "{http://www.w3.org/2000/svg}"
 
 

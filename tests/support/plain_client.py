@@ -20,8 +20,6 @@ from typing import Any, Final
 from tests.support.message_pack import pack, unpack
 from tests.support.segment_reader import SegmentBytes, parse
 
-__all__ = ["PROTOCOL", "PlainClient", "Refused", "Stale", "connect_first", "documented_bytes", "socket_paths"]
-
 PROTOCOL: Final = files("shmmap.protocol").joinpath("PROTOCOL.md").read_text(encoding="utf-8")
 
 _MORE, _LONG, _COMMAND = 1, 2, 4

@@ -8,12 +8,19 @@ import mmap
 import os
 import struct
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+import shmmap
+from shmmap.errors import LoadFailed
+from tests.support.daemon_process import Deadline
+from tests.support.divided_map import DividedMap
+from tests.support.raw_client import RawClient, RawHandle
 
 
 @dataclass
@@ -93,3 +100,45 @@ def map_segment(path: str | Path, session: int | None = None) -> mmap.mmap:
 def read_segment(path: str | Path) -> SegmentBytes:
     """Read a copy of a segment: nothing stays open or mapped."""
     return parse(Path(path).read_bytes())
+
+
+# Whether what the daemon handed out is what the map's files hold
+
+
+def names(cells: Iterable[Any]) -> list[str]:
+    """File names of cells, or of handles."""
+    return [cell.id.rsplit("/", 1)[-1] for cell in cells]
+
+
+def assert_same_points(client: RawClient, handle: RawHandle, made: DividedMap) -> None:
+    """The segment holds exactly what an independent reader finds in the file."""
+    name = handle.id.rsplit("/", 1)[1]
+    segment = read_segment(client.path(handle))
+    source = made.points(name)
+    expected = np.column_stack([source["x"], source["y"], source["z"]])
+    assert segment.columns["xyz"].tobytes() == expected.tobytes()
+    assert segment.columns["intensity"].tobytes() == source["intensity"].tobytes()
+    assert segment.fields["cell_id"] == made.id(name) == handle.id
+    assert segment.fields["box"] == made.box(name) == handle.box
+    assert (segment.epoch, segment.version) == (client.epoch, handle.version)
+    assert handle.points == segment.fields["rows"] == len(expected)
+    assert segment.fields["dropped_points"] == 0
+
+
+def assert_right(cells: shmmap.CellSet, made: DividedMap, wanted: list[str]) -> None:
+    """All of them are there, each with exactly its file's bytes."""
+    assert sorted(cell.id.rsplit("/", 1)[1] for cell in cells) == wanted
+    for cell in cells:
+        expected = made.points(cell.id.rsplit("/", 1)[1])
+        assert cell.xyz[:, 0].tobytes() == expected["x"].tobytes()
+        assert cell["intensity"].tobytes() == expected["intensity"].tobytes()
+
+
+def whole(client: shmmap.Client, x: float, y: float, radius: float) -> shmmap.CellSet:
+    """Ask until every cell is there: one that a loader died of is retried."""
+    found = client.around(x, y, radius, wait=30.0)
+    waiting = Deadline()
+    while waiting(not found.complete):
+        assert all(isinstance(failure, LoadFailed) for failure in found.failed), found
+        found = client.around(x, y, radius, wait=30.0)
+    return found

@@ -24,11 +24,8 @@ from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.served_map import ServedMap
 from shmmap.daemon.live.worker.voxel_lists import VoxelLists
 from shmmap.protocol import live as messages
-from tests.support.live_drive import RESOLUTION, SETTINGS, record_in
-from tests.support.patience import Patience
-from tests.support.slow_occupancy import Voxel
-
-__all__ = ["Served"]
+from tests.support.daemon_process import Deadline
+from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel, record_in
 
 
 class Served:
@@ -93,7 +90,7 @@ class Served:
 
     def until(self, done: Callable[[], object], *, save_all: bool = False) -> None:
         """Turn until something is so."""
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not done()):
             self.turn(save_all=save_all)
             self.live.wait(0.01)

@@ -12,18 +12,9 @@ import os
 from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pytest
-
-__all__ = [
-    "NEEDS_ROOT",
-    "allowed_patterns",
-    "pytest_collectreport",
-    "pytest_runtest_logreport",
-    "pytest_sessionfinish",
-    "pytest_terminal_summary",
-]
 
 NEEDS_ROOT: Final = "needs root (other user accounts, private tmpfs)"
 
@@ -82,3 +73,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("skipped, but not on the list of allowed skips", red=True)
         for test, reason in unexpected.items():
             terminalreporter.write_line(f"{test}: {reason}")
+
+
+# -- open3D, where its package and the libraries of the system that it needs are there
+
+
+def open3d_or_skip() -> Any:
+    """Return Open3D's module; skip the test where it cannot be loaded."""
+    from shmmap.layers.selections import SYSTEM_PACKAGES
+
+    reason = f"Open3D, or one of {' '.join(SYSTEM_PACKAGES)} that it needs, is missing"
+    return pytest.importorskip("open3d", reason=reason, exc_type=ImportError)

@@ -23,8 +23,6 @@ import pytest
 from tests.support.daemon_process import ROOT, processes_marked, wait_ended
 from tests.support.forked_programs import forking
 
-__all__ = ["no_survivors"]
-
 _VARIABLE: Final = "PYTEST_RUN_OF_SHMMAP"  # what begins with SHMMAP_ is kept from many a program
 
 

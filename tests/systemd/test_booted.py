@@ -13,8 +13,8 @@ from types import TracebackType
 import pytest
 
 from tests.support.booted_systemd import BootedSystemd
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.patience import Patience
 from tests.systemd.conftest import MAP, RUN
 
 pytestmark = pytest.mark.root
@@ -159,7 +159,7 @@ def test_a_reload_shows_what_changed(fresh: BootedSystemd, the_map: DividedMap) 
         the_map.write_cell("0_0.pcd", (0, 0), {name: values[:7] for name, values in points.items()})
         fresh.run("systemctl", "reload", "shmmapd")
         # systemd 252 may count the reload as done just before it hears that it began
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((after := alice.ask()) == before):
             pass
         while waiting((state := fresh.properties("shmmapd")["ActiveState"]) == "reloading"):
@@ -181,7 +181,7 @@ def test_the_watchdog_ends_a_daemon_that_hangs_and_the_next_one_is_warm(fresh: B
         names = segments(fresh)
         pid = fresh.properties("shmmapd")["MainPID"]
         fresh.run("kill", f"-{int(signal.SIGSTOP)}", pid)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(fresh.properties("shmmapd")["MainPID"] in ("0", pid)):
             pass
         fresh.run("systemctl", "start", "shmmapd")  # returns when it is ready
@@ -275,7 +275,7 @@ def test_live_maps_have_a_place_and_the_rights_that_they_need(fresh: BootedSyste
     """)
     done = shmmap(fresh, "status", "--json", user="alice")
     assert [row["name"] for row in json.loads(done.stdout)["live"]] == ["lidar"], done.stderr
-    waiting = Patience()  # points are served before live maps are
+    waiting = Deadline()  # points are served before live maps are
     while waiting(fresh.shell("ls -d /dev/shm/shmmap-live.default.marks || true") == ""):
         pass
     places = "/var/lib/shmmap /var/lib/shmmap/state/default /var/lib/shmmap/state/default/live/lidar"
@@ -303,7 +303,7 @@ def test_administrators_reload_and_stop(fresh: BootedSystemd) -> None:
     assert done.returncode == 0, done.stderr
     done = shmmap(fresh, "stop", user="alice")
     assert done.returncode == 0, done.stderr
-    waiting = Patience()
+    waiting = Deadline()
     while waiting((unit := fresh.properties("shmmapd"))["ActiveState"] != "inactive"):
         pass
     assert (unit["Result"], unit["NRestarts"]) == ("success", "0")  # it was meant: nobody starts it again
@@ -364,7 +364,7 @@ def test_what_can_get_better_is_tried_again_until_it_has(
         fresh.shell(hinder.format(map=MAP))
         try:
             assert fresh.run("systemctl", "start", "shmmapd", check=False).returncode != 0
-            waiting = Patience()
+            waiting = Deadline()
             seen: list[str] = []  # empty while it runs
             while waiting(int((unit := fresh.properties("shmmapd"))["NRestarts"]) < 2 or not any(seen)):
                 seen.append(unit["ExecMainStatus"].strip("0"))
@@ -372,7 +372,7 @@ def test_what_can_get_better_is_tried_again_until_it_has(
             assert says in fresh.shell("journalctl --sync; journalctl --no-pager -u shmmapd")
         finally:
             fresh.shell(mend.format(map=MAP))
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((unit := fresh.properties("shmmapd"))["ActiveState"] != "active"):
             assert unit["Result"] != "start-limit-hit"
         with Client(fresh, "alice") as alice:
@@ -387,13 +387,13 @@ def test_a_client_that_waits_does_not_start_for_ever_what_stays_down(fresh: Boot
         fresh.run("systemctl", "start", "shmmapd.socket")
         refused = shmmap(fresh, "query", "--circle", "0,0,25", "--timeout", "60", user="alice")
         assert refused.returncode == 69, refused
-        waiting = Patience()
+        waiting = Deadline()
         while waiting((socket := fresh.properties("shmmapd.socket"))["ActiveState"] != "failed"):
             pass
         assert socket["Result"] == "trigger-limit-hit"
     finally:
         fresh.shell("mv /etc/shmmap/kept /etc/shmmap/shmmap.toml")
-    waiting = Patience()  # the limit still counts for some seconds
+    waiting = Deadline()  # the limit still counts for some seconds
     while waiting(shmmap(fresh, "query", "--circle", "0,0,25", user="alice").returncode != 0):
         fresh.run("systemctl", "start", "shmmapd.socket", check=False)
 

@@ -10,7 +10,7 @@ import pytest
 from shmmap.errors import SegmentCorrupt
 from shmmap.segment.header import read_columns
 from shmmap.segment.layout import COLUMN, COLUMNS_OFFSET
-from tests.support.fuzz_targets import TARGETS, corpus, repair
+from tests.support.fuzzing import TARGETS, corpus, repair
 
 MUTATIONS = 40
 

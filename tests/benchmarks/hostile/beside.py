@@ -16,14 +16,12 @@ from typing import Final
 
 import numpy as np
 
-from tests.benchmarks.hostile.actors import Actor
-from tests.benchmarks.hostile.bystanders import asks_the_daemon, asks_the_echo, echoes, newcomers
-from tests.benchmarks.hostile.report import Report
-from tests.benchmarks.hostile.turns import Turns
+from shmmap.statistics.histogram import Histogram, lower_bound_ns
+from shmmap.statistics.reader import read_statistics
+from tests.benchmarks.hostile.actors import Actor, asks_the_daemon, asks_the_echo, echoes, newcomers
+from tests.benchmarks.hostile.stage import Report
 from tests.support.daemon_process import DaemonProcess
 from tests.support.raw_client import RawClient, circle
-
-__all__ = ["PROBED_M", "Beside"]
 
 OVER_ECHO_MS: Final = 50.0
 OVER_IDLE_MIB: Final = 100.0
@@ -189,3 +187,40 @@ def private_bytes(pid: int) -> int:
 def _figures(times: list[float]) -> str:
     p50, p99 = np.percentile(times, [50, 99])
     return f"p50 {p50:8.2f}  p99 {p99:8.2f}  longest {max(times):8.2f} ms  n={len(times)}"
+
+
+class Turns:
+    """Those since it was made; reading them sends no request."""
+
+    def __init__(self, one: DaemonProcess) -> None:
+        self._one = one
+        self._before, self._longest_before = self._now()
+
+    def _now(self) -> tuple[Histogram, dict[str, float]]:
+        """All turns, and the longest of each kind (ms), of the daemon's life."""
+        found = read_statistics(self._one.instance, self._one.shm_dir)
+        return found.histograms["turn"], {
+            name.removeprefix("longest_turn_").removesuffix("_ns"): value / 1e6
+            for name, value in found.counters.items()
+            if name.startswith("longest_turn_")
+        }
+
+    def quantile_and_longest_ms(self, share: float) -> tuple[float, float]:
+        """What ``share`` of the turns do not exceed, and what none does, ms."""
+        histogram, longest = self._now()
+        found = histogram.since(self._before)
+        last = max((bucket for bucket, count in enumerate(found.counts) if count), default=0)
+        grown = max((ms for kind, ms in longest.items() if ms > self._longest_before[kind]), default=0.0)
+        if grown * 1e6 < lower_bound_ns(last):  # a kind that once had a longer one: only the bucket tells
+            grown = lower_bound_ns(last + 1) / 1e6
+        return (found.quantile_s(share) or 0.0) * 1e3, grown
+
+    def said(self) -> str:
+        """Median, 99.9th percentile and longest, and which kinds had the longest of the daemon's life."""
+        p50, longest = self.quantile_and_longest_ms(0.5)
+        p999, _ = self.quantile_and_longest_ms(0.999)
+        shown = sorted(self._now()[1].items(), key=lambda one: -one[1])[:3]
+        return (
+            f"p50 {p50:.3f}  p99.9 {p999:.2f}  longest {longest:.1f} ms;"
+            f" of the daemon's life: {', '.join(f'{kind} {ms:.1f}' for kind, ms in shown)}"
+        )

@@ -4,31 +4,37 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
-import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import shmmap
-from shmmap.segment.names import segment_prefix, statistics_name
 from tests.benchmarks.hostile.actors import Actor, Orders
 from tests.benchmarks.hostile.beside import Beside
-from tests.benchmarks.hostile.hung_mount import hung_mount
-from tests.benchmarks.hostile.report import Report
-from tests.benchmarks.hostile.stage import Stage, scene
+from tests.benchmarks.hostile.stage import LeftOut, Report, Stage, scene
 from tests.support.daemon_process import DaemonProcess
-from tests.support.divided_map import DividedMap
+from tests.support.disks import HangingDirectory
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 
-EX_CONFIG: Final = 78
-"""Exit code of what stays wrong until somebody changes it: systemd does not try again."""
+
+@contextlib.contextmanager
+def hung_mount(path: Path) -> Iterator[Path]:
+    """Mount a file system that never answers; at the end of the block all that wait in it get an error."""
+    path.mkdir()
+    try:
+        hanging = HangingDirectory(path)
+    except OSError as error:
+        raise LeftOut(f"cannot mount with FUSE: {error.strerror}") from None
+    try:
+        yield path
+    finally:
+        hanging.end()
 
 
 def asks_for_what_hangs(orders: Orders, endpoint: str, names: list[str]) -> int:
@@ -61,78 +67,6 @@ def hung_files(told: Report, stage: Stage) -> None:
         with Beside(told, one), Actor(asks_for_what_hangs, one.endpoint, names) as attacker:
             time.sleep(15.0)
             told.tell(f"asked for them {attacker.end()} times")
-
-
-def exit_code(one: DaemonProcess) -> int:
-    """Start a daemon that is expected to end; 0 if it gets ready instead."""
-    try:
-        one.start()
-    except shmmap.ShmmapError:
-        pass
-    else:
-        one.stop()
-        return 0
-    assert one.process is not None
-    code = one.process.wait(10)
-    one.process = None
-    return code
-
-
-@scene("A14", "What can pass by itself does not keep the service from being started again")
-def full_at_the_start(told: Report, stage: Stage) -> None:
-    """A full tmpfs; names and a lock that somebody else took.  Exit code 78 would be final."""
-    made = stage.new_map()
-
-    def full(one: DaemonProcess) -> Path:
-        filler = Path(one.shm_dir, "filler")
-        fd = os.open(filler, os.O_WRONLY | os.O_CREAT)
-        with contextlib.suppress(OSError):  # it is full
-            while os.write(fd, bytes(4096)):
-                pass
-        os.close(fd)
-        return filler
-
-    def squatted(name: Callable[[str], str]) -> Callable[[DaemonProcess], Path]:
-        def take(one: DaemonProcess) -> Path:
-            path = Path(one.shm_dir + name(one.instance))
-            path.mkdir()  # as a stranger's file in a sticky directory, it cannot be replaced
-            return path
-
-        return take
-
-    cases: dict[str, Callable[[DaemonProcess], Path]] = {
-        "a full tmpfs": full,
-        "its statistics' name is taken": squatted(statistics_name),
-        "its lock's name is taken": squatted(lambda instance: segment_prefix(instance) + "lock"),
-    }
-    for what, prepare in cases.items():
-        with stage.tmpfs("64m") as tmpfs:
-            one = DaemonProcess(made.root, shm_dir=tmpfs)
-            try:
-                obstacle = prepare(one)
-                code = exit_code(one)
-                last = [line for line in one.log.splitlines() if line.strip()][-2:]
-                told.must(f"{what}: exit code {code} is not final", code != EX_CONFIG)
-                if code:
-                    told.tell(f"it said: {' | '.join(last)[:300]}")
-                shutil.rmtree(obstacle) if obstacle.is_dir() else obstacle.unlink()
-                told.must("once that is over it starts", exit_code(one) == 0)
-            finally:
-                one.dispose()
-    with stage.tmpfs("64m") as tmpfs:
-        one = DaemonProcess(made.root, shm_dir=tmpfs)
-        try:
-            path = Path(tmpfs + segment_prefix(one.instance) + "lock")
-            with path.open("w") as file:
-                fcntl.flock(file, fcntl.LOCK_EX)
-                code = exit_code(one)
-                told.must(
-                    "beside somebody's flock in the shm directory it starts", code == 0, f"exit code {code}"
-                )
-                if code:
-                    told.tell(f"it said: {one.log.splitlines()[-1][:300]}")
-        finally:
-            one.dispose()
 
 
 def columns_of(client: RawClient, layer: str) -> dict[str, dict[str, NDArray[Any]]]:
@@ -223,47 +157,3 @@ def touch_the_last(map_directory: Path, side: int) -> None:
     """Change the state of the last cell's file, and so of all that are links to it."""
     last = 20 * (side - 1)
     os.utime(map_directory / "pointcloud_map.pcd" / f"city_{last}_{last}.pcd")
-
-
-@scene("A19", "A reload of a million cells is asked for once, is waited for, and stops nobody")
-def long_reload(told: Report, stage: Stage) -> None:
-    """A million cells, 40 000 of which have changed, are read again by the library, twice."""
-    side = 1000
-    path = stage.many_cells(side)
-    with stage.served(path, "--budget", "1G") as one, Beside(told, one):
-        for number in (1, 2):
-            touch_the_last(path, side)
-            with Actor(reloads, one.endpoint) as operator:
-                took_s, failure = operator.said(600.0)
-            with RawClient(one.endpoint, timeout=120.0) as client:
-                counters = client.ask("stats")[4]
-            told.tell(f"reload {number} took {took_s:.1f} s; the daemon counts {counters['reloads']} of them")
-            told.must("its client got its answer", not failure, failure)
-            told.must("there was one", counters["reloads"] == number)
-
-
-def version_of(client: RawClient, made: DividedMap, name: str, layer: str) -> int:
-    """Version of one cell's layer."""
-    (cell,) = client.cells_reply(client.ask("selected", [made.id(name)], [layer], 60.0)).cells
-    return cell.version
-
-
-@scene("A20", "A version names bytes: whatever else they would be has another one")
-def versions(told: Report, stage: Stage) -> None:
-    """A cell's box is edited, its file is not; and layers of a cell are compared."""
-    made = stage.new_map()
-    with stage.served(made.root) as one, RawClient(one.endpoint) as client:
-        layers = ("points", "voxel(leaf=0.5)", "normals(radius=2)")
-        before = [version_of(client, made, "20_20.pcd", layer) for layer in layers]
-        told.must("three layers of a cell have three versions", len(set(before)) == 3)
-        made.corners["20_20.pcd"] = (20, 21)
-        made.write_metadata()
-        client.ask("reload")
-        after = [version_of(client, made, "20_20.pcd", layer) for layer in layers]
-        for layer, old, new in zip(layers, before, after, strict=True):
-            told.must(f"with another box {layer} has another version", old != new)
-        neighbour = version_of(client, made, "0_20.pcd", "normals(radius=2)")
-        made.change("20_20.pcd", 5)
-        client.ask("reload")
-        now = version_of(client, made, "0_20.pcd", "normals(radius=2)")
-        told.must("with another neighbour a layer that looks at it has another version", neighbour != now)

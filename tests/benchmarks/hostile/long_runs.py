@@ -10,16 +10,13 @@ from contextlib import ExitStack
 from typing import Final
 
 from shmmap.statistics.reader import read_statistics
-from tests.benchmarks.hostile.actors import Actor, Orders
+from tests.benchmarks.hostile.actors import Actor, Orders, fills, walks_cold, works
 from tests.benchmarks.hostile.beside import Beside
-from tests.benchmarks.hostile.bystanders import works
 from tests.benchmarks.hostile.files import reloads, touch_the_last
-from tests.benchmarks.hostile.report import Report
 from tests.benchmarks.hostile.requests import SIDE, asks_for_normals, waits_with_many_requests
 from tests.benchmarks.hostile.segments import ROUTE_VERTICES, budget_for, idles_with_routes
 from tests.benchmarks.hostile.sessions import DESCRIPTORS, leaves_without_a_word, subscribes
-from tests.benchmarks.hostile.stage import Stage, scene
-from tests.benchmarks.hostile.walkers import fills, walks_cold
+from tests.benchmarks.hostile.stage import Report, Stage, scene
 from tests.support.daemon_process import DaemonProcess
 from tests.support.raw_client import RawClient, circle
 

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that ask for very much: many that wait, costly layers, and a client at its quota."""
+"""Requests that ask for very much, and layers that take long, are many, or grow when a file is read."""
 
 from __future__ import annotations
 
+import os
+import struct
 import time
+from pathlib import Path
 from typing import Any, Final
 
 from tests.benchmarks.hostile.actors import Actor, Orders
-from tests.benchmarks.hostile.beside import Beside
-from tests.benchmarks.hostile.report import Report
-from tests.benchmarks.hostile.stage import Stage, scene
+from tests.benchmarks.hostile.beside import Beside, private_bytes
+from tests.benchmarks.hostile.stage import Report, Stage, scene
+from tests.support.daemon_process import ROOT
 from tests.support.message_pack import pack
-from tests.support.raw_client import RawClient
+from tests.support.raw_client import RawClient, circle
 
 SIDE: Final = 141
 """19 881 cells, as many as one request may ask for."""
@@ -80,3 +83,148 @@ def halo_layers(told: Report, stage: Stage) -> None:
         told.tell(
             f"normals(radius=50) of {SIDE**2} cells, every other request also of radius 49: {attacker.end()}"
         )
+
+
+SLOW_S: Final = 5.0
+SLOW_KIND: Final = """
+import time
+import numpy as np
+from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter
+
+
+def build(points, parameters):
+    time.sleep(parameters["seconds"])
+    return LayerTable({"count": np.array([len(points)])}, rows=1, units={"count": ""})
+
+
+SLOW = LayerKind(
+    name="slow", builder_version=1, summary="takes long", borders="none",
+    parameters=(Parameter("seconds", float, "how long", "s", default=5.0, minimum=0.0, maximum=50.0),),
+    columns=(LayerColumn("count", np.dtype("<i8"), "", "", "points"),), build=build,
+)
+"""
+
+
+def install_slow_kind(directory: Path) -> str:
+    """Make a package that offers a layer kind that takes long; returns what to put on the module path."""
+    information = directory / "slow_kind-1.0.dist-info"
+    information.mkdir(parents=True, exist_ok=True)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: slow-kind\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[shmmap.layers]\nslow = slow_kind:SLOW\n")
+    (directory / "slow_kind.py").write_text(SLOW_KIND)
+    return str(directory)
+
+
+def asks_for_slow_layers(orders: Orders, endpoint: str) -> str:
+    """Ask for a layer that takes long, of many cells, and wait."""
+    with RawClient(endpoint, name="slow") as client:
+        client.send("area", circle(-120.0, -120.0, 70.0), [f"slow(seconds={SLOW_S})"], 600.0, None)
+        client.ask("stats")
+        orders.say("asked")
+        while orders.go_on(60.0):
+            pass
+    return "ended"
+
+
+def cold_cell_s(client: RawClient, names: list[str]) -> list[float]:
+    """Seconds that each of some cold cells takes, one after the other."""
+    times = []
+    for name in names:
+        begin_s = time.monotonic()
+        (_,) = client.selected([name], wait=200.0).cells
+        times.append(time.monotonic() - begin_s)
+    return times
+
+
+@scene("A7", "Layers that take long do not hold up somebody else's cold cell")
+def slow_layers(told: Report, stage: Stage) -> None:
+    """About 35 layers of 5 s each are wanted; a cold cell of somebody else, five times."""
+    made = stage.new_map(columns=20, rows=20, points=2000)
+    path = f"{ROOT}{os.pathsep}{install_slow_kind(stage.scratch / 'slow_kind')}"
+    with (
+        stage.served(made.root, "--cache-size", "0", environment={"PYTHONPATH": path}) as one,
+        RawClient(one.endpoint, timeout=300.0) as client,
+        Beside(told, one),
+    ):
+        (_,) = client.ask("area", circle(150, 150, 0.1), ["slow(seconds=0)"], 60.0, None)[4]
+        alone = max(cold_cell_s(client, [f"100_{y}.pcd" for y in range(-200, -100, 20)]))
+        with Actor(asks_for_slow_layers, one.endpoint) as attacker:
+            attacker.said()
+            beside = cold_cell_s(client, [f"120_{y}.pcd" for y in range(-200, -100, 20)])
+        told.tell(f"a cold cell took at most {alone:.3f} s alone; beside slow layers "
+                  + ", ".join(f"{took:.2f}" for took in beside))  # fmt: skip
+        told.limit("longest, over that alone", max(beside) - alone, 1.0, "s")
+
+
+LAYERS: Final = 1491
+"""As many as may be in memory at once, of a map of 22 500 cells."""
+
+
+def uses_up_layers(orders: Orders, endpoint: str) -> dict[str, int]:
+    """Ask for one cell in one layer after the other, and leave."""
+    found = {"layers": 0, "refused": 0}
+    with RawClient(endpoint, name="layers", timeout=120.0) as client:
+        for first in range(0, LAYERS + 64, 16):
+            specs = [f"voxel(leaf={1.0 + number / 1000:.3f})" for number in range(first, first + 16)]
+            reply = client.wait_for_any(client.send("area", circle(10.0, 10.0, 0.1), specs, 60.0, None))
+            found["refused" if reply[0] == "error" else "layers"] += 16
+    return found
+
+
+@scene("A8", "The number of different layers cannot be used up for good")
+def layers_used_up(told: Report, stage: Stage) -> None:
+    """One cell in 1491 different layers and more; then somebody else wants another one."""
+    with stage.served(stage.many_cells(150), "--cache-size", "0") as one, Beside(told, one):
+        with Actor(uses_up_layers, one.endpoint) as attacker:
+            told.tell(f"one client, one cell: {attacker.said(600.0)}")
+        with RawClient(one.endpoint) as client:
+            for layer in ("voxel(leaf=3.3)", "ndt(leaf=2.5)"):
+                reply = client.wait_for_any(
+                    client.send("area", circle(410.0, 410.0, 0.1), [layer], 60.0, None)
+                )
+                told.must(f"somebody else gets {layer}", reply[0] == "cells" and len(reply[4]) == 1, reply[3])
+
+
+BOMB_BYTES: Final = 34 << 20
+LOADER_MIB: Final = 1024.0
+
+
+def write_bomb(path: Path) -> int:
+    """Write a sound compressed PCD file whose points take 88 times its size; returns their bytes."""
+    runs = BOMB_BYTES // 3
+    size = 1 + 264 * runs
+    points = size // 16
+    body = b"\x00\x00" + b"\xe0\xff\x00" * ((points * 16 - 1) // 264)
+    rest = points * 16 - 1 - 264 * ((points * 16 - 1) // 264)
+    body += b"".join(b"\x00\x00" for _ in range(rest))
+    header = (
+        f"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {points}\n"
+        f"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA binary_compressed\n"
+    )
+    path.write_bytes(header.encode() + struct.pack("<II", len(body), points * 16) + body)
+    return points * 16
+
+
+@scene("A9", "A compressed file that grows to gigabytes takes neither the loader nor its neighbours with it")
+def bomb(told: Report, stage: Stage) -> None:
+    """34 MiB that become 3 GiB, wanted as a computed layer, and a neighbour's normals."""
+    made = stage.new_map()
+    nbytes = write_bomb(made.pcd_dir / "40_40.pcd")
+    told.tell(f"{BOMB_BYTES / 1e6:.0f} MB of LZF become {nbytes / 1e9:.2f} GB")
+    with (
+        stage.served(made.root, "--budget", "256M", "--cache-size", "0") as one,
+        Beside(told, one),
+        RawClient(one.endpoint, timeout=300.0) as client,
+    ):
+        for x, layer in ((50.0, "voxel(leaf=1.0)"), (30.0, "normals(radius=5)")):
+            begin_s, peak = time.monotonic(), 0
+            client.send("area", circle(x, 50.0, 0.1), [layer], 200.0, None)
+            while not client.readable():
+                peak = max([peak, *(private_bytes(pid) for pid in one.children())])
+                time.sleep(0.02)
+            reply = client.receive()
+            failed = [(failure[2], failure[3][:100]) for failure in reply[8]]
+            told.tell(
+                f"{layer} at x = {x:g}: {time.monotonic() - begin_s:.1f} s, {len(reply[4])} cells, {failed}"
+            )
+            told.limit("private memory of a loader", peak / (1 << 20), LOADER_MIB, "MiB")

@@ -9,11 +9,9 @@ import time
 from contextlib import ExitStack
 from typing import Final
 
-from tests.benchmarks.hostile.actors import Actor, Orders
+from tests.benchmarks.hostile.actors import Actor, Orders, fills, walks_cold
 from tests.benchmarks.hostile.beside import Beside
-from tests.benchmarks.hostile.report import Report
-from tests.benchmarks.hostile.stage import Stage, scene
-from tests.benchmarks.hostile.walkers import fills, walks_cold
+from tests.benchmarks.hostile.stage import Report, Stage, scene
 from tests.support.daemon_process import DaemonProcess
 from tests.support.raw_client import RawClient, circle
 

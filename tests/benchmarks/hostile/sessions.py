@@ -1,27 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Connections and sessions: subscriptions without end, clients that leave without a goodbye, crowds."""
+"""Connections and sessions: subscriptions, crowds, clients that leave without a goodbye or start together."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import gc
 import math
+import os
 import random
+import signal
 import socket
 import struct
+import subprocess
+import sys
 import time
+from collections import Counter
 from typing import Final
 
 import zmq
 
-from tests.benchmarks.hostile.actors import Actor, Orders
+import shmmap
+from tests.benchmarks.hostile.actors import Actor, Orders, walks_cold
 from tests.benchmarks.hostile.beside import Beside
-from tests.benchmarks.hostile.report import Report
-from tests.benchmarks.hostile.stage import Stage, scene
-from tests.benchmarks.hostile.walkers import walks_cold
+from tests.benchmarks.hostile.stage import Report, Stage, scene
 from tests.support.daemon_process import ROOT
 from tests.support.message_pack import pack
 from tests.support.process_costs import descriptors
-from tests.support.raw_client import RawClient
+from tests.support.raw_client import RawClient, circle
 
 DESCRIPTORS: Final = 1024
 STILL_MAPPED: Final = 100
@@ -204,3 +210,94 @@ def dropped_clients(told: Report, stage: Stage) -> None:
                 after, took_s = walker.said()
             told.tell(f"cold cells in 8 s beside them: {after / took_s * 8:.0f}")
             told.limit("those before over these", before / max(1, after), 1.5)
+
+
+def leases(orders: Orders, paths: list[str]) -> int:
+    """Take and give back a lease of each file again and again, as the daemon does to see who uses it."""
+    signal.signal(signal.SIGIO, signal.SIG_IGN)  # somebody opens what is leased
+    count = 0
+    while orders.go_on():
+        for path in paths:
+            fd = os.open(path, os.O_RDONLY)
+            with contextlib.suppress(OSError):  # somebody has it open
+                fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
+                fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+                count += 1
+            os.close(fd)
+    return count
+
+
+def opens(orders: Orders, endpoint: str, shm_dir: str, seconds: float) -> tuple[int, Counter[str]]:
+    """Ask for cells, map them and let go, for some seconds; how often, and what failed."""
+    count, failures = 0, Counter[str]()
+    with shmmap.connect(endpoint, name="opens", shm_dir=shm_dir) as client:
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            count += 1
+            try:
+                cells = client.around(0.0, 0.0, 50.0)
+                failures.update(str(failure)[:100] for failure in cells.failed)
+                del cells
+            except (shmmap.ShmmapError, OSError) as error:
+                failures[f"{type(error).__name__}: {error}"[:100]] += 1
+    return count, failures
+
+
+@scene("A21", "Opening a segment that is just being looked at, or was swapped for a pipe, harms no request")
+def lease_probes(told: Report, stage: Stage) -> None:
+    """Another process takes leases of the segments all the time; then one of them is a named pipe."""
+    with stage.served(stage.new_map().root) as one, RawClient(one.endpoint) as client:
+        paths = [client.path(cell) for cell in client.area(circle(0, 0, 50)).cells]
+        other_way = f"/proc/self/root{one.shm_dir}"
+        for what, shm_dir in (("the usual directory", ""), ("another path to it", other_way)):
+            with Actor(leases, paths) as prober, Actor(opens, one.endpoint, shm_dir, 10.0) as opener:
+                count, failures = opener.said()
+                told.tell(f"{what}: {count} requests beside {prober.end()} leases; failed {dict(failures)}")
+            told.limit("of them failed", failures.total(), 0)
+        os.unlink(paths[0])
+        os.mkfifo(paths[0])
+        with Actor(opens, one.endpoint, "", 1.0) as opener:
+            begin_s = time.monotonic()
+            try:
+                count, failures = opener.said(60.0)
+                told.tell(f"beside a pipe: {count} requests, {dict(failures)}")
+            finally:
+                told.limit(
+                    "with a pipe in the place of a segment it took", time.monotonic() - begin_s, 10.0, "s"
+                )
+        os.unlink(paths[0])
+
+
+PROGRAMS: Final = 60
+_PROGRAM: Final = """
+import sys
+import shmmap
+with shmmap.connect(sys.argv[1]) as client:
+    assert client.around(0.0, 0.0, 30.0)
+"""
+
+
+@scene("B3", "60 programs that are started together all connect, as at a robot's boot")
+def boot(told: Report, stage: Stage) -> None:
+    """60 processes are started at once, on this machine's processors; three times."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with stage.served(stage.new_map().root) as one, Beside(told, one, newcomers_too=False):
+        for number in range(3):
+            begin_s = time.monotonic()
+            started = [
+                subprocess.Popen(
+                    [sys.executable, "-c", _PROGRAM, one.endpoint],
+                    env=environment, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+                )
+                for _ in range(PROGRAMS)
+            ]  # fmt: skip
+            said = [process.communicate()[1] for process in started]
+            failed = [words for process, words in zip(started, said, strict=True) if process.returncode]
+            took_s = time.monotonic() - begin_s
+            processors = len(os.sched_getaffinity(0))
+            told.limit(
+                f"start {number + 1}: of {PROGRAMS} programs on {processors} processors, {took_s:.1f} s,"
+                " could not connect", len(failed), 0,
+            )  # fmt: skip
+            if failed:
+                told.tell(f"one was told: {failed[0].strip().splitlines()[-1][:160]}")

@@ -1,27 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where scenes play: maps that are made when one needs them, and daemons that serve them."""
+"""Where scenes play (maps made when needed, and daemons that serve them), and what they found."""
 
 from __future__ import annotations
 
 import atexit
 import contextlib
 import os
-import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from tests.benchmarks.hostile.report import LeftOut, Report
 from tests.benchmarks.make_many_cells import make_many_cells
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 
-__all__ = ["SCENES", "Scene", "Stage", "scene"]
-
 MOST_BYTES: Final = 6 << 30
 """Private memory of a daemon, and of each of its loaders: a defect must not take the machine with it."""
+
+
+class LeftOut(Exception):
+    """A scene cannot be played on this machine; the message says why."""
+
+
+@dataclass
+class Report:
+    """What one scene found, printed as it grows: limits that did not hold, and figures for the last table."""
+
+    row: str
+    sentence: str
+    over: list[str] = field(default_factory=list)
+    figures: dict[str, str] = field(default_factory=dict)
+    left_out: str = ""
+
+    def begin(self) -> None:
+        """Print the heading."""
+        print(f"\n{self.row}  {self.sentence}", flush=True)
+
+    def tell(self, text: str) -> None:
+        """Print a line of figures."""
+        print(f"    {text}", flush=True)
+
+    def limit(self, what: str, value: float, most: float, unit: str = "") -> None:
+        """Check a figure."""
+        unit = unit and f" {unit}"
+        held = value <= most
+        self.tell(f"{what}: {value:.6g}{unit}, at most {most:.6g}{unit}" + ("" if held else "  <-- OVER"))
+        if not held:
+            self.over.append(f"{what} {value:.6g}{unit} (limit {most:.6g})")
+
+    def must(self, what: str, held: bool, instead: str = "") -> None:
+        """Check something that is so or not; ``instead`` says what was seen."""
+        seen = f": {instead}" if instead else ""
+        self.tell(f"{what}{' yes' if held else ' NO'}{seen}" + ("" if held else "  <-- OVER"))
+        if not held:
+            self.over.append(f"{what}: no{f' ({instead})' if instead else ''}")
+
+    def verdict(self) -> str:
+        """OK, or what is over the limit."""
+        if self.left_out:
+            return f"left out: {self.left_out}"
+        return "OVER: " + "; ".join(self.over) if self.over else "OK"
+
+    def end(self) -> None:
+        """Print the verdict."""
+        self.tell(f"=> {self.verdict()}")
 
 
 @dataclass
@@ -82,19 +127,6 @@ class Stage:
         finally:
             one.dispose()
 
-    @contextlib.contextmanager
-    def tmpfs(self, size: str) -> Iterator[str]:
-        """Mount a tmpfs of its own while the block runs."""
-        with tempfile.TemporaryDirectory(dir=self.scratch) as path:
-            command = ["mount", "-t", "tmpfs", "-o", f"size={size},mode=755", "tmpfs", path]
-            done = subprocess.run(command, capture_output=True, text=True)
-            if done.returncode:
-                raise LeftOut(f"cannot mount a tmpfs: {done.stderr.strip()}")
-            try:
-                yield path
-            finally:
-                subprocess.run(["umount", path], check=True)
-
 
 def lift(pid: int, niceness: int = -19) -> None:
     """Let the session of a process have its processor time before others; with 0, as others."""
@@ -125,3 +157,45 @@ def scene(row: str, sentence: str) -> Callable[[Play], Play]:
         return play
 
     return add
+
+
+def every_scene() -> dict[str, Scene]:
+    """Return all scenes by name: rows of the findings in their order, then the long runs."""
+    # they import this module, and importing them adds their scenes
+    from tests.benchmarks.hostile import files, long_runs, requests, segments, sessions  # noqa: F401
+
+    def place(name: str) -> tuple[bool, str, int]:
+        is_row = name[1:].isdigit()
+        return not is_row, name[0], int(name[1:]) if is_row else 0
+
+    return {name: SCENES[name] for name in sorted(SCENES, key=place)}
+
+
+def play(scenes: Sequence[Scene], stage: Stage) -> int:
+    """Play; returns 1 if a limit did not hold."""
+    reports = []
+    for one in scenes:
+        report = Report(one.row, one.sentence)
+        report.begin()
+        try:
+            one.play(report, stage)
+        except LeftOut as reason:
+            report.left_out = str(reason)
+        except Exception as error:
+            traceback.print_exc()
+            report.over.append(f"the scene itself: {type(error).__name__}: {error}".split("\n")[0])
+        report.end()
+        reports.append(report)
+    print_table(reports)
+    return int(any(report.over for report in reports))
+
+
+def print_table(reports: Sequence[Report]) -> None:
+    """Print one line a scene; times in ms, memory in MiB over idle."""
+    print(f"\n{'scene':10} {'p99':>9} {'longest':>9} {'echo':>7} {'memory':>7} {'newcomers':>9}  verdict")
+    for one in reports:
+        cells = [one.figures.get(name, "-") for name in ("p99", "probe", "echo", "memory", "newcomers")]
+        widths = (9, 9, 7, 7, 9)
+        shown = " ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+        print(f"{one.row:10} {shown}  {one.verdict()}")
+    print(f"load {os.getloadavg()[0]:.1f}")

@@ -247,7 +247,7 @@ def test_ten_thousand_evaluations_grow_nothing(points: NDArray[np.float64]) -> N
 def test_a_device_that_hangs_holds_nobody(fallback: str | None) -> None:
     words = ["align", "0.5", *([fallback] if fallback else [])]
     done = subprocess.run(
-        [sys.executable, "-m", "tests.support.hanging_device", *words],
+        [sys.executable, "-m", "tests.support.opencl_device", *words],
         capture_output=True,
         text=True,
         cwd=ROOT,

@@ -17,7 +17,7 @@ from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import SegmentCorrupt
 from tests.support.chunk_memory import ChunkMemory
-from tests.support.slow_occupancy import SlowOccupancy
+from tests.support.live_drive import SlowOccupancy
 
 FILTER = ScanFilter(0.2, 9.0, -5.0, 5.0)
 

@@ -17,7 +17,7 @@ from shmmap.chunks.marking import Marker, ScanFilter
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import CHUNK_SIDE, ChunkKey, voxel_indices, voxels_of
 from tests.support.chunk_memory import ChunkMemory
-from tests.support.slow_occupancy import SlowOccupancy, Voxel, walk
+from tests.support.live_drive import SlowOccupancy, Voxel, walk
 
 Points = NDArray[np.float64]
 Stored = list[tuple[ChunkKey, Voxel]]

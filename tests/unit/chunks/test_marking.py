@@ -17,7 +17,7 @@ from shmmap.chunks.marking import Counts, Marker, ScanFilter
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import voxels_of
 from shmmap.errors import BadRequest
-from tests.support.slow_occupancy import SlowOccupancy, Voxel
+from tests.support.live_drive import SlowOccupancy, Voxel
 
 Points = NDArray[np.floating]
 

@@ -19,9 +19,8 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from shmmap.errors import BadRequest
 from tests.support.chunk_memory import ChunkMemory as Unbounded
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import ROOT, Deadline
 from tests.support.live_drive import RESOLUTION, marked
-from tests.support.patience import Patience
 
 IDENTITY = ChunkIdentity(bytes(16), ChunkKey(3, -1, 0), 0.1, -1992, 3476, 0, 0, 7, "map")
 FILLED = 64
@@ -66,7 +65,7 @@ def written(chunk: tuple[ChunkFile, Path]) -> Iterator[ChunkView]:
 def test_copies_of_what_is_written_are_whole(written: ChunkView, opened: int) -> None:
     seen: set[int] = set()
     assert written.bricks.size
-    waiting, copies = Patience(), 0
+    waiting, copies = Deadline(), 0
     while waiting(copies < 3000 or len(seen) < 50):
         copy = read_chunk(opened)
         if copy is None:
@@ -79,7 +78,7 @@ def test_copies_of_what_is_written_are_whole(written: ChunkView, opened: int) ->
 
 def test_without_the_sequence_some_are_torn(written: ChunkView) -> None:
     """Else the test above would find nothing."""
-    waiting, torn = Patience(), 0
+    waiting, torn = Deadline(), 0
     while waiting(torn < 3):
         copy = ChunkView(bytes(written.data))
         torn += int(copy.bricks.min()) != int(copy.bricks.max())

@@ -20,8 +20,8 @@ from shmmap.errors import LimitReached
 from shmmap.segment.attach import attach, attach_writable
 from shmmap.segment.names import retired_name
 from shmmap.segment.pins import in_use, prepare_process
-from tests.support.open3d_package import open3d_or_skip
 from tests.support.process_costs import mappings_under
+from tests.support.skips import open3d_or_skip
 
 if TYPE_CHECKING:
     from tests.unit.client.conftest import Segments

@@ -29,7 +29,7 @@ from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from tests.support.cpp_client import CppClient
 from tests.support.divided_map import DividedMap
-from tests.support.open3d_package import open3d_or_skip
+from tests.support.skips import open3d_or_skip
 from tests.unit.daemon.paging_view import MemoryPages, PagedOrigin, PagedView
 from tests.unit.daemon.whole_daemon import WholeDaemon
 

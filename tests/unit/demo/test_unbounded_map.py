@@ -10,10 +10,8 @@ import numpy as np
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey, voxels_of
 from shmmap.demo.unbounded_map import UnboundedMap
-from tests.support.live_drive import FILTER, RESOLUTION, drive
-from tests.support.live_reference import reference
-from tests.support.slow_occupancy import Voxel
-from tests.support.stored_live_map import stored_drive
+from tests.support.live_drive import FILTER, RESOLUTION, Voxel, drive
+from tests.support.live_reference import reference, stored_drive
 
 
 def unbounded(scans: int) -> UnboundedMap:

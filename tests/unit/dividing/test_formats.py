@@ -18,9 +18,9 @@ from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError
 from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.las_reader import LasReader
+from tests.support.cloud_bytes import write_las
 from tests.support.clouds import map_rows, xyzircaedt
-from tests.support.las_files import write_las
-from tests.support.open3d_package import open3d_or_skip
+from tests.support.skips import open3d_or_skip
 
 
 def run(path: Path, out: Path, **options: Any) -> DividedMap:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from shmmap.dividing.map_writer import MapWriter, WrittenMap
 from shmmap.errors import BadRequest
 from shmmap.origin.map_directory import open_map
-from tests.support.pcd_files import read_pcd
+from tests.support.divided_map import read_pcd
 
 Columns = Mapping[str, NDArray[Any]]
 

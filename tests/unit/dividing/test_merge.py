@@ -18,7 +18,7 @@ from shmmap.errors import BadRequest, CannotWrite, MapDataError, MapMissing
 from shmmap.formats import cloud
 from shmmap.formats.pcd.writer import write_pcd
 from tests.support.clouds import Columns, rows_of, xyzircaedt
-from tests.support.pcd_files import read_pcd
+from tests.support.divided_map import read_pcd
 
 
 def divided(folder: Path, columns: Columns, **options: Any) -> Path:

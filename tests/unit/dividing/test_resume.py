@@ -17,8 +17,8 @@ from shmmap.dividing.settings import DivideSettings
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import InstanceBusy
 from shmmap.formats.pcd.writer import write_pcd
+from tests.support.cloud_bytes import write_las
 from tests.support.clouds import Columns, expected_rows, map_rows, rows_of, xyzircaedt
-from tests.support.las_files import write_las
 
 
 class Interrupt(NoProgress):

@@ -19,7 +19,7 @@ from shmmap.errors import MapDataError, ShmmapError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_cloud, read_pcd
 from shmmap.layers.selections import SYSTEM_PACKAGES, load_open3d
-from tests.support.pcd_bytes import Field, column, pcd
+from tests.support.cloud_bytes import Field, column, pcd
 
 PLY = (
     "ply\nformat {form} 1.0\ncomment made by hand\nelement vertex {count}\n"

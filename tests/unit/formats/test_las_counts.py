@@ -13,7 +13,7 @@ from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError
 from shmmap.formats.cloud import describe, read_cloud
-from tests.support.las_files import POINTS, las_file, patched
+from tests.support.cloud_bytes import POINTS, las_file, patched
 
 
 def said(path: Path) -> str:

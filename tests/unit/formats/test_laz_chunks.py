@@ -15,7 +15,7 @@ import pytest
 from shmmap.errors import MapDataError
 from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.las_reader import _refused
-from tests.support.las_files import POINTS, las_file, patched
+from tests.support.cloud_bytes import POINTS, las_file, patched
 
 CHUNK_POINTS, ITEMS, FIRST_ITEM = 12, 32, 34  # in the LASzip record
 

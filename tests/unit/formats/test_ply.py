@@ -20,7 +20,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.ply_reader import PlyReader
-from tests.support.ply_bytes import random_ply
+from tests.support.cloud_bytes import random_ply
 
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")
 CODES = {"float": "f", "double": "d", "short": "h", "ushort": "H", "uchar": "B", "uint": "I", "int": "i"}

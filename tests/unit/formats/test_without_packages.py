@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from shmmap.formats.pcd.writer import write_pcd
+from tests.support.cloud_bytes import write_las
 from tests.support.daemon_process import ROOT
-from tests.support.las_files import write_las
 
 _WITHOUT = (
     "import sys\n"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest
 from shmmap.geometry import AutowareSquare, Box, Circle, ZRange, distance_to_boxes
-from tests.support.autoware_areas import Rectangle, cylinder_and_box_overlap_exists, f32
+from tests.support.divided_map import Rectangle, cylinder_and_box_overlap_exists, f32
 
 whole = st.integers(-1_000_000, 1_000_000).map(float)
 anywhere = st.floats(-1e6, 1e6)

@@ -14,7 +14,7 @@ from shmmap.errors import InternalError, ShmmapError
 from shmmap.layers import registry
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
 from shmmap.testing.layer_conformance import CORNERS, check_layer
-from tests.support.open3d_package import open3d_or_skip
+from tests.support.skips import open3d_or_skip
 
 SPECS = {
     "points": ["points"],

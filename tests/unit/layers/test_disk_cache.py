@@ -22,9 +22,8 @@ from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.source import Source
-from tests.support.divided_map import random_points
-from tests.support.open3d_package import open3d_or_skip
-from tests.support.pcd_files import write_pcd
+from tests.support.divided_map import random_points, write_pcd
+from tests.support.skips import open3d_or_skip
 
 BOX = (0.0, 0.0, 20.0, 20.0)
 LAYERS = ["points", "ndt(leaf=2.0,min_points=3)", "voxel(leaf=0.5)", "elevation(resolution=1.0)"]

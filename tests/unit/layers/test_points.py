@@ -20,7 +20,7 @@ from shmmap.layers.points import BUILDER_VERSION, build_points
 from shmmap.layers.spec import layer_spec
 from shmmap.segment.header import unpack_header
 from shmmap.segment.source import Source
-from tests.support.pcd_bytes import Field, column, pcd
+from tests.support.cloud_bytes import Field, column, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 BOX = (0.0, 0.0, 20.0, 20.0)

@@ -22,8 +22,7 @@ from shmmap.layers.spec import parse_layer
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.publish_block import PublishBlock, pack_publish_block
 from shmmap.segment.source import Source
-from tests.support.divided_map import random_points
-from tests.support.pcd_files import write_pcd
+from tests.support.divided_map import random_points, write_pcd
 
 BOX: Box = (0.0, 0.0, 20.0, 20.0)
 XYZ = np.dtype("<f4")

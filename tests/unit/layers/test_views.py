@@ -14,7 +14,7 @@ from shmmap.layers.build import build_layer
 from shmmap.layers.ground import ground_height
 from shmmap.testing.layer_conformance import CORNERS, corner, surface
 from tests.support.layer_oracles import columns_of, fitted_height, inliers_of, normal_of
-from tests.support.open3d_package import open3d_or_skip
+from tests.support.skips import open3d_or_skip
 
 TABLES = [name for name in CORNERS if name != "far_apart"]
 

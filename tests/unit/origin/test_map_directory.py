@@ -15,7 +15,7 @@ from shmmap.geometry import Circle
 from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory, open_map
 from shmmap.segment.layout import SourceStamp
-from tests.support.pcd_files import write_pcd
+from tests.support.divided_map import write_pcd
 
 NAMES = ("t_0_0.pcd", "t_20_0.pcd", "t_-20_40.pcd")
 CORNERS = {"t_0_0.pcd": (0, 0), "t_20_0.pcd": (20, 0), "t_-20_40.pcd": (-20, 40)}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.spatial_index import SpatialIndex
-from tests.support.autoware_areas import Rectangle, cylinder_and_box_overlap_exists
+from tests.support.divided_map import Rectangle, cylinder_and_box_overlap_exists
 
 
 def circle_touches(x: float, y: float, radius: float, box: Rectangle) -> bool:

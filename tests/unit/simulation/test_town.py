@@ -13,7 +13,7 @@ import pytest
 from shmmap.errors import BadRequest
 from shmmap.origin.map_directory import open_map
 from shmmap.simulation.town import Town
-from tests.support.pcd_files import read_pcd
+from tests.support.divided_map import read_pcd
 
 ORIGINS = [(0.0, 0.0), (-160.0, 40.0), (89_000.0, 43_000.0)]
 

@@ -11,8 +11,8 @@ import pytest
 
 from shmmap.cli.entry import main
 from shmmap.daemon.live.folder import Folder
-from tests.support.pcd_files import read_pcd
-from tests.support.stored_live_map import contents, stored_drive
+from tests.support.divided_map import read_pcd
+from tests.support.live_reference import contents, stored_drive
 
 Captured = pytest.CaptureFixture[str]
 

@@ -20,8 +20,8 @@ from shmmap.geometry import Circle
 from shmmap.protocol.events import Late, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent
 from tests.support import connections
+from tests.support.connections import says
 from tests.support.divided_map import DividedMap
-from tests.support.moving import says
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
 

@@ -33,9 +33,8 @@ from shmmap.daemon.live.map_files import MapFiles
 from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
 from shmmap.daemon.live.paging.residency import Residency
 from tests.support.chunk_memory import ChunkMemory as Unbounded
-from tests.support.cut_disk import CutDisk
-from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, voxels_on_disk
-from tests.support.slow_occupancy import Voxel
+from tests.support.disks import CutDisk
+from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, Voxel, voxels_on_disk
 
 SIDE_M = CHUNK_SIDE * RESOLUTION
 FAR_AWAY = (900.0, 900.0, 900.0)

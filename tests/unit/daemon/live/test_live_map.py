@@ -20,8 +20,7 @@ from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkMemory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.forked_programs import run_verb
-from tests.support.live_drive import RESOLUTION, SCANS, marked, opened, voxels_on_disk
-from tests.support.slow_occupancy import Voxel
+from tests.support.live_drive import RESOLUTION, SCANS, Voxel, marked, opened, voxels_on_disk
 
 LITTLE = "1500000", "0.05"
 """Of about eight megabytes that the whole map takes, and more than one chunk can; saved all the time."""

@@ -21,7 +21,7 @@ from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings, Row
 from shmmap.daemon.live.unflushed_files import UnflushedFiles
 from shmmap.errors import ConfigError, InstanceBusy, MapDataError
-from tests.support.cut_disk import CutDisk, PowerCut
+from tests.support.disks import CutDisk, PowerCut
 
 SETTINGS = MapSettings(resolution=0.1)
 KEYS = [ChunkKey(0, 0, 0), ChunkKey(-1, 2, 0), ChunkKey(5, 5, -5)]

@@ -33,8 +33,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
-from tests.support.divided_map import random_points
-from tests.support.pcd_files import write_pcd
+from tests.support.divided_map import random_points, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
 PATIENCE_S = 60.0

@@ -27,10 +27,8 @@ from shmmap.segment.pins import in_use, prepare_process
 from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.source import Source
 from shmmap.segment.version import cell_version
-from tests.support.daemon_process import wait_ended, wait_readable
-from tests.support.divided_map import random_points
-from tests.support.pcd_files import write_ascii, write_pcd
-from tests.support.waiting import until
+from tests.support.daemon_process import until, wait_ended, wait_readable
+from tests.support.divided_map import random_points, write_ascii, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
 PATIENCE_S = 60.0

@@ -12,7 +12,7 @@ import pytest
 
 from shmmap.daemon.map.origin_link import LinkNews, OriginLink
 from shmmap.errors import MapDataError, Offline
-from tests.support.patience import Patience
+from tests.support.daemon_process import Deadline
 
 
 class Origin:
@@ -54,7 +54,7 @@ def news(link: OriginLink) -> LinkNews:
 
 
 def until_asked(origin: Origin, times: int) -> None:
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(origin.asked < times):
         time.sleep(0.001)
 
@@ -62,7 +62,7 @@ def until_asked(origin: Origin, times: int) -> None:
 def test_a_doubt_that_is_unfounded_is_over_at_once(origin: Origin) -> None:
     link = origin.link()
     link.doubt()
-    waiting, back = Patience(), False
+    waiting, back = Deadline(), False
     while waiting(not back):
         back = news(link).back
     assert (link.is_out, link.is_doubted, origin.asked) == (False, False, 1)
@@ -76,7 +76,7 @@ def test_it_is_out_until_it_answers(origin: Origin) -> None:
     until_asked(origin, 2)
     assert link.is_out
     origin.answer = False
-    waiting, back = Patience(), False
+    waiting, back = Deadline(), False
     while waiting(not back):
         back = news(link).back
     assert not link.is_out
@@ -90,7 +90,7 @@ def test_what_cannot_be_had_of_one_that_answers_is_asked_for_less_and_less(origi
         link.doubt()
         link.doubt()
         origin.may_answer.set()
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not news(link).back):
             pass
         times.append(time.monotonic())

@@ -20,7 +20,7 @@ from shmmap.errors import BadRequest, Offline
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.segment.version import cell_version, layer_version
-from tests.support.patience import Patience
+from tests.support.daemon_process import Deadline
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -321,7 +321,7 @@ def test_what_an_area_needs_comes_before_the_background(served: Served) -> None:
     served.store.open.clear()
     view = served.view(root)
     view.pages.collect()
-    begun = Patience()
+    begun = Deadline()
     while begun(len(served.store.asked) < BACKGROUND_AT_ONCE):
         time.sleep(0.001)
     needed = view.pages.of_area(Circle(-1200, -1200, 300))
@@ -389,7 +389,7 @@ def test_a_version_that_is_served_no_more_goes(served: Served) -> None:
     gc.disable()
     try:
         del view
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(pages() is not None):  # a thread may still have delivered to it
             time.sleep(0.001)
     finally:

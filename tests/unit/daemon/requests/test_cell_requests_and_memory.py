@@ -21,8 +21,7 @@ from shmmap.protocol.messages import (
     CircleMessage,
     Selected,
 )
-from tests.support.divided_map import DividedMap, make_map
-from tests.support.pcd_files import write_ascii
+from tests.support.divided_map import DividedMap, make_map, write_ascii
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, names
 
 

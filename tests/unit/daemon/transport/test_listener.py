@@ -33,7 +33,7 @@ from shmmap.daemon.transport.zmtp import GREETING, framed
 from shmmap.errors import Busy
 from shmmap.protocol.codec import decode_reply
 from shmmap.statistics.writer import StatisticsWriter
-from tests.support.patience import Patience
+from tests.support.daemon_process import Deadline
 
 LONGEST = 1 << 20
 _READER = """
@@ -91,7 +91,7 @@ class Loop:
 
     def settle(self) -> None:
         """Turn until there is nothing to do."""
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(self.turn(0) > 0):
             pass
 
@@ -108,7 +108,7 @@ class Loop:
     def send(self, one: socket.socket, data: bytes) -> None:
         """Have a bare socket say more than the kernel keeps."""
         one.setblocking(False)
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(len(data) > 0):
             with contextlib.suppress(BlockingIOError):
                 data = data[one.send(data) :]
@@ -167,7 +167,7 @@ def test_libzmq_s_client(loop: Loop) -> None:
     for size in sizes:
         one.send(bytes(size))
     one.send_multipart([b"first", b"second"])
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(loop.heard) < len(sizes) + 1):
         loop.turn()
     assert [(len(body), several) for _, body, several in loop.heard] == [
@@ -206,7 +206,7 @@ def test_a_turn_does_little(loop: Loop) -> None:
     one = loop.raw(GREETING + READY)
     one.sendall(framed(b"x") * 1000)
     most = 0
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(loop.heard) < 1000):
         before = len(loop.heard)
         loop.turn()
@@ -234,7 +234,7 @@ def test_what_nobody_serves_yet_stays_in_the_kernel(loop: Loop) -> None:
     one.sendall(framed(b"x") * 500)
     loop.settle()
     one.close()
-    waits = Patience()
+    waits = Deadline()
     while waits(not loop.ended):
         loop.turn()
 
@@ -259,7 +259,7 @@ def test_replies_that_are_not_read(loop: Loop) -> None:
     expected = GREETING + framed(b"\x05READY\x0bSocket-Type\0\0\0\x06ROUTER\x08Identity\0\0\0\0", 4)
     expected += b"".join(map(framed, sent))
     received = bytearray()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(len(received) < len(expected)):
         received += one.recv(1 << 20)
         loop.settle()

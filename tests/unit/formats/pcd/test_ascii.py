@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError
 from shmmap.formats.pcd.reader import PcdReader
-from tests.support.pcd_bytes import CODES, Field, column, header
+from tests.support.cloud_bytes import CODES, Field, column, header
 
 XYZ = [column(name, "F4", [1.0, 2.0, 3.0]) for name in "xyz"]
 

@@ -13,7 +13,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.causes import CAUSES, refusal
 from shmmap.formats.pcd import header as pcd_header
 from shmmap.formats.pcd.header import PcdHeader, parse_header
-from tests.support.pcd_bytes import Field, column, header, pcd
+from tests.support.cloud_bytes import Field, column, header, pcd
 
 XYZ = [column(name, "F4", [1.0, 2.0]) for name in "xyz"]
 WITH = [*XYZ, column("intensity", "U1", [1, 2])]

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from shmmap.errors import MapDataError
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.reader import PcdReader
-from tests.support.pcd_bytes import Field, column, header, lzf_decode, lzf_encode
+from tests.support.cloud_bytes import Field, column, header, lzf_decode, lzf_encode
 
 PLAIN = [
     b"a",

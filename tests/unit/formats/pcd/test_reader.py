@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from shmmap.errors import MapDataError
 from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd.reader import PcdReader
-from tests.support.pcd_bytes import CODES, Field, Number, body, column, header, pcd
+from tests.support.cloud_bytes import CODES, Field, Number, body, column, header, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 X = column("x", "F4", [0.5, 1.5, -2.5])

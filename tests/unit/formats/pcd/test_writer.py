@@ -20,7 +20,7 @@ from shmmap.errors import BadRequest
 from shmmap.formats.cloud import read_pcd
 from shmmap.formats.pcd import writer as pcd_writer
 from shmmap.formats.pcd.writer import write_pcd
-from tests.support.pcd_bytes import lzf_decode
+from tests.support.cloud_bytes import lzf_decode
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 TYPES = ["f4", "f8", "u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8"]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from shmmap.errors import MapDataError
 from shmmap.segment.header import unpack_header
 from shmmap.segment.layout import SegmentHeader
-from tests.support.mutations import mutate_bytes
-from tests.support.published_map_reader import columns_of
+from tests.support.fuzzing import mutate_bytes
+from tests.support.published_maps import columns_of
 from tests.support.segments import write_segment as segment_of
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")

@@ -24,7 +24,7 @@ from shmmap.origin.remote.directory_store import DirectoryStore
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.statistics.counters import OBJECTS_READ
-from tests.support.trimming import wait_for_trimming
+from tests.support.map_stores import wait_for_trimming
 
 DATA = random.Random(1).randbytes(20_000)
 NAME = hashlib.sha256(DATA).digest()

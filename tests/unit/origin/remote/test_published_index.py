@@ -17,8 +17,8 @@ import xxhash
 
 from shmmap.errors import MapDataError
 from shmmap.segment.version import cell_version
+from tests.support.fuzzing import mutate_bytes
 from tests.support.message_pack import pack, unpack
-from tests.support.mutations import mutate_bytes
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 

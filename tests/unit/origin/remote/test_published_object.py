@@ -18,7 +18,7 @@ from shmmap.errors import MapDataError
 from shmmap.segment.header import unpack_header
 from shmmap.segment.layout import Lattice, SourceStamp
 from shmmap.segment.table_writer import SegmentOrigin, write_table
-from tests.support.mutations import mutate_bytes
+from tests.support.fuzzing import mutate_bytes
 from tests.support.segments import write_segment as segment_of
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")

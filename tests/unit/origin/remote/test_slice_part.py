@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from shmmap.errors import BadRequest, MapDataError
+from tests.support.fuzzing import mutate_bytes
 from tests.support.message_pack import pack, unpack
-from tests.support.mutations import mutate_bytes
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapDataError, MapMissing, Offline
-from tests.support.bucket_server import BucketServer
+from tests.support.map_stores import BucketServer
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 

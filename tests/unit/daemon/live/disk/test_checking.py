@@ -21,7 +21,7 @@ from shmmap.daemon.live.folder import Folder, FolderToRead
 from shmmap.daemon.live.map_files import MapFiles
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 from tests.support.live_drive import SETTINGS
-from tests.support.stored_live_map import contents, stored_drive
+from tests.support.live_reference import contents, stored_drive
 
 
 def checked(directory: Path) -> CheckedMap:

@@ -19,10 +19,9 @@ from shmmap.daemon.live.map_files import MapSettings
 from shmmap.dividing.frame import Translation
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.cloud import read_cloud
-from tests.support.live_drive import RESOLUTION
-from tests.support.pcd_files import read_pcd
-from tests.support.slow_occupancy import Voxel
-from tests.support.stored_live_map import contents, stored_drive
+from tests.support.divided_map import read_pcd
+from tests.support.live_drive import RESOLUTION, Voxel
+from tests.support.live_reference import contents, stored_drive
 
 FORMATS: list[Format] = ["ply", "pcd", "map"]
 FAR = (52000.0, -41000.0, 0.0)

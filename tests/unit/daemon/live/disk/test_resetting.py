@@ -12,7 +12,7 @@ from shmmap.daemon.live.disk.resetting import reset
 from shmmap.daemon.live.folder import Folder
 from shmmap.daemon.live.map_files import MapFiles
 from tests.support.live_drive import SETTINGS
-from tests.support.stored_live_map import contents, stored_drive
+from tests.support.live_reference import contents, stored_drive
 
 OTHERS = {"notes.txt": b"mine", ".hidden.tmp": b"mine"}
 LEFT_OVER = [".0_0_0.chunk.abcd.tmp", ".map.json.abcd.tmp", "9_9_9.chunk.damaged.1", "odd.chunk"]

@@ -13,7 +13,7 @@ from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings
 from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
 from shmmap.daemon.live.worker.mappers import Mappers
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
-from tests.support.cut_disk import CutDisk
+from tests.support.disks import CutDisk
 
 SETTINGS = MapSettings(resolution=0.1)
 

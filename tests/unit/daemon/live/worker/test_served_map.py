@@ -19,10 +19,9 @@ from shmmap.errors import BadRequest, CannotWrite, NotPermitted
 from shmmap.protocol import live as messages
 from shmmap.protocol.messages import ErrorReply
 from tests.support.chunk_memory import ChunkMemory as Unbounded
-from tests.support.live_drive import RESOLUTION, marked
-from tests.support.patience import Patience
+from tests.support.daemon_process import Deadline
+from tests.support.live_drive import RESOLUTION, Voxel, marked
 from tests.support.served_map import Served
-from tests.support.slow_occupancy import Voxel
 
 Serve = Callable[..., Served]
 NOTHING = Marks(
@@ -326,7 +325,7 @@ def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest
     one.answer(one.send(marks, one.open().mapper, 1))
     for _ in range(3):
         one.turn()
-    waiting = Patience()
+    waiting = Deadline()
     while waiting(not blocked.calls):
         pass
     assert blocked.calls == 1

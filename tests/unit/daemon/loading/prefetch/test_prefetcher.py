@@ -19,9 +19,9 @@ from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.events import Loaded, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
+from tests.support.connections import says
 from tests.support.daemon_process import stop
 from tests.support.divided_map import DividedMap, make_map
-from tests.support.moving import says
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon, names
 
 RADIUS_M = 30.0
