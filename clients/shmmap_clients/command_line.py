@@ -18,7 +18,7 @@ import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 from shmmap import needed_packages
 from shmmap.cli.programs import (
@@ -44,7 +44,6 @@ from shmmap.cli.programs import (
 
 __all__ = [
     "ProgressLine",
-    "Verb",
     "add_allow_empty",
     "add_daemon_options",
     "add_json_option",
@@ -68,29 +67,24 @@ __all__ = [
 ]
 
 
-class Verb(Protocol):
-    """A module with one verb of a program."""
-
-    def add_parser(self, subparsers: Any) -> None:
-        """Add the verb's parser, with ``run`` as a default."""
-
-
-def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequence[str] | None = None) -> int:
-    """Run a verb of a program; returns the exit code, as ``shmmap`` itself has them.
+def run_program(
+    name: str, description: str, add_verbs: Sequence[Callable[[Any], None]], argv: Sequence[str] | None = None
+) -> int:
+    """Run a verb of a program and return the exit code, as ``shmmap`` itself has them.
 
     Parameters
     ----------
     name, description
         For the help.
-    verbs
-        Modules as in `Verb`.
+    add_verbs
+        Each adds the parser of a verb, with ``run`` as a default, to the subparsers.
     argv
         Words after the program's name; those of this process by default.
     """
     parser = Parser(prog=name, description=description)
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
-    for verb in verbs:
-        verb.add_parser(subparsers)
+    for add in add_verbs:
+        add(subparsers)
     return _guarded(name, parser, argv)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shmmap_clients.rolling_map.voxel_parts import all_voxels
+from shmmap_clients.rolling_map.live_map import all_voxels
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import read_trajectory, tum_line

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 
-from shmmap_clients.ros_bridge.messages.autoware import PARTIAL, AreaInfo
+from shmmap_clients.ros_bridge.messages import PARTIAL, AreaInfo
 
 from tests.support.ros_maps import NAMES
 from tests.support.ros_peer import ros_peer

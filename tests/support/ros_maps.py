@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo
+from shmmap_clients.ros_bridge.messages import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo
 
 import shmmap
 from tests.support.daemon_process import DaemonProcess

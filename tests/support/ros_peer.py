@@ -20,7 +20,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
-from shmmap_clients.ros_bridge.messages.wire import ServiceKind
+from shmmap_clients.ros_bridge.messages import ServiceKind
 
 from tests.support.dds_domain import URI
 

@@ -32,7 +32,7 @@ from shmmap import (
 )
 from shmmap.formats.npz_writer import write_npz
 from shmmap_clients.elevation_map.grid import ElevationGrid
-from shmmap_clients.elevation_map.rule import ElevationRule
+from shmmap_clients.elevation_map.heights import ElevationRule
 from shmmap_clients.elevation_map.seams import ColumnBox, Columns, Seams, column_boxes
 from shmmap_clients.elevation_map.surface import surface_heights
 

@@ -14,7 +14,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from shmmap.compiling import compiled
-from shmmap_clients.elevation_map.rule import ElevationRule
+from shmmap_clients.elevation_map.heights import ElevationRule
 
 __all__ = ["surface_heights"]
 

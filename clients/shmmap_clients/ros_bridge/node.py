@@ -21,16 +21,26 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
 from shmmap import Client, LiveMap
-from shmmap_clients.ros_bridge import names
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
-from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, MapMetaData
-from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
-from shmmap_clients.ros_bridge.messages.standard import PointCloud2
-from shmmap_clients.ros_bridge.messages.wire import ServiceKind
-from shmmap_clients.ros_bridge.parameters import Parameters
-from shmmap_clients.ros_bridge.participant import close, endpoint_qos, open_participant
+from shmmap_clients.ros_bridge.messages import (
+    DIFFERENTIAL,
+    PARTIAL,
+    SELECTED,
+    MapMetaData,
+    PointCloud2,
+    ServiceKind,
+)
+from shmmap_clients.ros_bridge.parameters import PARAMETER_SERVICES, Parameters
+from shmmap_clients.ros_bridge.participant import (
+    close,
+    endpoint_qos,
+    node_name,
+    open_participant,
+    resolved,
+    topic,
+)
 from shmmap_clients.ros_bridge.service_server import Listening, Requester, ServiceServer
 from shmmap_clients.ros_bridge.status_file import StatusFile
 from shmmap_clients.ros_bridge.worker import Worker
@@ -84,7 +94,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
 
     def name(self, what: str) -> str:
         """Return the name of a service or topic, in full."""
-        return names.resolved(self.names.get(what, NAMES[what]), self.namespace)
+        return resolved(self.names.get(what, NAMES[what]), self.namespace)
 
 
 class RosBridge:
@@ -127,7 +137,7 @@ class RosBridge:
         self._id = secrets.token_bytes(12)
         self._incompatible = _IncompatiblePeers(log)
         with contextlib.ExitStack() as undo:
-            own = names.resolved(names.node_name(settings.node), settings.namespace)
+            own = resolved(node_name(settings.node), settings.namespace)
             services = {one: settings.name(one) for one in NAMES}
             welcome = client.welcome
             self._status = StatusFile(client.endpoint, welcome.instance, settings.domain)
@@ -219,14 +229,14 @@ class RosBridge:
 
     def _latched(self, name: str, kind: type) -> DataWriter:
         qos = endpoint_qos(depth=1, latched=True)
-        return DataWriter(self._participant, Topic(self._participant, names.topic(name), kind), qos)
+        return DataWriter(self._participant, Topic(self._participant, topic(name), kind), qos)
 
     def _add_live(self, live: LiveMap, place: str) -> None:
         qos = endpoint_qos(depth=1)
         clouds = {
             kind: DataWriter(
                 self._participant,
-                Topic(self._participant, names.topic(f"{place}/{kind}_voxels"), PointCloud2),
+                Topic(self._participant, topic(f"{place}/{kind}_voxels"), PointCloud2),
                 qos,
             )
             for kind in ("occupied", "free")
@@ -283,7 +293,7 @@ class RosBridge:
         self._status.write(
             {
                 "domain": self._settings.domain,
-                "node": names.resolved(self._settings.node, self._settings.namespace),
+                "node": resolved(self._settings.node, self._settings.namespace),
                 "clients": clients,
                 "remembered": self._map.requesters,
                 "strangers": self._incompatible.now,

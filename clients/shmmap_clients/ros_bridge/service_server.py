@@ -37,9 +37,8 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.messages.wire import Damaged, ServiceKind, ready_made
-from shmmap_clients.ros_bridge.names import reply_topic, request_topic
-from shmmap_clients.ros_bridge.participant import endpoint_qos
+from shmmap_clients.ros_bridge.messages import Damaged, ServiceKind, ready_made
+from shmmap_clients.ros_bridge.participant import endpoint_qos, reply_topic, request_topic
 
 __all__ = ["Listening", "Request", "Requester", "ServiceServer", "Tries"]
 

@@ -22,17 +22,18 @@ from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, m
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, frame_document
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import (
+    DriveStatistics,
+    RunningErrors,
+    TrajectoryErrors,
+    frame_document,
+    pose_errors,
+)
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
 from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher, decode_pose
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
-    RunningErrors,
-    TrajectoryErrors,
-    pose_errors,
-)
-from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
-from shmmap_clients.scans.thinning import thinned
+from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.scans.scan_file import thinned
 from shmmap_clients.scans.trajectory import Trajectory
 from shmmap_clients.spread import KEPT
 

@@ -17,8 +17,8 @@ from shmmap_clients.ndt_scan_matcher import (
     VoxelMap,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
-from shmmap_clients.ndt_scan_matcher.matching.trust import Evidence, default_nvtl, default_sharpness
+from shmmap_clients.ndt_scan_matcher.drive.follower import Tracking
+from shmmap_clients.ndt_scan_matcher.matching.result import Evidence, default_nvtl, default_sharpness
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street

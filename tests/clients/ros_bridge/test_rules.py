@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import names
+from shmmap_clients.ros_bridge.catalogue import Requesters
 from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
-from shmmap_clients.ros_bridge.requesters import Requesters
 from shmmap_clients.ros_bridge.service_server import Request, Requester
 from shmmap_clients.ros_bridge.worker import MOST_OF_ONE, MOST_WAITING, WaitingRequests
 

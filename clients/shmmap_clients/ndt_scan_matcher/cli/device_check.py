@@ -20,22 +20,19 @@ from numpy.typing import NDArray
 
 import shmmap
 from shmmap_clients.command_line import complain, print_line, write_text
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, DeviceOptions
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import NO_DRIVER_HINT, DeviceInfo, list_devices
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
-from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelCell, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     Evaluation,
     Neighbors,
     Scoring,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 from shmmap_clients.ndt_scan_matcher.matching.result import Result
-from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits, Settings
 
 __all__ = ["BOUNDS", "SCENES", "run"]
 
