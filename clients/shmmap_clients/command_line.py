@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the programs are run: verbs, errors, exit codes, and what is said where nothing was found.
+"""How the programs are run: verbs, errors, exit codes, progress.
 
 Exit codes are those of ``shmmap``: 0 done; 1 a negative answer, or nothing found; 2 wrong usage; 65 bad data;
 66 no file or no map there; 69 no daemon answers, or a package is missing; 70 internal error; 73 an output
@@ -135,7 +135,7 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
 
 @contextlib.contextmanager
 def _ended_as_interrupted() -> Iterator[list[int]]:
-    """Let SIGTERM, and SIGHUP unless it is ignored, end a program as Ctrl-C does: it cleans up after itself.
+    """Make SIGTERM, and SIGHUP unless it is ignored, end a program as Ctrl-C does: it cleans up.
 
     Yields a list that holds the signal then; a second signal ends the process at once.
     """
@@ -227,7 +227,7 @@ class ProgressLine:
         sys.stderr.flush()
 
     def end(self) -> None:
-        """Let what comes next begin a line."""
+        """End the line, so that the next text begins one."""
         if self._shown:
             sys.stderr.write("\n")
             self._shown = ""

@@ -313,7 +313,7 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
     ):
         try:
             assert process.stderr is not None
-            assert publisher.wait_for_listener(LONG_S)
+            assert publisher.wait_for_subscriber(LONG_S)
             assert process.stderr.readline() == f"waiting for scans from {source}\n"
             for number, scan in enumerate(scans):
                 if number == 5:
@@ -378,7 +378,7 @@ def test_nothing_found_exits_1(live_daemon: LiveDaemon, words: Words, tmp_path: 
         ) as process,
     ):  # fmt: skip
         try:
-            assert publisher.wait_for_listener(LONG_S)
+            assert publisher.wait_for_subscriber(LONG_S)
             publisher.send(None)
             _, err = process.communicate(timeout=LONG_S)
         finally:

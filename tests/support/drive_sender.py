@@ -62,7 +62,7 @@ def main() -> None:
     order = to_and_fro(len(files))
     poses = read_trajectory(truth).T_map_sensor[order]
     with ScanPublisher(scan_address) as publisher:
-        if not publisher.wait_for_listener(_PATIENCE_S):
+        if not publisher.wait_for_subscriber(_PATIENCE_S):
             raise SystemExit("nobody wants scans")
         for number, index in enumerate(order):
             columns = {"xyz": read_scan(files[index])}

@@ -120,7 +120,7 @@ def _add_follow(subparsers: Any) -> None:
         type=not_negative,
         default=10.0,
         metavar="M",
-        help="ask for the next map after so many metres (default: 10)",
+        help="distance after which the next map is asked for (default: 10)",
     )
     window.add_argument(
         "--wait",

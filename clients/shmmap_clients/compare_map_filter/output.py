@@ -33,10 +33,10 @@ class Output(Protocol):
     """Takes scans; `close` ends it."""
 
     def write(self, compared: ComparedScan) -> None:
-        """Take one."""
+        """Take a scan."""
 
     def close(self) -> None:
-        """No more come."""
+        """Finish: no more scans come."""
 
 
 def _columns(compared: ComparedScan, mask: bool) -> dict[str, NDArray[Any]]:
@@ -94,13 +94,13 @@ class Stream:
     mask
         As in `PcdDirectory`.
     wait_s
-        How long to wait for the first listener.
+        How long to wait for the first subscriber.
     """
 
     def __init__(self, endpoint: str, *, mask: bool, wait_s: float) -> None:
         self._publisher = ScanPublisher(endpoint)
         self._mask = mask
-        self._publisher.wait_for_listener(wait_s)
+        self._publisher.wait_for_subscriber(wait_s)
 
     def write(self, compared: ComparedScan) -> None:
         """Send one scan."""
@@ -110,7 +110,7 @@ class Stream:
         self._publisher.send(Scan(scan.name, scan.stamp_s, columns, scan.T_map_sensor, no_map))
 
     def close(self) -> None:
-        """Say that it was the last one."""
+        """Publish the end of the stream."""
         self._publisher.send(None)
         self._publisher.close()
 

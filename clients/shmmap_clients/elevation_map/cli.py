@@ -242,7 +242,7 @@ def _build(args: argparse.Namespace) -> int:
 
 
 def _sparse(rule: ElevationRule, measured: int, occupied: int) -> str:
-    """Say that few columns have a height, why, and what helps."""
+    """Return that few columns have a height, why, and what helps."""
     return (
         f"{measured} of {occupied} columns with points ({100 * measured / occupied:.1f} %) have a height;"
         f" a column of {rule.resolution:g} m needs {rule.min_points} points within {rule.tolerance:g} m of"
@@ -258,7 +258,7 @@ def _cache(named: str | None) -> Path:
 
 
 class _Progress:
-    """Shows how far a build is, now and then: cells come faster than anything can be read."""
+    """Shows the progress of a build now and then: cells come faster than a person reads."""
 
     def __init__(self, line: ProgressLine, rows: str) -> None:
         self._line = line

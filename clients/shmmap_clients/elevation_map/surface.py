@@ -49,7 +49,7 @@ def surface_heights(
 @numba.njit(inline="always")
 def _root(parent: Any, member: Any) -> Any:
     while parent[member] != member:
-        parent[member] = parent[parent[member]]  # halves the path for whoever comes next
+        parent[member] = parent[parent[member]]  # halves the path for the next lookup
         member = parent[member]
     return member
 

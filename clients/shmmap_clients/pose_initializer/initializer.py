@@ -152,7 +152,7 @@ class PoseInitializer:
     limits, trust
         Of the final alignments, as in `NdtMatcher`.
     backend, device, fallback
-        Who computes, as in `Settings`.
+        What computes, as in `Settings`.
     threads
         As in `NdtMatcher`.
 
@@ -212,7 +212,7 @@ class PoseInitializer:
         self.close()
 
     def close(self) -> None:
-        """Let the map go, and end the session if it is its own."""
+        """Release the map, and end the session if it is its own."""
         self._window.close()
         self._coarse.close()
         self._fine.close()
@@ -227,7 +227,7 @@ class PoseInitializer:
         rough
             Where it was probably taken.
         effort
-            So many times as many candidates are drawn from the rough pose as by the rules.
+            Factor on the number of candidates that are drawn from the rough pose.
 
         Raises
         ------
@@ -316,7 +316,7 @@ class PoseInitializer:
         return min(grounds, key=lambda ground: abs(ground - stands_at), default=None)
 
     def _take_map(self, rough: RoughPose) -> None:
-        """Have the map around a place."""
+        """Fetch the map around a place."""
         self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)
         voxels = {cell.id: cell for cell in self._window.cells if cell.layer == self._voxels}
         if not voxels:
@@ -344,7 +344,7 @@ class PoseInitializer:
             self._versions = versions
 
     def _window_is_empty(self, rough: RoughPose) -> NoReturn:
-        """Say why there is no map around the place."""
+        """Raise why there is no map around the place."""
         if not self._window.complete:
             raise NoAnswer(
                 f"no cell around ({rough.x:.3f}, {rough.y:.3f}) was loaded within {self.rules.wait_s:g} s",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live map as this program uses it: each scan on its way into it, all its voxels, and what it takes."""
+"""The live map as this program uses it: scans sent to it, all its voxels, its memory."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SIDE: Final = 64  # of a chunk, voxels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedScan:
-    """A scan that was sent.
+    """A scan that was sent to the map.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class MappedScan:
     number
         Of this mapper's scans.
     counts
-        What became of its points.
+        Of its points, by what became of them.
     on_their_way
         Scans that were sent and are not applied, this one included.
     add_s
@@ -108,7 +108,7 @@ class DriveStatistics:
 
     @property
     def counted(self) -> int:
-        """Points that said something: in range, or beyond it."""
+        """Points that counted: in range, or beyond it."""
         return self._counts["near"] + self._counts["far"]
 
     @property

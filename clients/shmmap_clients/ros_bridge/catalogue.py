@@ -21,7 +21,7 @@ from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 __all__ = ["MOST_REQUESTERS", "Catalogue", "Requesters"]
 
 MOST_REQUESTERS: Final = 256
-"""So many clients are remembered: then the one that has not asked for longest is forgotten."""
+"""Clients that are remembered; beyond that, the one with the oldest request is forgotten."""
 
 
 class Catalogue:
@@ -43,12 +43,12 @@ class Catalogue:
         self.map_version: int | None = None
 
     def refresh(self, client: Client) -> None:
-        """Take in what has changed.
+        """Fetch what has changed.
 
         Raises
         ------
         DaemonUnreachable
-            Nobody answers.
+            The daemon does not answer.
         """
         listing = client.metadata(since=self.map_version)
         if listing.map_version == self.map_version:
@@ -100,7 +100,7 @@ class Requesters:
         Parameters
         ----------
         requester
-            Who it is.
+            The client.
         ids
             What it says it has.
         current
@@ -108,7 +108,7 @@ class Requesters:
 
         Returns
         -------
-        One for each id, also for those that nobody knows: in the order given, without repetitions.
+        One for each id, unknown ones included: in the order given, without repetitions.
         """
         known = self._versions.get(requester, {})
         return [HeldCell(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
@@ -121,7 +121,7 @@ class Requesters:
         Parameters
         ----------
         held, removed, sent
-            What it had; what it was told to drop; the versions of what it was sent.
+            What it had; what it was asked to drop; the versions of what it was sent.
         """
         gone = set(removed)
         versions = {one.id: one.version for one in held if one.version is not None and one.id not in gone}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, with the daemon's map behind it.
 
-Three threads: one answers with cells, one with voxels where there is a live map, and one what parameters
-there are. Each takes the requests itself. The last one also looks every second which clients there are.
+Three threads: one answers with cells, one with voxels where there is a live map, and one with the
+parameters. Each takes its requests itself. The last one also looks every second which clients there are.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ NAMES: Final[Mapping[str, str]] = {
     "whole": "pointcloud_map",
     "live": "/shmmap/live",
 }
-"""What services and topics are called in the node's namespace, where `BridgeSettings.names` does not say."""
+"""Names of services and topics in the node's namespace, unless `BridgeSettings.names` has another."""
 _KINDS: Final = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 _LOOK_S: Final = 1.0
 _ADVICE: Final = "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
@@ -164,7 +164,7 @@ class RosBridge:
             self._listening = Listening(self._participant, log)
             for name, kind in PARAMETER_SERVICES.items():
                 self._add(f"{own}/{name}", kind, self._listening)
-            self._tell()
+            self._write_status()
             self._undo = undo.pop_all()
 
     def __enter__(self: _Self) -> _Self:
@@ -186,7 +186,7 @@ class RosBridge:
         return self._status.path
 
     def stop(self) -> None:
-        """Let `run` end; may be called from a signal handler."""
+        """End `run`; may be called from a signal handler."""
         self._stop.set()
 
     def run(self) -> None:
@@ -283,13 +283,13 @@ class RosBridge:
                 look_s = time.monotonic() + _LOOK_S
 
     def _look(self) -> None:
-        """See which clients there are."""
+        """Look which clients there are."""
         clients = [(server, one) for server in self._servers for one in server.requesters()]
         self._map.alive = frozenset(one.name for _, one in clients)
         self._incompatible.look(clients)
-        self._tell(len({one.name for _, one in clients}))
+        self._write_status(len({one.name for _, one in clients}))
 
-    def _tell(self, clients: int = 0) -> None:
+    def _write_status(self, clients: int = 0) -> None:
         self._status.write(
             {
                 "domain": self._settings.domain,
@@ -302,7 +302,7 @@ class RosBridge:
 
 
 class _IncompatiblePeers:
-    """Clients that would wait without end, because their ROS is not that of CycloneDDS.
+    """Clients with an unbounded wait, because their ROS is not that of CycloneDDS.
 
     Parameters
     ----------
@@ -317,19 +317,19 @@ class _IncompatiblePeers:
 
     @property
     def now(self) -> list[dict[str, str]]:
-        """Those there are, at most 32: ``service``, and ``vendor`` of their DDS, which may be empty."""
+        """Incompatible clients now, at most 32: ``service``, and ``vendor`` of their DDS, maybe empty."""
         return self._now
 
     def look(self, clients: Iterable[tuple[ServiceServer, Requester]]) -> None:
-        """Take in which clients there are."""
+        """Note which clients there are, and log each new incompatible one."""
         found = [(server, one) for server, one in clients if one.incompatible]
         for server, one in found:
             if one.name in self._logged:
                 continue
             self._logged[one.name] = None
-            whose = f", speaks {one.vendor}" if one.vendor else ""
+            vendor = f", speaks {one.vendor}" if one.vendor else ""
             self._log(
-                f"a client of {server.name} is no node of rmw_cyclonedds_cpp{whose}, and may wait for ever:"
+                f"a client of {server.name} is no node of rmw_cyclonedds_cpp{vendor}: unbounded wait;"
                 f" {_ADVICE}"
             )
         while len(self._logged) > 8 * _MAX_LISTED:

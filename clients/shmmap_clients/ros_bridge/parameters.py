@@ -127,7 +127,7 @@ class GetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::GetPa
 @dataclass
 @sample
 class GetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameters_Response_"):
-    """They, in the order asked for."""
+    """Those, in the order asked for."""
 
     client: uint64
     number: int64
@@ -147,7 +147,7 @@ class GetParameterTypesRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::G
 @dataclass
 @sample
 class GetParameterTypesResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameterTypes_Response_"):
-    """They, in the order asked for."""
+    """Those, in the order asked for."""
 
     client: uint64
     number: int64
@@ -201,7 +201,7 @@ class SetParametersAtomicallyResponse(
 @dataclass
 @sample
 class ListParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Request_"):
-    """Which parameters are there below these prefixes, so many levels down (0: all)?"""
+    """Which parameters are there below these prefixes, ``depth`` levels down (0: all)?"""
 
     client: uint64
     number: int64
@@ -212,7 +212,7 @@ class ListParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::List
 @dataclass
 @sample
 class ListParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Response_"):
-    """They."""
+    """Their names and prefixes."""
 
     client: uint64
     number: int64
@@ -234,7 +234,7 @@ class DescribeParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::
 class DescribeParametersResponse(
     IdlStruct, typename="rcl_interfaces::srv::dds_::DescribeParameters_Response_"
 ):
-    """They, in the order asked for."""
+    """Those, in the order asked for."""
 
     client: uint64
     number: int64

@@ -136,11 +136,11 @@ def endpoint_qos(user_data: str = "", *, depth: int = 10, latched: bool = False)
     Parameters
     ----------
     user_data
-        What others may read of it.
+        Visible to the other participants.
     depth
         How many samples are kept.
     latched
-        Who comes late gets the last ones, too (``transient_local``).
+        A late reader gets the last samples, too (``transient_local``).
     """
     policies: list[Any] = [
         Policy.Reliability.Reliable(duration(milliseconds=_BLOCKING_MS)),
@@ -156,6 +156,6 @@ def endpoint_qos(user_data: str = "", *, depth: int = 10, latched: bool = False)
 
 
 def close(*entities: Any) -> None:
-    """Close entities and all that they have made, now and not when Python comes round to it."""
+    """Close entities and all that they have made, now and not when Python collects them."""
     for one in entities:
         one.__del__()

@@ -35,7 +35,7 @@ def _silent(note: str) -> None:
 
 @dataclass(slots=True)
 class ScanReader:
-    """Reads the scans of a program, all in one way.
+    """Reads all scans of a program alike.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class ScanReader:
         `screened` leaves out nearer points, metres from the sensor; None: it leaves out nothing, also
         not what is not finite.
     say
-        Called with what a user should know of how files are read, once each.
+        Called once with each note on how files are read.
     too_near, not_finite
         Points that `screened` has left out.
     """

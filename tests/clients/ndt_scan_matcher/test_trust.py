@@ -149,7 +149,9 @@ def test_a_vehicle_is_lost_after_so_many_results(points: NDArray[np.float64]) ->
     tracking = Tracking(3)
     assert tracking.state == "uncertain"
     states = [tracking.update(one) for one in (trusted, doubtful, doubtful, trusted)]
-    assert states == ["tracking", "uncertain", "uncertain", "tracking"], "a trusted one begins anew"
+    assert states == ["tracking", "uncertain", "uncertain", "tracking"], (
+        "a trusted one starts the count again"
+    )
     states = [tracking.update(one) for one in (doubtful, doubtful, doubtful, doubtful, trusted)]
     assert states == ["uncertain", "uncertain", "lost", "lost", "tracking"]
     assert tracking.update(nowhere) == "lost", "there is nothing to wait for"

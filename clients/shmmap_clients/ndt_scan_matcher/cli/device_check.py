@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _checked(info: DeviceInfo, scenes: list[_Scene]) -> Iterator[dict[str, Any]]:
-    """Check a device in every precision that it has, and every way that it reads maps."""
+    """Check a device in every precision that it has, and each memory that it can read maps from."""
     print_line(info.describe())
     options = [DeviceOptions(str(info.index), "float", "copy")]
     if info.fp64:
@@ -254,7 +254,7 @@ def _check_evaluations(scene: _Scene, device: DeviceOptions, most: int) -> _Chec
 
 
 def _check_repeats(scene: _Scene, device: DeviceOptions) -> _Check:
-    """Compare repeats, and a batch of poses with the poses one by one, bit for bit."""
+    """Compare repeats, and a batch of poses with single poses, bit for bit."""
     there = _ready(scene, "opencl", scene.limits, device)
     first, *repeats = [there.evaluate(scene.guess[None], _RADIUS)[0] for _ in range(_REPEATS + 1)]
     unlike = sum(not _same(again, first) for again in repeats)

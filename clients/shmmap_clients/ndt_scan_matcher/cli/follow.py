@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
-    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
     from shmmap_clients.pose_initializer import Relocalizer
     from shmmap_clients.scans.scan_sequence import Scan
 
@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
     from shmmap_clients.ndt_scan_matcher.drive.drive_summary import frame_document
     from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame, Tracking
-    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
     from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.scans.trajectory import read_route, tum_line
@@ -122,16 +122,16 @@ def run(args: argparse.Namespace) -> int:
     plot = DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
     with contextlib.ExitStack() as stack:
-        # all sockets before the first scan: who waits for this program's subscription finds it
+        # all sockets before the first scan: a publisher may wait for this program's subscription
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
         listener = None
         if args.odometry is not None and is_endpoint(args.odometry):
-            listener = OdometryListener(args.odometry)
+            listener = OdometrySubscriber(args.odometry)
             stack.callback(listener.close)
         drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
         tum = drive.open_text(str(args.tum)) if args.tum else None
         if publisher is not None and args.listener_wait > 0:
-            publisher.wait_for_listener(args.listener_wait)
+            publisher.wait_for_subscriber(args.listener_wait)
         first = drive.first()
         if first is None:
             return drive.no_scans()
@@ -208,7 +208,7 @@ def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], 
 def _prediction(
     args: argparse.Namespace,
     T_first: NDArray[np.float64],
-    listener: OdometryListener | None,
+    listener: OdometrySubscriber | None,
     source: Iterable[Scan],
 ) -> MotionPrediction:
     """Return what predicts the next pose; the first velocity is the truth's, or that of the route's times."""
@@ -282,7 +282,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_thin_option(parser, default=1.0)
     parser.add_argument("--frames", type=at_least(1), metavar="N", help="stop after N scans")
     parser.add_argument(
-        "--rate", type=positive, metavar="HZ", help="read a directory no faster than so many scans a second"
+        "--rate", type=positive, metavar="HZ", help="read at most HZ scans a second from a directory"
     )
     window = parser.add_argument_group("map around the vehicle, as in Autoware")
     add_leaf_option(window)
@@ -292,7 +292,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=not_negative,
         default=20.0,
         metavar="M",
-        help="ask for the next map after so many metres (default: 20)",
+        help="distance after which the next map is asked for (default: 20)",
     )
     window.add_argument(
         "--lidar-radius",
@@ -304,7 +304,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     window.add_argument(
         "--route",
         metavar="FILE",
-        help="the way the vehicle will take, in the map's frame: a TUM file, or x,y a line in a .csv; the"
+        help="the vehicle's path, in the map's frame: a TUM file, or x,y a line in a .csv; the"
         " daemon fetches the map along it beforehand (default: along the predicted motion)",
     )
     _add_relocalization_options(parser)
@@ -352,7 +352,7 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
         help="how long to wait for the first subscriber, which then gets every pose (default: 0)",
     )
     out.add_argument(
-        "--plot", type=output_file, metavar="FILE", help="write an SVG of the way, errors and latency"
+        "--plot", type=output_file, metavar="FILE", help="write an SVG of the path, errors and latency"
     )
     out.add_argument(
         "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"

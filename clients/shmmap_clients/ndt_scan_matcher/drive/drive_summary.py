@@ -231,7 +231,7 @@ class DriveStatistics:
         backend: str = "numba",
         fault: DeviceError | None = None,
     ) -> DriveSummary:
-        """Return the drive so far; what its map's updates were like, limits of trust, who computed."""
+        """Return the drive so far; with its map's updates, limits of trust, and the backend."""
         return DriveSummary(
             frames=self.frames,
             converged=self._converged,

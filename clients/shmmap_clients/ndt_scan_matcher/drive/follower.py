@@ -46,7 +46,7 @@ class Tracking:
     Parameters
     ----------
     lost_after
-        So many results in a row that are not trusted, and the vehicle is lost; one without a map suffices.
+        Number of results in a row that are not trusted after which it is lost; one without a map suffices.
     lost
         Whether it is lost at the beginning.
     """
@@ -59,7 +59,7 @@ class Tracking:
         self.state: State = "lost" if lost else "uncertain"
 
     def update(self, result: Result) -> State:
-        """Take in the next result; returns the state."""
+        """Return the state after the next result."""
         if result.trustworthy:
             self._untrusted = 0
             self.state = "tracking"
@@ -73,7 +73,7 @@ class Tracking:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What became of one scan.
+    """The result of one scan.
 
     Attributes
     ----------

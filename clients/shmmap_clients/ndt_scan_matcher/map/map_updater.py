@@ -149,7 +149,7 @@ class MapUpdater:
     name
         Of its own session, for ``shmmap clients``.
     route
-        The way that the vehicle will take, (N, 2), metres, map frame, as far as it is known: the daemon
+        The path that the vehicle will take, (N, 2), metres, map frame, as far as it is known: the daemon
         fetches what lies along it before it is asked for.
 
     Raises

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Newton's method on the score: the alignment itself (algorithm 2 of Magnusson 2009).
 
-Three programs do it, each in its own way (`VARIANTS`): covariances, when to stop, one sign.
+Three programs differ in it (`VARIANTS`): covariances, stop rule, one sign.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Climb = Generator[tuple[NDArray[np.float64], float], Evaluation, None]
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One program's way to align.
+    """One program's alignment.
 
     Attributes
     ----------

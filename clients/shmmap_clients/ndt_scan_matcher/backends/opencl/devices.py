@@ -166,7 +166,7 @@ def choose_device(options: DeviceOptions) -> Device:
         )
     double = info.fp64 if options.precision == "auto" else options.precision == "double"
     if options.memory == "svm" and not double:
-        # A device without doubles has no instruction that reads them.  One that has them, and is told to use
+        # A device without doubles has no instruction that reads them.  One that has them, and is set to use
         # floats because its doubles are slow, would have to subtract and convert nine doubles for each
         # neighbour at each evaluation, at the slow rate and with twice the bytes read; copying does it once.
         raise NoDevice(
@@ -212,11 +212,11 @@ def _found() -> list[tuple[DeviceInfo, Any]]:
 
 
 def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
-    def asked(name: str, otherwise: Any) -> Any:
+    def asked(name: str, default: Any) -> Any:
         try:
             return getattr(handle, name)
         except cl.Error:  # an older driver does not know the question
-            return otherwise
+            return default
 
     kinds = {
         cl.device_type.GPU: "GPU",
