@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the programs are run: verbs, errors, exit codes, and what is said where nothing was found.
+"""How the programs are run: verbs, errors, exit codes, progress.
 
 Exit codes are those of ``shmmap``: 0 done; 1 a negative answer, or nothing found; 2 wrong usage; 65 bad data;
 66 no file or no map there; 69 no daemon answers, or a package is missing; 70 internal error; 73 an output
@@ -18,7 +18,7 @@ import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
 from shmmap import needed_packages
 from shmmap.cli.programs import (
@@ -44,7 +44,6 @@ from shmmap.cli.programs import (
 
 __all__ = [
     "ProgressLine",
-    "Verb",
     "add_allow_empty",
     "add_daemon_options",
     "add_json_option",
@@ -68,29 +67,24 @@ __all__ = [
 ]
 
 
-class Verb(Protocol):
-    """A module with one verb of a program."""
-
-    def add_parser(self, subparsers: Any) -> None:
-        """Add the verb's parser, with ``run`` as a default."""
-
-
-def run_program(name: str, description: str, verbs: Sequence[Any], argv: Sequence[str] | None = None) -> int:
-    """Run a verb of a program; returns the exit code, as ``shmmap`` itself has them.
+def run_program(
+    name: str, description: str, add_verbs: Sequence[Callable[[Any], None]], argv: Sequence[str] | None = None
+) -> int:
+    """Run a verb of a program and return the exit code, as ``shmmap`` itself has them.
 
     Parameters
     ----------
     name, description
         For the help.
-    verbs
-        Modules as in `Verb`.
+    add_verbs
+        Each adds the parser of a verb, with ``run`` as a default, to the subparsers.
     argv
         Words after the program's name; those of this process by default.
     """
     parser = Parser(prog=name, description=description)
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
-    for verb in verbs:
-        verb.add_parser(subparsers)
+    for add in add_verbs:
+        add(subparsers)
     return _guarded(name, parser, argv)
 
 
@@ -141,7 +135,7 @@ def _guarded(name: str, parser: argparse.ArgumentParser, argv: Sequence[str] | N
 
 @contextlib.contextmanager
 def _ended_as_interrupted() -> Iterator[list[int]]:
-    """Let SIGTERM, and SIGHUP unless it is ignored, end a program as Ctrl-C does: it cleans up after itself.
+    """Make SIGTERM, and SIGHUP unless it is ignored, end a program as Ctrl-C does: it cleans up.
 
     Yields a list that holds the signal then; a second signal ends the process at once.
     """
@@ -233,7 +227,7 @@ class ProgressLine:
         sys.stderr.flush()
 
     def end(self) -> None:
-        """Let what comes next begin a line."""
+        """End the line, so that the next text begins one."""
         if self._shown:
             sys.stderr.write("\n")
             self._shown = ""

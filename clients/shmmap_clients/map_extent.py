@@ -25,7 +25,7 @@ def extent_text(bounds: Sequence[float] | None, position: Iterable[float] = ()) 
     bounds
         min_x, min_y, max_x, max_y, metres, map frame; None for a map of nothing.
     position
-        Of the pose, metres, map frame: x, y and perhaps z; by default nothing is said of it.
+        Of the pose, metres, map frame: x, y and perhaps z; by default it is left out.
     """
     pose = ", ".join(f"{value:.3f}" for value in position)
     where = f", the pose is at ({pose})" if pose else ""

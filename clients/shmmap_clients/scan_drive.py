@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scans of a drive, one after the other through one step, and what a program writes and says of each."""
+"""The scans of a drive, one after the other through one step, and what a program prints of each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _Outcome = TypeVar("_Outcome", contravariant=True)
 
 
 class DriveReport(Protocol[_Outcome]):
-    """Counts what became of each scan, and puts it in words."""
+    """Counts the outcomes, and puts each in words."""
 
     def add(self, outcome: _Outcome, /) -> None:
         """Count the next scan."""
@@ -125,7 +125,7 @@ class ScanDrive:
         step
             What is done with a scan.
         report
-            Counts what came of it, and says so on stderr.
+            Counts the outcome, and puts it in words for stderr.
         document
             Returns what ``--json-lines`` writes of it.
         max_scans
@@ -146,12 +146,12 @@ class ScanDrive:
                 self._progress.show(report.line(outcome))
 
     def say(self, text: str, hint: str = "") -> None:
-        """Say on stderr what a reader has to know."""
+        """Print on stderr what a reader has to know."""
         self._progress.end()
         complain(self._name, text, hint)
 
     def no_scans(self) -> int:
-        """Say that there was no scan; returns the exit code."""
+        """Print that there was no scan and return the exit code."""
         return nothing_found(self._args, f"no scan came from {self._args.scans}", name=self._name)
 
     def _begin(self) -> Iterator[Scan]:
@@ -172,7 +172,7 @@ def open_scans(source: str, poses: str | None, stack: ExitStack, reader: ScanRea
     source
         Directory or address.
     poses
-        File with T_map_sensor of each scan of a directory; the first and the last pair are said.
+        File with T_map_sensor of each scan of a directory; the first and the last pair are printed.
     stack
         Closes a subscription.
     reader

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages over ZeroMQ: whoever has something to tell binds an address, whoever wants it subscribes."""
+"""Messages over ZeroMQ: a publisher binds an address, subscribers connect to it."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def is_endpoint(text: str) -> bool:
 
 
 class Publisher:
-    """Binds an endpoint and sends to whoever listens.
+    """Binds an endpoint and sends to all subscribers.
 
     Parameters
     ----------
     endpoint
         Address to bind, such as ``ipc:///tmp/scans`` or ``tcp://127.0.0.1:5600``.
     queue
-        How many messages may wait for a slow reader; it misses what comes while so many wait.
+        How many messages may wait for a slow reader; it misses those beyond.
     linger_ms
-        How long `close` may take to deliver what is queued, and to wait for readers to hear the end.
+        How long `close` may take to deliver what is queued, and to wait until readers have received the end.
 
     Raises
     ------
@@ -48,7 +48,7 @@ class Publisher:
         self._socket = self._context.socket(zmq.XPUB)
         self._socket.sndhwm = queue
         self._socket.linger = self._linger_ms = linger_ms
-        self._listening = False
+        self._has_subscriber = False
         self._last: Sequence[bytes] | None = None
         try:
             self._socket.bind(endpoint)
@@ -65,12 +65,14 @@ class Publisher:
     ) -> None:
         self.close()
 
-    def wait_for_listener(self, timeout_s: float) -> bool:
-        """Wait until somebody listens; False if nobody does in time."""
+    def wait_for_subscriber(self, timeout_s: float) -> bool:
+        """Wait for the first subscriber; False if there is none in time."""
         deadline_s = time.monotonic() + timeout_s
-        while not self._listening and self._socket.poll(max(0, int((deadline_s - time.monotonic()) * 1000))):
-            self._hear()
-        return self._listening
+        while not self._has_subscriber and self._socket.poll(
+            max(0, int((deadline_s - time.monotonic()) * 1000))
+        ):
+            self._read_subscription()
+        return self._has_subscriber
 
     def publish(self, frames: Sequence[bytes], *, last: bool = False) -> None:
         """Send one message.
@@ -80,7 +82,7 @@ class Publisher:
         frames
             Of the message.
         last
-            It is the end, for which readers wait: `close` repeats it until nobody listens any more.
+            It is the end, for which readers wait: `close` repeats it until no subscriber is left.
         """
         self._last = frames if last else None
         self._socket.send_multipart(frames)
@@ -90,21 +92,21 @@ class Publisher:
         deadline_s = time.monotonic() + self._linger_ms / 1000
         while self._last is not None:
             while self._socket.poll(0):
-                self._hear()
-            if not self._listening or time.monotonic() >= deadline_s:
+                self._read_subscription()
+            if not self._has_subscriber or time.monotonic() >= deadline_s:
                 break
             self._socket.send_multipart(self._last)  # a slow reader has missed it, as any other message
             self._socket.poll(_REPEAT_MS)
         self._socket.close()
         self._context.term()
 
-    def _hear(self) -> None:
-        """Take in that the first listener has come, or the last one has gone."""
-        self._listening = self._socket.recv()[:1] == b"\1"
+    def _read_subscription(self) -> None:
+        """Note that the first subscriber has come, or the last one has gone."""
+        self._has_subscriber = self._socket.recv()[:1] == b"\1"
 
 
 class Subscriber:
-    """Hears everything that a publisher sends from now on.
+    """Receives everything that a publisher sends from now on.
 
     Parameters
     ----------
@@ -153,6 +155,6 @@ class Subscriber:
         return self._socket.recv_multipart()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         self._socket.close()
         self._context.term()

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.compare_map_filter import CompareMapFilter, CompareRule
-from shmmap_clients.compare_map_filter.numpy_path import to_map
+from shmmap_clients.compare_map_filter.rule import to_map
 from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 

@@ -75,7 +75,7 @@ int main(int count, char** words) {
   shmmap::Options options;
   options.endpoint = words[1];
   options.name = "control loop";
-  options.patience = std::stod(words[3]);
+  options.timeout = std::stod(words[3]);
   shmmap::WindowOptions kept;
   kept.radius = std::stod(words[2]);
   kept.update_distance = 0.0;  // it asks in each round

@@ -27,9 +27,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose, voxel_cell
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
-from shmmap_clients.scans.scan_file import read_scan
-from shmmap_clients.scans.thinning import thinned
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
+from shmmap_clients.scans.scan_file import read_scan, thinned
 
 from shmmap.simulation.lidar_drive import LidarDrive
 from shmmap.simulation.town import Town

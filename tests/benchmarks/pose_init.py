@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 from shmmap_clients.ndt_scan_matcher import pose_from_matrix
 from shmmap_clients.ndt_scan_matcher.cli.machine import warmup_alignment
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
-from shmmap_clients.scans.scan_file import read_scan
-from shmmap_clients.scans.thinning import thinned
+from shmmap_clients.scans.scan_file import read_scan, thinned
 
 from shmmap import connect
 from shmmap.testing.daemon_process import DaemonProcess

@@ -172,7 +172,7 @@ def run_three_programs(
         for program in programs.values():
             stack.enter_context(program)
         for output in outputs:
-            if not output.wait_for_listener(_ANSWER_S):
+            if not output.wait_for_subscriber(_ANSWER_S):
                 raise InternalError(f"no program connects to {output.endpoint}")
         for scan in scans:
             answers.wait(result.scans - _ON_THEIR_WAY, programs)

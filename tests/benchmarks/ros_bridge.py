@@ -39,7 +39,7 @@ import struct, sys
 from cyclonedds.core import WaitSet
 from cyclonedds.util import duration
 from shmmap_clients.ros_bridge.cdr import CdrWriter
-from shmmap_clients.ros_bridge.messages.autoware import PARTIAL
+from shmmap_clients.ros_bridge.messages import PARTIAL
 from shmmap_clients.ros_bridge.participant import open_participant
 from shmmap_clients.ros_bridge.service_server import ServiceServer
 
@@ -136,7 +136,7 @@ def main() -> None:
 
 def measure(arguments: argparse.Namespace, daemon: DaemonProcess, bridge: BridgeProcess, domain: int) -> None:
     """Measure and print."""
-    from shmmap_clients.ros_bridge.messages.autoware import PARTIAL, AreaInfo
+    from shmmap_clients.ros_bridge.messages import PARTIAL, AreaInfo
 
     from tests.support.ros_peer import ros_peer
 

@@ -48,7 +48,9 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> Non
     assert output_file("new.svg") == Path("new.svg"), "the working directory"
 
 
-def test_programs_tell_it_without_a_traceback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_output_that_cannot_be_written_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     nowhere = str(tmp_path / "nowhere" / "out")
     assert ndt(["follow", "--scans", str(tmp_path), "--plot", f"{nowhere}.svg"]) == 73
     assert ndt(["follow", "--scans", str(tmp_path), "--tum", nowhere]) == 73
@@ -135,13 +137,13 @@ def test_bin_columns_are_named_or_said(tmp_path: Path, capsys: pytest.CaptureFix
     words = ["apply", "--map", f"{tmp_path}/doubles.bin", "--scan", f"{tmp_path}/doubles.bin", "--json"]
     words += ["--backend", "numpy", "--allow-empty"]
     assert compare(words) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["points"] == 3000
-    assert "rows of 4 float64, x y z intensity, by the look of its numbers; --bin-columns" in told.err
+    output = capsys.readouterr()
+    assert json.loads(output.out)["points"] == 3000
+    assert "rows of 4 float64, x y z intensity, by the look of its numbers; --bin-columns" in output.err
     assert compare([*words, "--bin-columns", "x:f8,y,z,_"]) == 0
-    told = capsys.readouterr()
-    assert json.loads(told.out)["points"] == 3000
-    assert "--bin-columns" not in told.err
+    output = capsys.readouterr()
+    assert json.loads(output.out)["points"] == 3000
+    assert "--bin-columns" not in output.err
     assert compare([*words, "--bin-columns", "x,y,z,_"]) == 65
     assert "doubles.bin: read as rows of 4 float32" in capsys.readouterr().err
     with pytest.raises(SystemExit) as ended:

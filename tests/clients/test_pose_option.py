@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
+from shmmap_clients.shared_options import add_pose_format_option, add_pose_option, pose_from, pose_text
 
 from shmmap import BadRequest
 

@@ -121,7 +121,7 @@ def test_the_scan_after_the_last_one_is_not_waited_for(
     report = Report()
     with ExitStack() as stack, ScanPublisher(endpoint) as publisher:
         drive = ScanDrive(options(endpoint), "program", None, stack)
-        assert publisher.wait_for_listener(30.0)
+        assert publisher.wait_for_subscriber(30.0)
         for _ in range(2):
             publisher.send(Scan("one", 0.0, {"xyz": np.full((3, 3), 9.0, np.float32)}))
         drive.run(size, report, max_scans=2)  # there is no third
@@ -134,7 +134,7 @@ def test_no_scan_is_a_negative_answer(tmp_path: Path, capsys: pytest.CaptureFixt
     with ExitStack() as stack:
         drive = ScanDrive(options(endpoint, quiet=True), "program", None, stack)
         with ScanPublisher(endpoint) as publisher:
-            assert publisher.wait_for_listener(30.0)
+            assert publisher.wait_for_subscriber(30.0)
             publisher.send(None)
             assert drive.first() is None
         drive.run(size, Report())
@@ -163,8 +163,8 @@ def test_scans_as_an_option_names_them(scans: str, poses: str, tmp_path: Path) -
         with pytest.raises(BadRequest, match="publisher"):
             open_scans(endpoint, poses, stack, ScanReader())
         publisher = stack.enter_context(ScanPublisher(endpoint))
-        heard = open_scans(endpoint, None, stack, ScanReader())
-        assert publisher.wait_for_listener(30.0)
+        received = open_scans(endpoint, None, stack, ScanReader())
+        assert publisher.wait_for_subscriber(30.0)
         for scan in (*posed[:2], None):
             publisher.send(scan)
-        assert [scan.stamp_s for scan in heard] == [0.0, 0.5]
+        assert [scan.stamp_s for scan in received] == [0.0, 0.5]

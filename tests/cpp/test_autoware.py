@@ -171,15 +171,15 @@ def test_a_changed_cell_comes_again(
 def test_ids_that_were_not_handed_out_here(
     daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
-    """Those of the area come again, as nobody knows what they name; the others are removed, each once."""
+    """Those of the area come again, as what they name is unknown; the others are removed, each once."""
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
     inside, outside = divided_map.id("0_0.pcd"), divided_map.id("-60_-60.pcd")
-    held = ["nobody.pcd", outside, inside, "/nowhere/0_0.pcd", "nobody.pcd", "40_40.pcd", inside]
+    held = ["unknown.pcd", outside, inside, "/nowhere/0_0.pcd", "unknown.pcd", "40_40.pcd", inside]
     answer = node.ask("ask", 10, 10, 0, ";".join(held))
     assert [line[0] for line in of(answer, "cell")] == [inside]
     assert [line[0] for line in of(answer, "remove")] == [
-        "nobody.pcd",
+        "unknown.pcd",
         outside,
         "/nowhere/0_0.pcd",
         "40_40.pcd",
@@ -238,16 +238,16 @@ def test_without_a_daemon(daemon: DaemonFactory, node: AutowareNode, divided_map
     one.stop()
     node.ask("loader", one.endpoint, 0.2, 5)
     for command, nothing in (("update", "nullptr"), ("grids", "nothing")):
-        told, answer = node.ask(command, *EVERYTHING)
-        assert told[0] == "log"
-        assert one.endpoint in told[1]
+        logged, answer = node.ask(command, *EVERYTHING)
+        assert logged[0] == "log"
+        assert one.endpoint in logged[1]
         assert answer == [nothing]
     one.start()
     warm(one)
     assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
     one.stop()
-    told, answer = node.ask("update", *EVERYTHING)
-    assert (told[0], answer) == ("log", ["nullptr"])
+    logged, answer = node.ask("update", *EVERYTHING)
+    assert (logged[0], answer) == ("log", ["nullptr"])
     divided_map.change("0_0.pcd", seed=3)
     one.start()
     warm(one)
@@ -258,9 +258,9 @@ def test_a_daemon_that_hangs(daemon: DaemonFactory, node: AutowareNode, divided_
     one = daemon(divided_map.root)
     stop(one.pid)
     node.ask("loader", one.endpoint, 0.2, 0.2)
-    told, answer = node.ask("update", *EVERYTHING)
-    assert told[0] == "log"
-    assert "does not answer" in told[1]
+    logged, answer = node.ask("update", *EVERYTHING)
+    assert logged[0] == "log"
+    assert "does not answer" in logged[1]
     assert answer == ["nullptr"]
     one.send(signal.SIGCONT)
     node.ask("loader", one.endpoint, 60, 30)
@@ -270,10 +270,10 @@ def test_a_daemon_that_hangs(daemon: DaemonFactory, node: AutowareNode, divided_
 def test_what_is_refused(daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 5)
-    (told, nothing) = node.ask("update", 0, 0, -1)
-    assert (told[0], nothing) == ("log", ["nullptr"])
-    (told, nothing) = node.ask("update", "nan", 0, 10)
-    assert (told[0], nothing) == ("log", ["nullptr"])
+    (logged, nothing) = node.ask("update", 0, 0, -1)
+    assert (logged[0], nothing) == ("log", ["nullptr"])
+    (logged, nothing) = node.ask("update", "nan", 0, 10)
+    assert (logged[0], nothing) == ("log", ["nullptr"])
     assert len(of(node.ask("update", *EVERYTHING), "cell")) == 36
 
 
@@ -331,7 +331,7 @@ def test_what_is_not_loaded_in_time(
 def test_an_area_larger_than_the_daemon_s_memory(
     daemon: DaemonFactory, node: AutowareNode, tmp_path: Path
 ) -> None:
-    """Cells are let go of as they are copied: there is room for the next ones."""
+    """Cells are released as they are copied: there is room for the next ones."""
     made = make_map(tmp_path / "map", points=20_000)
     one = daemon(made.root, "--budget", "6M")
     node.ask("loader", one.endpoint, 60, 5)

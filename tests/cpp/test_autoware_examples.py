@@ -84,7 +84,7 @@ def test_leaves_along_a_drive(daemon: DaemonFactory, divided_map: DividedMap, tm
 def test_requesters_of_the_service(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, types: str
 ) -> None:
-    """Each gets everything once, whoever asks at the same time; two of one name share what they hold."""
+    """Each gets everything once, also of requests at the same time; two of one name share what they hold."""
     if shutil.which("g++") is None:
         pytest.skip("g++ is missing")
     program = compiled_with(types, ROOT / "tests" / "support" / "requesters.cpp", tmp_path)

@@ -151,13 +151,13 @@ def test_the_examples_run_beside_a_daemon(divided_map: DividedMap, tmp_path: Pat
         (serve,) = PAGE.commands("serve")
         with reader.terminal().serving(serve.replace("MAP", str(divided_map.root))):
             user = reader.terminal()
-            told = {}
+            printed = {}
             for name, library in (("ndt-leaves", "eigen3"), ("pcl-cloud", "pcl_common")):
                 if subprocess.run(["pkg-config", "--exists", library], check=False).returncode:
                     pytest.skip(f"{library} is missing (libeigen3-dev, libpcl-dev)")
                 for command in PAGE.commands(name):
-                    told[name] = user.run(command)
+                    printed[name] = user.run(command)
     finally:
         reader.leave()
-    assert told["ndt-leaves"].count("cells") == 8
-    assert "0 cells, 0 points" in told["pcl-cloud"]  # it was asked for a place of the demonstration's town
+    assert printed["ndt-leaves"].count("cells") == 8
+    assert "0 cells, 0 points" in printed["pcl-cloud"]  # it was asked for a place of the demonstration's town

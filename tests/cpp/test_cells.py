@@ -110,7 +110,7 @@ def test_what_it_lets_go_can_be_freed(
 def test_a_hoarder_meets_its_quota_and_others_get_theirs(
     daemon: DaemonFactory, cpp_program: Path, divided_map: DividedMap
 ) -> None:
-    """It is told so of each cell, and keeps what it has."""
+    """Each cell is reported so, and the client keeps what it has."""
     one = daemon(divided_map.root, "--budget", "1M", "--session-quota", "0.5")
     with CppClient(cpp_program, one.endpoint) as hoarder, CppClient(cpp_program, one.endpoint) as modest:
         held: Any = hoarder.around(0, 0, 500, wait=10.0)

@@ -82,7 +82,7 @@ def test_a_killed_daemon_is_found_again(
     one.kill()
     codes = loop.go(250, wait=0.0, period=0.0).codes
     assert set(codes) <= {"-", "stale_socket"}
-    assert codes["stale_socket"] >= 248, "said at once where nobody listens"
+    assert codes["stale_socket"] >= 248, "reported at once without a daemon"
     one.start()
     is_whole(loop, one)
     assert loop.close() == 0

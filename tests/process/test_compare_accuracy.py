@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shmmap_clients.compare_map_filter import CompareMapFilter, CompareRule
-from shmmap_clients.compare_map_filter.numpy_path import to_map
+from shmmap_clients.compare_map_filter.rule import to_map
 from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 

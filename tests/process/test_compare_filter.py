@@ -253,7 +253,7 @@ def test_sockets_to_sockets(
             stdout=subprocess.DEVNULL,
         )
         try:
-            assert publisher.wait_for_listener(LONG_S)
+            assert publisher.wait_for_subscriber(LONG_S)
             for scan in drive:
                 publisher.send(scan)
             publisher.send(None)

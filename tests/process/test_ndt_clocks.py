@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
 from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence

@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matrix_from_pose
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, pose_errors
 from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
 from shmmap_clients.scans.scan_sequence import ScanSequence
 from shmmap_clients.scans.trajectory import read_trajectory

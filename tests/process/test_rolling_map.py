@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from shmmap_clients.rolling_map.voxel_parts import all_voxels
+from shmmap_clients.rolling_map.live_map import all_voxels
 from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import read_trajectory, tum_line
@@ -310,7 +310,7 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
     ):
         try:
             assert process.stderr is not None
-            assert publisher.wait_for_listener(LONG_S)
+            assert publisher.wait_for_subscriber(LONG_S)
             assert process.stderr.readline() == f"waiting for scans from {source}\n"
             for number, scan in enumerate(scans):
                 if number == 5:
@@ -375,7 +375,7 @@ def test_nothing_found_exits_1(live_daemon: LiveDaemon, words: Words, tmp_path: 
         ) as process,
     ):  # fmt: skip
         try:
-            assert publisher.wait_for_listener(LONG_S)
+            assert publisher.wait_for_subscriber(LONG_S)
             publisher.send(None)
             _, err = process.communicate(timeout=LONG_S)
         finally:

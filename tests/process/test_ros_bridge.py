@@ -15,9 +15,15 @@ import pytest
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES
-from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo, MapMetaData
-from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
-from shmmap_clients.ros_bridge.messages.standard import PointCloud2
+from shmmap_clients.ros_bridge.messages import (
+    DIFFERENTIAL,
+    PARTIAL,
+    SELECTED,
+    AreaInfo,
+    MapMetaData,
+    PointCloud2,
+)
+from shmmap_clients.ros_bridge.parameters import PARAMETER_SERVICES
 
 from tests.process.conftest import DaemonFactory
 from tests.support.bridge_process import (
@@ -214,7 +220,7 @@ def test_the_whole_map_is_one_cloud_where_it_is_asked_for(
 def test_parameters_are_there_and_cannot_be_set(
     bridge: BridgeProcess, peer: RosPeer, divided_map: DividedMap
 ) -> None:
-    from shmmap_clients.ros_bridge.messages.parameters import Parameter, ParameterValue
+    from shmmap_clients.ros_bridge.parameters import Parameter, ParameterValue
 
     clients = {
         name: peer.client(f"/map/pointcloud_map_loader/{name}", kind)

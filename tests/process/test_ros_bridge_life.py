@@ -16,8 +16,8 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo
-from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
+from shmmap_clients.ros_bridge.messages import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo
+from shmmap_clients.ros_bridge.parameters import PARAMETER_SERVICES
 
 from tests.process.conftest import DaemonFactory
 from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment, built_fast_peer

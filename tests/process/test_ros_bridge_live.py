@@ -13,8 +13,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge.messages.bonxai import FREE, OCCUPIED
-from shmmap_clients.ros_bridge.messages.standard import PointCloud2
+from shmmap_clients.ros_bridge.messages import FREE, OCCUPIED, PointCloud2
 
 import shmmap
 from tests.support.bridge_process import PROGRAM, BridgeProcess, bridge_environment

@@ -65,7 +65,7 @@ void make(const std::vector<std::string>& words) {
   options.client.endpoint = words.at(1);
   options.client.name = "node";
   options.wait = std::stod(words.at(2));
-  options.client.patience = std::stod(words.at(3));
+  options.client.timeout = std::stod(words.at(3));
   options.log = [](const std::string& message) {
     std::cout << "log\t" << message << "\n";
     throw std::runtime_error("whoever logs may fail");

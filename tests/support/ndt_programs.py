@@ -137,7 +137,7 @@ def send(directory: str, truth: str, scan_address: str, odometry_address: str, p
     order = to_and_fro(len(files))
     poses = read_trajectory(truth).T_map_sensor[order]
     with ScanPublisher(scan_address) as publisher:
-        if not publisher.wait_for_listener(_TIMEOUT_S):
+        if not publisher.wait_for_subscriber(_TIMEOUT_S):
             raise SystemExit("nobody wants scans")
         for number, index in enumerate(order):
             columns = {"xyz": read_scan(files[index])}

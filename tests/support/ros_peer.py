@@ -26,8 +26,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
-from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo
-from shmmap_clients.ros_bridge.messages.wire import ServiceKind
+from shmmap_clients.ros_bridge.messages import DIFFERENTIAL, PARTIAL, SELECTED, AreaInfo, ServiceKind
 
 import shmmap
 from tests.support.bridge_process import URI

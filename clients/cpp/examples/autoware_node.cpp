@@ -38,8 +38,8 @@ class Requesters {
  public:
   using Loader = shmmap::PcdLoader<Service>;
 
-  /// At most so many are known; of more, the one that has not asked for the longest time is forgotten, and
-  /// would get again what it has.
+  /// At most this many are known; beyond that the one with the oldest request is forgotten, and would get
+  /// again what it has.
   static constexpr std::size_t most = 256;
 
   explicit Requesters(shmmap::LoaderOptions options) : options_(std::move(options)) {}
@@ -84,10 +84,10 @@ class Requesters {
 
   const shmmap::LoaderOptions options_;
   mutable std::mutex mutex_;
-  std::list<std::pair<std::string, Loader>> known_;  // who asked last comes first
+  std::list<std::pair<std::string, Loader>> known_;  // the latest request first
 };
 
-/// Whatever names a requester: the bytes of its writer's id.
+/// The name of a requester: the bytes of its writer's id.
 template <typename RequestId>
 std::string requester_of(const RequestId& id) {
   return {reinterpret_cast<const char*>(&id.writer_guid[0]), sizeof id.writer_guid};

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest, Cell, LayerTable, MapWindow, canonical_layer
-from shmmap_clients.compare_map_filter import numpy_path
-from shmmap_clients.compare_map_filter.rule import CompareRule
+from shmmap_clients.compare_map_filter.rule import CompareRule, explain, to_map
 from shmmap_clients.compare_map_filter.search_table import SearchCell, SearchTable
 
 __all__ = ["CompareMapFilter", "Comparison"]
@@ -172,7 +171,7 @@ class CompareMapFilter:
         if self.backend == "numba":
             explained = self._compiled(scan, pose)
         else:
-            explained = numpy_path.explain(scan, pose, self.rule, self._table)
+            explained = explain(scan, pose, self.rule, self._table)
         no_map = not explained.any() and not self._reached(scan, pose)
         compare_s = time.perf_counter() - begin
         update_s, self._update_s = self._update_s, 0.0
@@ -185,7 +184,7 @@ class CompareMapFilter:
 
     def _reached(self, scan: NDArray[Any], pose: NDArray[np.float64]) -> bool:
         """Whether a cell has columns where the scan is; an empty scan is everywhere."""
-        places = numpy_path.to_map(scan, pose)[:, :2]
+        places = to_map(scan, pose)[:, :2]
         places = places[np.isfinite(places).all(axis=1)]
         if not len(places):
             return bool(self._table.cells)

@@ -13,8 +13,7 @@ import numpy as np
 from numba import types
 
 from shmmap.compiling import compiled, read_only
-from shmmap_clients.compare_map_filter.numpy_path import SLACK
-from shmmap_clients.compare_map_filter.rule import VOXEL, VOXEL_DISTANCE
+from shmmap_clients.compare_map_filter.rule import SLACK, VOXEL, VOXEL_DISTANCE
 from shmmap_clients.compare_map_filter.search_table import (
     ADDRESS_START,
     ADDRESS_TILE,
@@ -74,7 +73,7 @@ def explain(
     bin_first_x: Any, bin_first_y: Any, bins_x: Any, bins_y: Any, bin_start: Any, bin_cells: Any,
     explained: Any,
 ) -> None:  # fmt: skip
-    """Say of each point whether the map explains it; see `numpy_path.explain`, which this equals."""
+    """Say of each point whether the map explains it; see `rule.explain`, which this equals."""
     inverse = 1.0 / leaf
     inverse_z = 1.0 / d_z
     reach = d + SLACK

@@ -1,32 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where filtered scans go: PCD files in a directory, or a ZeroMQ publisher."""
+"""Where filtered scans go: PCD files in a directory, a ZeroMQ publisher, and a picture from above."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import write_pcd
+from shmmap.formats.svg import Axes, Page, dash, swatch
 from shmmap_clients.compare_map_filter.drive import ComparedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import quaternion_of
+from shmmap_clients.spread import Decimated
 from shmmap_clients.streams import is_endpoint
 
-__all__ = ["Output", "PcdDirectory", "Stream", "open_output"]
+__all__ = ["Output", "PcdDirectory", "Stream", "TopView", "open_output"]
+
+_SIDE_PX: Final = 1200.0  # of the picture, at most
+_MARGIN: Final = 2.0  # metres
+_REMOVED: Final = (178, 186, 194, 255)
+_KEPT: Final = (214, 40, 40, 255)
+_DRIVE: Final = "#1c7ed6"
+_MOST: Final = 1 << 20  # pixels that are remembered before they are made twice as large
+_OFFSET: Final = 1 << 30  # makes indices positive; two of them fit one int64
 
 
 class Output(Protocol):
     """Takes scans; `close` ends it."""
 
     def write(self, compared: ComparedScan) -> None:
-        """Take one."""
+        """Take a scan."""
 
     def close(self) -> None:
-        """No more come."""
+        """Finish: no more scans come."""
 
 
 def _columns(compared: ComparedScan, mask: bool) -> dict[str, NDArray[Any]]:
@@ -84,13 +94,13 @@ class Stream:
     mask
         As in `PcdDirectory`.
     wait_s
-        How long to wait for the first listener.
+        How long to wait for the first subscriber.
     """
 
     def __init__(self, endpoint: str, *, mask: bool, wait_s: float) -> None:
         self._publisher = ScanPublisher(endpoint)
         self._mask = mask
-        self._publisher.wait_for_listener(wait_s)
+        self._publisher.wait_for_subscriber(wait_s)
 
     def write(self, compared: ComparedScan) -> None:
         """Send one scan."""
@@ -100,7 +110,7 @@ class Stream:
         self._publisher.send(Scan(scan.name, scan.stamp_s, columns, scan.T_map_sensor, no_map))
 
     def close(self) -> None:
-        """Say that it was the last one."""
+        """Publish the end of the stream."""
         self._publisher.send(None)
         self._publisher.close()
 
@@ -110,3 +120,66 @@ def open_output(target: str, *, mask: bool, wait_s: float) -> Output:
     if is_endpoint(target):
         return Stream(target, mask=mask, wait_s=wait_s)
     return PcdDirectory(Path(target), mask=mask)
+
+
+class TopView:
+    """Collects which pixels of the ground have kept and which have removed points.
+
+    Parameters
+    ----------
+    pixel
+        Side of a pixel, metres; the picture is made coarser where it would be too large.
+    """
+
+    def __init__(self, pixel: float = 0.1) -> None:
+        self._pixel = pixel
+        self._offset = _OFFSET
+        self._kept = np.empty(0, np.int64)
+        self._removed = np.empty(0, np.int64)
+        self._path: Decimated[tuple[float, float]] = Decimated()
+
+    def add(self, xyz: NDArray[Any], kept: NDArray[np.bool_], position: tuple[float, float]) -> None:
+        """Add a scan: (N, 3) and (N,), metres, map frame; and where it was taken."""
+        places = np.floor(xyz[:, :2].astype(np.float64) / self._pixel)
+        finite = np.isfinite(places).all(axis=1) & (np.abs(places) < self._offset).all(axis=1)
+        index = places[finite].astype(np.int64) + self._offset
+        packed = (index[:, 1] << 32) | index[:, 0]
+        mine = kept[finite]
+        self._kept = np.union1d(self._kept, packed[mine])
+        self._removed = np.union1d(self._removed, packed[~mine])
+        self._path.add(position)
+        while len(self._kept) + len(self._removed) > _MOST:
+            self._coarsen()
+
+    def _coarsen(self) -> None:
+        """Make pixels twice as large: memory does not grow with the length of the drive."""
+        self._pixel *= 2
+        self._offset //= 2
+        self._kept, self._removed = (
+            np.unique(((packed >> 33) << 32) | ((packed & 0xFFFFFFFF) >> 1))
+            for packed in (self._kept, self._removed)
+        )
+
+    def svg(self, title: str, note: str) -> str:
+        """Return the picture, north up, with two lines of text, a legend and a scale below."""
+        removed, kept = (_unpacked(packed) - self._offset for packed in (self._removed, self._kept))
+        path = np.array(self._path.values).reshape(-1, 2)
+        corners = np.concatenate([removed * self._pixel, kept * self._pixel, path])
+        if not len(corners):
+            corners = np.zeros((1, 2))
+        low, high = corners.min(axis=0) - _MARGIN, corners.max(axis=0) + self._pixel + _MARGIN
+        page = Page(_SIDE_PX, title)
+        axes = Axes.fitted(page, (*low.tolist(), *high.tolist()), page.margin, _SIDE_PX)
+        axes.raster([(removed, _REMOVED), (kept, _KEPT)], self._pixel)
+        axes.line(self._path.values, stroke=_DRIVE, stroke_width=2)
+        page.heading(axes.bottom + 28, title, note)
+        entries = [
+            (swatch(fill=f"rgb{_KEPT[:3]}"), "kept: not in the map"),
+            (swatch(fill=f"rgb{_REMOVED[:3]}"), "removed"),
+            (dash(stroke=_DRIVE, stroke_width=2), "drive"),
+        ]
+        return page.svg(axes.legend(axes.bottom + 76, entries) + 16)
+
+
+def _unpacked(packed: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.stack([packed & 0xFFFFFFFF, packed >> 32], axis=1)

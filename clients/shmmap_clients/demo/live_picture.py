@@ -39,9 +39,8 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     import shmmap
-    from shmmap_clients.rolling_map.drive import usage_text
+    from shmmap_clients.rolling_map.live_map import all_voxels, usage_text
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
-    from shmmap_clients.rolling_map.voxel_parts import all_voxels
 
     path = [(x, y, z) for x, y, z in json.loads(args.path.read_text(encoding="utf-8"))]
     with shmmap.connect(args.endpoint, name="demo picture") as client:

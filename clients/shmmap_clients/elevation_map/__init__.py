@@ -10,8 +10,7 @@ from shmmap.lazy_names import lazy_names
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import build_elevation_map
     from shmmap_clients.elevation_map.grid import ElevationGrid
-    from shmmap_clients.elevation_map.rule import ElevationRule
-    from shmmap_clients.elevation_map.window_heights import WindowHeights
+    from shmmap_clients.elevation_map.heights import ElevationRule, WindowHeights
 
 __all__ = [
     "ElevationGrid",

@@ -32,7 +32,7 @@ from shmmap import (
 )
 from shmmap.formats.npz_writer import write_npz
 from shmmap_clients.elevation_map.grid import ElevationGrid
-from shmmap_clients.elevation_map.rule import ElevationRule
+from shmmap_clients.elevation_map.heights import ElevationRule
 from shmmap_clients.elevation_map.seams import ColumnBox, Columns, Seams, column_boxes
 from shmmap_clients.elevation_map.surface import surface_heights
 
@@ -226,7 +226,7 @@ class MapChanged(ShmmapError):
 
 @dataclass(frozen=True, slots=True)
 class BuildProgress:
-    """How far a build is: cells done of all, and points (or columns of layers) read."""
+    """Progress of a build: cells done of all, and points (or columns of layers) read."""
 
     done: int
     cells: int
@@ -289,7 +289,7 @@ def build_elevation_map(
     Parameters
     ----------
     client
-        Whom to ask.
+        Of the daemon.
     rule
         What a height is.
     cache

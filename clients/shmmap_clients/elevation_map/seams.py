@@ -104,7 +104,7 @@ class Seams:
         return [(n, ColumnBox(*self._boxes[n].tolist()).common(box)) for n in some.tolist()]
 
     def add(self, number: int, rows: Columns | None) -> Columns | None:
-        """Take the rows of cell ``number``, the next in order; return what nobody adds to any more.
+        """Take the rows of cell ``number``, the next in order; return what no later cell adds to.
 
         Parameters
         ----------

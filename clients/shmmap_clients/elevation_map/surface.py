@@ -14,7 +14,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from shmmap.compiling import compiled
-from shmmap_clients.elevation_map.rule import ElevationRule
+from shmmap_clients.elevation_map.heights import ElevationRule
 
 __all__ = ["surface_heights"]
 
@@ -49,7 +49,7 @@ def surface_heights(
 @numba.njit(inline="always")
 def _root(parent: Any, member: Any) -> Any:
     while parent[member] != member:
-        parent[member] = parent[parent[member]]  # halves the path for whoever comes next
+        parent[member] = parent[parent[member]]  # halves the path for the next lookup
         member = parent[member]
     return member
 

@@ -19,22 +19,18 @@ from typing import TYPE_CHECKING
 from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceOptions
-    from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+    from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, DeviceOptions
     from shmmap_clients.ndt_scan_matcher.backends.registry import BACKENDS
-    from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer, voxel_cell
-    from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+    from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap, cell_from_layer, voxel_cell
     from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
         Evaluation,
         Scoring,
         matrix_from_pose,
         pose_from_matrix,
     )
-    from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher, Regularization
-    from shmmap_clients.ndt_scan_matcher.matching.result import Result
-    from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
-    from shmmap_clients.ndt_scan_matcher.matching.trust import TrustLimits
+    from shmmap_clients.ndt_scan_matcher.matching.result import Result, TrustLimits
+    from shmmap_clients.ndt_scan_matcher.matching.settings import Cut, Limits, Settings
 
 __all__ = [
     "BACKENDS",

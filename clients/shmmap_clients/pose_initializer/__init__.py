@@ -22,8 +22,8 @@ if TYPE_CHECKING:
         InitializerRules,
         InitialPose,
         PoseInitializer,
+        Relocalizer,
     )
-    from shmmap_clients.pose_initializer.relocalizer import Relocalizer
 
 __all__ = [
     "Alternative",

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Final, NoReturn
@@ -13,7 +14,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Client, MapWindow, NoAnswer, canonical_layer, ground_height
+from shmmap import BadRequest, Client, MapWindow, NoAnswer, ShmmapError, canonical_layer, ground_height
 from shmmap_clients.map_extent import NoMapHere, map_extent
 from shmmap_clients.ndt_scan_matcher import (
     DeviceError,
@@ -27,16 +28,18 @@ from shmmap_clients.ndt_scan_matcher import (
     VoxelMap,
     cell_from_layer,
     matrix_from_pose,
+    pose_from_matrix,
 )
 from shmmap_clients.pose_initializer.candidates import ParzenEstimator, RoughPose
 
-__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer"]
+__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "Relocalizer"]
 
 _APART_M: Final = 1.0
 _APART_YAW: Final = math.radians(10.0)
 _SEED_APART_M: Final = 0.5
 _SEED_APART_YAW: Final = math.radians(3.0)
 _SAME_HEIGHT_M: Final = 0.3
+_DOUBLINGS: Final = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +152,7 @@ class PoseInitializer:
     limits, trust
         Of the final alignments, as in `NdtMatcher`.
     backend, device, fallback
-        Who computes, as in `Settings`.
+        What computes, as in `Settings`.
     threads
         As in `NdtMatcher`.
 
@@ -209,7 +212,7 @@ class PoseInitializer:
         self.close()
 
     def close(self) -> None:
-        """Let the map go, and end the session if it is its own."""
+        """Release the map, and end the session if it is its own."""
         self._window.close()
         self._coarse.close()
         self._fine.close()
@@ -224,7 +227,7 @@ class PoseInitializer:
         rough
             Where it was probably taken.
         effort
-            So many times as many candidates are drawn from the rough pose as by the rules.
+            Factor on the number of candidates that are drawn from the rough pose.
 
         Raises
         ------
@@ -313,7 +316,7 @@ class PoseInitializer:
         return min(grounds, key=lambda ground: abs(ground - stands_at), default=None)
 
     def _take_map(self, rough: RoughPose) -> None:
-        """Have the map around a place."""
+        """Fetch the map around a place."""
         self._window.move_to(rough.x, rough.y, wait=self.rules.wait_s)
         voxels = {cell.id: cell for cell in self._window.cells if cell.layer == self._voxels}
         if not voxels:
@@ -341,7 +344,7 @@ class PoseInitializer:
             self._versions = versions
 
     def _window_is_empty(self, rough: RoughPose) -> NoReturn:
-        """Say why there is no map around the place."""
+        """Raise why there is no map around the place."""
         if not self._window.complete:
             raise NoAnswer(
                 f"no cell around ({rough.x:.3f}, {rough.y:.3f}) was loaded within {self.rules.wait_s:g} s",
@@ -371,3 +374,63 @@ def _apart(results: list[Result]) -> list[Result]:
         else:
             kept.append(result)
     return kept
+
+
+class Relocalizer:
+    """Searches around a probable pose; after each failure twice as far, up to eight times.
+
+    Twice as far takes twice as many candidates to begin with.  The search begins at ``sigma_m`` again when it
+    has found the vehicle.  It is a `shmmap_clients.ndt_scan_matcher.drive.follower.Relocalize`.
+
+    Parameters
+    ----------
+    initializer
+        Returns the initializer, which stays the caller's to close; called at the first search, for it has
+        a map of its own.
+    sigma_m, sigma_yaw
+        Standard deviation of x and y, metres, and of the heading, radians, at the first attempt.
+
+    Attributes
+    ----------
+    error
+        Why the last search could not be made, or None.
+    """
+
+    def __init__(
+        self, initializer: Callable[[], PoseInitializer], *, sigma_m: float = 2.0, sigma_yaw: float = 0.1745
+    ) -> None:
+        self._make = initializer
+        self._initializer: PoseInitializer | None = None
+        self._sigma_m = sigma_m
+        self._sigma_yaw = sigma_yaw
+        self._failures = 0
+        self.error: ShmmapError | None = None
+
+    def __call__(self, points: NDArray[np.floating], T_guess: NDArray[np.float64]) -> Result | None:
+        """Return a trusted result, or None.
+
+        Parameters
+        ----------
+        points : (N, 3)
+            The scan, base frame, metres.
+        T_guess : (4, 4)
+            Where it was probably taken.
+        """
+        wider = 2 ** min(self._failures, _DOUBLINGS)
+        x, y, z, roll, pitch, yaw = pose_from_matrix(T_guess).tolist()
+        rough = RoughPose(
+            x, y, z, roll, pitch, yaw, sigma_m=self._sigma_m * wider, sigma_yaw=self._sigma_yaw * wider
+        )
+        self._failures += 1
+        self.error = None
+        try:
+            if self._initializer is None:
+                self._initializer = self._make()
+            found = self._initializer.initialize(points, rough, effort=wider)
+        except ShmmapError as error:  # no map there, no daemon: the next scan may have better luck
+            self.error = error
+            return None
+        if not found.reliable:
+            return None
+        self._failures = 0
+        return found.result

@@ -91,7 +91,7 @@ _KNOWN: Final[Mapping[str, type]] = {
 
 
 class LiveSettings(msgspec.Struct, frozen=True):
-    """What the daemon has to know of a live map.
+    """A live map's settings for the daemon.
 
     Attributes
     ----------

@@ -1,15 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map's list of cells as the bridge knows it, kept up by asking the daemon what has changed."""
+"""The map's cells as the bridge knows them, and which version of each every client has.
+
+Autoware's request names cells, but not their versions: a file that has changed would never reach a client
+that has its cell already.  So the bridge remembers what each client was sent, and sends a changed cell again
+under its id.
+"""
 
 from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Collection, Iterable, Mapping
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import CellInfo, Client
+from shmmap import CellInfo, Client, HeldCell
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 
-__all__ = ["Catalogue"]
+__all__ = ["MOST_REQUESTERS", "Catalogue", "Requesters"]
+
+MOST_REQUESTERS: Final = 256
+"""Clients that are remembered; beyond that, the one with the oldest request is forgotten."""
 
 
 class Catalogue:
@@ -31,12 +43,12 @@ class Catalogue:
         self.map_version: int | None = None
 
     def refresh(self, client: Client) -> None:
-        """Take in what has changed.
+        """Fetch what has changed.
 
         Raises
         ------
         DaemonUnreachable
-            Nobody answers.
+            The daemon does not answer.
         """
         listing = client.metadata(since=self.map_version)
         if listing.map_version == self.map_version:
@@ -64,3 +76,62 @@ class Catalogue:
             writer.text(cell.id)
             writer.float32(*cell.box)
         return writer.content()
+
+
+class Requesters:
+    """Versions by client and cell.
+
+    Parameters
+    ----------
+    most
+        How many clients are remembered.
+    """
+
+    def __init__(self, most: int = MOST_REQUESTERS) -> None:
+        self._most = most
+        self._versions: OrderedDict[str, dict[str, int]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._versions)
+
+    def held(self, requester: str, ids: Iterable[str], current: Mapping[str, int]) -> list[HeldCell]:
+        """Return what a client has: ids with versions.
+
+        Parameters
+        ----------
+        requester
+            The client.
+        ids
+            What it says it has.
+        current
+            Versions that cells have now: what was not sent by us counts as current, as it does in Autoware.
+
+        Returns
+        -------
+        One for each id, unknown ones included: in the order given, without repetitions.
+        """
+        known = self._versions.get(requester, {})
+        return [HeldCell(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
+
+    def answered(
+        self, requester: str, held: Iterable[HeldCell], removed: Collection[str], sent: Mapping[str, int]
+    ) -> None:
+        """Remember what a client has after an answer.
+
+        Parameters
+        ----------
+        held, removed, sent
+            What it had; what it was asked to drop; the versions of what it was sent.
+        """
+        gone = set(removed)
+        versions = {one.id: one.version for one in held if one.version is not None and one.id not in gone}
+        versions.update(sent)
+        self._versions[requester] = versions
+        self._versions.move_to_end(requester)
+        while len(self._versions) > self._most:
+            self._versions.popitem(last=False)
+
+    def keep_only(self, alive: Collection[str]) -> None:
+        """Forget every client that is not among these."""
+        for requester in [one for one in self._versions if one not in alive]:
+            del self._versions[requester]

@@ -33,12 +33,12 @@ class CdrWriter:
     """Collects a message's parts; what is large is written once, straight to its place.
 
     Numbers and texts are kept until `content` is asked for. Then the sample gets all its memory at once, and
-    whoever announced many bytes (`blob`) writes them into it.
+    each `blob` writes its bytes into it.
     """
 
     def __init__(self) -> None:
-        self._large: list[tuple[int, int, Fill]] = []  # where others' bytes are, and how many
-        self._small: list[tuple[int, bytearray]] = []  # where ours are
+        self._large: list[tuple[int, int, Fill]] = []  # place, size and writer of each blob
+        self._small: list[tuple[int, bytearray]] = []  # places of the bytes in between
         self._now = bytearray()
         self._start = 0  # where `_now` begins
 
@@ -103,7 +103,7 @@ class CdrWriter:
         self._now += data
 
     def blob(self, nbytes: int, fill: Fill) -> None:
-        """Append so many bytes, which ``fill`` writes when it is called with their place."""
+        """Append ``nbytes`` bytes, which ``fill`` writes when it is called with their place."""
         self._small.append((self._start, self._now))
         self._large.append((self.size, nbytes, fill))
         self._start = self.size + nbytes

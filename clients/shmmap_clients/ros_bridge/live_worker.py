@@ -17,11 +17,9 @@ from cyclonedds.pub import DataWriter
 from numpy.typing import NDArray
 
 from shmmap import LiveMap
-from shmmap_clients.rolling_map.voxel_parts import all_voxels
+from shmmap_clients.rolling_map.live_map import all_voxels
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
-from shmmap_clients.ros_bridge.messages.bonxai import FREE, OCCUPIED
-from shmmap_clients.ros_bridge.messages.standard import PointCloud2
-from shmmap_clients.ros_bridge.messages.wire import ServiceKind, ready_made
+from shmmap_clients.ros_bridge.messages import FREE, OCCUPIED, PointCloud2, ServiceKind, ready_made
 from shmmap_clients.ros_bridge.point_cloud import cloud_layout, write_cloud
 from shmmap_clients.ros_bridge.service_server import Listening, Request
 from shmmap_clients.ros_bridge.worker import Answer, Worker, no_followup

@@ -26,11 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import AutowareSquare, Cell, CellSet, Client
-from shmmap_clients.ros_bridge.catalogue import Catalogue
+from shmmap_clients.ros_bridge.catalogue import Catalogue, Requesters
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
-from shmmap_clients.ros_bridge.messages.autoware import GetDifferentialRequest, GetPartialRequest
+from shmmap_clients.ros_bridge.messages import GetDifferentialRequest, GetPartialRequest
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
-from shmmap_clients.ros_bridge.requesters import Requesters
 from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge, no_followup
 
 __all__ = ["MapAnswers", "RecentCells", "sensible", "touches"]

@@ -11,14 +11,11 @@ from typing import Any, Final
 from cyclonedds.pub import DataWriter
 
 from shmmap import BadRequest, CellInfo, Client, LoadFailed
-from shmmap_clients.ros_bridge.catalogue import Catalogue
+from shmmap_clients.ros_bridge.catalogue import Catalogue, Requesters
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.map_answers import MapAnswers
-from shmmap_clients.ros_bridge.messages.autoware import MapMetaData
-from shmmap_clients.ros_bridge.messages.standard import PointCloud2
-from shmmap_clients.ros_bridge.messages.wire import ready_made
+from shmmap_clients.ros_bridge.messages import MapMetaData, PointCloud2, ready_made
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, fill_rows, write_cloud_head
-from shmmap_clients.ros_bridge.requesters import Requesters
 from shmmap_clients.ros_bridge.service_server import Listening, Request
 from shmmap_clients.ros_bridge.worker import Answer, Worker
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`RosBridge`: the node ``pointcloud_map_loader`` of a ROS 2 system, with the daemon's map behind it.
 
-Three threads: one answers with cells, one with voxels where there is a live map, and one what parameters
-there are. Each takes the requests itself. The last one also looks every second which clients there are.
+Three threads: one answers with cells, one with voxels where there is a live map, and one with the
+parameters. Each takes its requests itself. The last one also looks every second which clients there are.
 """
 
 from __future__ import annotations
@@ -21,16 +21,26 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
 from shmmap import Client, LiveMap
-from shmmap_clients.ros_bridge import names
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
-from shmmap_clients.ros_bridge.messages.autoware import DIFFERENTIAL, PARTIAL, SELECTED, MapMetaData
-from shmmap_clients.ros_bridge.messages.parameters import PARAMETER_SERVICES
-from shmmap_clients.ros_bridge.messages.standard import PointCloud2
-from shmmap_clients.ros_bridge.messages.wire import ServiceKind
-from shmmap_clients.ros_bridge.parameters import Parameters
-from shmmap_clients.ros_bridge.participant import close, endpoint_qos, open_participant
+from shmmap_clients.ros_bridge.messages import (
+    DIFFERENTIAL,
+    PARTIAL,
+    SELECTED,
+    MapMetaData,
+    PointCloud2,
+    ServiceKind,
+)
+from shmmap_clients.ros_bridge.parameters import PARAMETER_SERVICES, Parameters
+from shmmap_clients.ros_bridge.participant import (
+    close,
+    endpoint_qos,
+    node_name,
+    open_participant,
+    resolved,
+    topic,
+)
 from shmmap_clients.ros_bridge.service_server import Listening, Requester, ServiceServer
 from shmmap_clients.ros_bridge.status_file import StatusFile
 from shmmap_clients.ros_bridge.worker import Worker
@@ -45,7 +55,7 @@ NAMES: Final[Mapping[str, str]] = {
     "whole": "pointcloud_map",
     "live": "/shmmap/live",
 }
-"""What services and topics are called in the node's namespace, where `BridgeSettings.names` does not say."""
+"""Names of services and topics in the node's namespace, unless `BridgeSettings.names` has another."""
 _KINDS: Final = {"partial": PARTIAL, "differential": DIFFERENTIAL, "selected": SELECTED}
 _LOOK_S: Final = 1.0
 _ADVICE: Final = "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
@@ -84,7 +94,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
 
     def name(self, what: str) -> str:
         """Return the name of a service or topic, in full."""
-        return names.resolved(self.names.get(what, NAMES[what]), self.namespace)
+        return resolved(self.names.get(what, NAMES[what]), self.namespace)
 
 
 class RosBridge:
@@ -127,7 +137,7 @@ class RosBridge:
         self._id = secrets.token_bytes(12)
         self._incompatible = _IncompatiblePeers(log)
         with contextlib.ExitStack() as undo:
-            own = names.resolved(names.node_name(settings.node), settings.namespace)
+            own = resolved(node_name(settings.node), settings.namespace)
             services = {one: settings.name(one) for one in NAMES}
             welcome = client.welcome
             self._status = StatusFile(client.endpoint, welcome.instance, settings.domain)
@@ -154,7 +164,7 @@ class RosBridge:
             self._listening = Listening(self._participant, log)
             for name, kind in PARAMETER_SERVICES.items():
                 self._add(f"{own}/{name}", kind, self._listening)
-            self._tell()
+            self._write_status()
             self._undo = undo.pop_all()
 
     def __enter__(self: _Self) -> _Self:
@@ -176,7 +186,7 @@ class RosBridge:
         return self._status.path
 
     def stop(self) -> None:
-        """Let `run` end; may be called from a signal handler."""
+        """End `run`; may be called from a signal handler."""
         self._stop.set()
 
     def run(self) -> None:
@@ -219,14 +229,14 @@ class RosBridge:
 
     def _latched(self, name: str, kind: type) -> DataWriter:
         qos = endpoint_qos(depth=1, latched=True)
-        return DataWriter(self._participant, Topic(self._participant, names.topic(name), kind), qos)
+        return DataWriter(self._participant, Topic(self._participant, topic(name), kind), qos)
 
     def _add_live(self, live: LiveMap, place: str) -> None:
         qos = endpoint_qos(depth=1)
         clouds = {
             kind: DataWriter(
                 self._participant,
-                Topic(self._participant, names.topic(f"{place}/{kind}_voxels"), PointCloud2),
+                Topic(self._participant, topic(f"{place}/{kind}_voxels"), PointCloud2),
                 qos,
             )
             for kind in ("occupied", "free")
@@ -273,17 +283,17 @@ class RosBridge:
                 look_s = time.monotonic() + _LOOK_S
 
     def _look(self) -> None:
-        """See which clients there are."""
+        """Look which clients there are."""
         clients = [(server, one) for server in self._servers for one in server.requesters()]
         self._map.alive = frozenset(one.name for _, one in clients)
         self._incompatible.look(clients)
-        self._tell(len({one.name for _, one in clients}))
+        self._write_status(len({one.name for _, one in clients}))
 
-    def _tell(self, clients: int = 0) -> None:
+    def _write_status(self, clients: int = 0) -> None:
         self._status.write(
             {
                 "domain": self._settings.domain,
-                "node": names.resolved(self._settings.node, self._settings.namespace),
+                "node": resolved(self._settings.node, self._settings.namespace),
                 "clients": clients,
                 "remembered": self._map.requesters,
                 "strangers": self._incompatible.now,
@@ -292,7 +302,7 @@ class RosBridge:
 
 
 class _IncompatiblePeers:
-    """Clients that would wait without end, because their ROS is not that of CycloneDDS.
+    """Clients with an unbounded wait, because their ROS is not that of CycloneDDS.
 
     Parameters
     ----------
@@ -307,19 +317,19 @@ class _IncompatiblePeers:
 
     @property
     def now(self) -> list[dict[str, str]]:
-        """Those there are, at most 32: ``service``, and ``vendor`` of their DDS, which may be empty."""
+        """Incompatible clients now, at most 32: ``service``, and ``vendor`` of their DDS, maybe empty."""
         return self._now
 
     def look(self, clients: Iterable[tuple[ServiceServer, Requester]]) -> None:
-        """Take in which clients there are."""
+        """Note which clients there are, and log each new incompatible one."""
         found = [(server, one) for server, one in clients if one.incompatible]
         for server, one in found:
             if one.name in self._logged:
                 continue
             self._logged[one.name] = None
-            whose = f", speaks {one.vendor}" if one.vendor else ""
+            vendor = f", speaks {one.vendor}" if one.vendor else ""
             self._log(
-                f"a client of {server.name} is no node of rmw_cyclonedds_cpp{whose}, and may wait for ever:"
+                f"a client of {server.name} is no node of rmw_cyclonedds_cpp{vendor}: unbounded wait;"
                 f" {_ADVICE}"
             )
         while len(self._logged) > 8 * _MAX_LISTED:

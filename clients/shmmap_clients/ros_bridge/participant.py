@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge's part in a DDS domain: settings of CycloneDDS, qualities of service, closing.
+"""The bridge's part in a DDS domain: names, settings of CycloneDDS, qualities of service, closing.
 
-Settings of the user (``CYCLONEDDS_URI``, ``ROS_LOCALHOST_ONLY``) count as they do for ROS nodes.
+ROS's names become those of DDS by ``rmw``'s mangling.  Settings of the user (``CYCLONEDDS_URI``,
+``ROS_LOCALHOST_ONLY``) count as they do for ROS nodes.
 
 All clients of a service read the same topic. A writer keeps its last samples, ten of replies, and so never
 waits for a reader that has stopped: that one misses what has been replaced, and the others notice nothing.
@@ -10,6 +11,7 @@ waits for a reader that has stopped: that one misses what has been replaced, and
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -20,16 +22,78 @@ from cyclonedds.util import duration
 
 from shmmap import BadRequest, CannotStart
 
-__all__ = ["MOST_DOMAIN", "close", "endpoint_qos", "open_participant", "settings"]
+__all__ = [
+    "MOST_DOMAIN",
+    "close",
+    "endpoint_qos",
+    "node_name",
+    "open_participant",
+    "reply_topic",
+    "request_topic",
+    "resolved",
+    "settings",
+    "topic",
+]
 
+_NAME: Final = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_MOST: Final = 200  # DDS allows 255, with a prefix, a suffix and the parameter services' own part
 MOST_DOMAIN: Final = 232
 """Highest number of a domain: those above have no UDP ports."""
-
 _LOCALHOST: Final = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
     "</General></Domain></CycloneDDS>"
 )
 _BLOCKING_MS: Final = 100
+
+
+def resolved(name: str, namespace: str) -> str:
+    """Return a name in full: one that does not begin with a slash stands in the namespace.
+
+    Raises
+    ------
+    BadRequest
+        It is no name of a topic or service.
+    """
+    full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
+    if not _NAME.fullmatch(name) or not (namespace == "/" or _NAME.fullmatch(namespace)):
+        bad = name if not _NAME.fullmatch(name) else namespace
+        raise BadRequest(
+            f"{bad!r} is no ROS name",
+            hint="use letters, digits and _, parted by /; no part begins with a digit",
+        )
+    if not full.startswith("/"):
+        full = f"/{full}"
+    if len(full) > _MOST:
+        raise BadRequest(f"{full[:40]}... has {len(full)} characters, of at most {_MOST}")
+    return full
+
+
+def node_name(name: str) -> str:
+    """Return the name of a node, if it is one.
+
+    Raises
+    ------
+    BadRequest
+        It has a slash, or is no name.
+    """
+    if "/" in name or not _NAME.fullmatch(name):
+        raise BadRequest(f"{name!r} is no name of a node", hint="use letters, digits and _")
+    return name
+
+
+def topic(name: str) -> str:
+    """Return what DDS calls a topic."""
+    return f"rt{name}"
+
+
+def request_topic(name: str) -> str:
+    """Return what DDS calls a service's requests."""
+    return f"rq{name}Request"
+
+
+def reply_topic(name: str) -> str:
+    """Return what DDS calls a service's replies."""
+    return f"rr{name}Reply"
 
 
 def settings(environ: Mapping[str, str] = os.environ) -> str:
@@ -72,11 +136,11 @@ def endpoint_qos(user_data: str = "", *, depth: int = 10, latched: bool = False)
     Parameters
     ----------
     user_data
-        What others may read of it.
+        Visible to the other participants.
     depth
         How many samples are kept.
     latched
-        Who comes late gets the last ones, too (``transient_local``).
+        A late reader gets the last samples, too (``transient_local``).
     """
     policies: list[Any] = [
         Policy.Reliability.Reliable(duration(milliseconds=_BLOCKING_MS)),
@@ -92,6 +156,6 @@ def endpoint_qos(user_data: str = "", *, depth: int = 10, latched: bool = False)
 
 
 def close(*entities: Any) -> None:
-    """Close entities and all that they have made, now and not when Python comes round to it."""
+    """Close entities and all that they have made, now and not when Python collects them."""
     for one in entities:
         one.__del__()

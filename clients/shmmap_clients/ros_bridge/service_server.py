@@ -8,7 +8,7 @@ would miss it. Up to 100 ms are waited for that, as ``rmw_send_response`` does; 
 asks until a second after it was found, for on a busy machine its two ends may be found apart.
 
 Other implementations of ROS send no ``clientid=``. They carry the number of a request outside of the message,
-where neither can read the other's, and their clients wait without end: they are incompatible peers.
+where neither can read the other's, and their clients wait without bound: they are incompatible peers.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from shmmap_clients.ros_bridge.cdr import Content
-from shmmap_clients.ros_bridge.messages.wire import Damaged, ServiceKind, ready_made
-from shmmap_clients.ros_bridge.names import reply_topic, request_topic
-from shmmap_clients.ros_bridge.participant import endpoint_qos
+from shmmap_clients.ros_bridge.messages import Damaged, ServiceKind, ready_made
+from shmmap_clients.ros_bridge.participant import endpoint_qos, reply_topic, request_topic
 
 __all__ = ["Listening", "Request", "Requester", "ServiceServer", "Tries"]
 
@@ -57,7 +56,7 @@ _VENDORS: Final = {0x0101: "RTI Connext", 0x010F: "Fast DDS", 0x0110: "CycloneDD
 
 @dataclass(frozen=True, slots=True)
 class Requester:
-    """Who asks: a client's writer of requests.
+    """The client behind a request: its writer of requests.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class Requester:
     incompatible
         It has none.
     vendor
-        Whose DDS it speaks; empty where that is unknown.
+        Of its DDS; empty where that is unknown.
     found_s
         When it was found, on the clock of `time.monotonic`.
     """
@@ -79,7 +78,7 @@ class Requester:
 
 @dataclass(slots=True)
 class Tries:
-    """How often a request has been tried.
+    """Attempts to answer a request.
 
     Attributes
     ----------
@@ -106,13 +105,13 @@ class Request:
     Attributes
     ----------
     server
-        Of which service.
+        Of the service.
     message
-        What is asked; its ``client`` and ``number`` go into the reply.
+        Its ``client`` and ``number`` go into the reply.
     requester, handle
-        Who asks; DDS's number of its writer.
+        The client; DDS's number of its writer.
     tries
-        What came of it so far.
+        Attempts so far.
     """
 
     server: ServiceServer
@@ -128,7 +127,7 @@ class ServiceServer:
     Parameters
     ----------
     participant
-        In whose domain.
+        Of the domain.
     name
         The service's, in full.
     kind
@@ -201,8 +200,8 @@ class ServiceServer:
         return True
 
     def gone(self, request: Request) -> bool:
-        """Whether the client that asked is gone."""
-        return self._requester(request.handle, afresh=True) is None
+        """Whether the requesting client is gone."""
+        return self._requester(request.handle, refresh=True) is None
 
     def reply(self, content: Content) -> str:
         """Send a reply; returns why it cannot be sent, empty when it was."""
@@ -220,12 +219,12 @@ class ServiceServer:
             return str(error)
         return ""
 
-    def _requester(self, handle: int, *, afresh: bool = False) -> Requester | None:
-        """Who writes there; None when it is gone.  ``afresh``: what was known before does not count."""
+    def _requester(self, handle: int, *, refresh: bool = False) -> Requester | None:
+        """Return the client behind a writer; None when it is gone.  ``refresh``: look it up again."""
         with self._lock:
             known = self._requesters.get(handle)
             if known is not None and (
-                not afresh or handle in _unsigned(self._reader.get_matched_publications())
+                not refresh or handle in _unsigned(self._reader.get_matched_publications())
             ):
                 return known
             found = None if known is not None else self._reader.get_matched_publication_data(handle)
@@ -266,7 +265,7 @@ class Listening:
     Parameters
     ----------
     participant
-        In whose domain.
+        Of the domain.
     log
         Takes a line about what came and was no request.
 
@@ -289,11 +288,11 @@ class Listening:
         self._waitset.attach(server.condition)
 
     def wait(self, timeout_s: float) -> None:
-        """Sleep until a request has come, or `wake` is called; at most so long."""
+        """Sleep until a request has come, `wake` is called or the timeout is over."""
         self._waitset.wait(duration(nanoseconds=max(int(timeout_s * 1e9), 0)))
 
     def wake(self) -> None:
-        """End the sleep of `wait`, and every later one at once."""
+        """End `wait`, and every later one at once."""
         self._wake.set(True)
 
     def take(self) -> Iterator[Request]:

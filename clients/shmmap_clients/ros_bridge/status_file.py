@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the bridge tells ``shmmap doctor``: a small file beside the daemon's socket.
+"""The bridge's status for ``shmmap doctor``: a small file beside the daemon's socket.
 
-Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. While a bridge runs it holds a lock on it (fcntl(2)), so
-that nobody takes the word of one that was killed, and no second bridge answers the same requests. It is
-written in place by one call, with blanks to its former length, so that who reads it never sees half of it.
+Its name is ``INSTANCE.ros-bridge-DOMAIN.json``. While a bridge runs it holds a lock on it (fcntl(2)):
+the file of one that was killed counts for nothing, and no second bridge answers the same requests. It is
+written in place by one call, with blanks to its former length, so that no reader sees half of it.
 
-Where the daemon's directory may not be written, it lies in the user's own, ``$XDG_RUNTIME_DIR/shmmap``; where
-there is none either, nobody is told.
+Where the daemon's directory may not be written, it lies in the user's own, ``$XDG_RUNTIME_DIR/shmmap``; if
+that cannot be written either, there is no file.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def status_name(instance: str, domain: int) -> str:
 
 
 class StatusFile:
-    """The file, from its making to its end.
+    """The file, from the bridge's start to its end.
 
     Parameters
     ----------
@@ -87,13 +87,13 @@ class StatusFile:
             if same:
                 return False
 
-    def write(self, told: Mapping[str, Any]) -> None:
-        """Tell this from now on."""
+    def write(self, status: Mapping[str, Any]) -> None:
+        """Replace the status."""
         if self._fd < 0:
             return
-        data = json.dumps(told).encode() + b"\n"
+        data = json.dumps(status).encode() + b"\n"
         data = data.ljust(self._written)
-        with contextlib.suppress(OSError):  # a full disk: what is told is older then
+        with contextlib.suppress(OSError):  # a full disk: the older status stays
             self._written = max(self._written, os.pwrite(self._fd, data, 0))
 
     def close(self) -> None:

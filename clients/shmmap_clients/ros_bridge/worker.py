@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What answers requests that need the daemon: in a thread of its own, and clients take turns.
+"""Workers that answer requests which need the daemon: each in a thread of its own, and clients take turns.
 
-A ROS client waits without end. So while the daemon is away a request is kept, and answered when it is back,
+A ROS client waits without bound. So while the daemon is away a request is kept, and answered when it is back,
 unless the client has gone meanwhile. One that takes long, or fails while others succeed, waits behind those
 of other clients, and is given up after some tries. What the daemon refuses is answered with nothing, and
 logged; what is too large is not answered at all, because an answer without cells would be taken for one.
@@ -34,7 +34,7 @@ MOST_OF_ONE: Final = 4
 """Of one client: rclcpp nodes have one under way."""
 MOST_WAITING: Final = 1024
 LATER: Final = (DaemonUnreachable, NoSession, Busy, LiveInterrupted, StaleHandle)
-"""What passes by itself."""
+"""Errors that pass by themselves."""
 _AGAIN_S: Final = 0.2
 _MOST_FAILED: Final = 5
 """Tries of one request that fail while the daemon answers others."""
@@ -88,7 +88,7 @@ class WaitingRequests:
 
 
 def no_followup() -> None:
-    """Do nothing after an answer was sent: nothing has to be remembered of it."""
+    """Do nothing after an answer was sent."""
 
 
 class StillLoading(Exception):

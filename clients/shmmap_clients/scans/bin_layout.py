@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of a ``.bin`` scan: bare numbers, whose columns a user names or their values give away.
+"""Rows of a ``.bin`` scan: bare numbers, with columns that a user names or that their values reveal.
 
 KITTI writes four float32 a point (x y z intensity), nuScenes five (and ring), others three or six, or
 doubles; nothing in the file says which.  A layout is taken only where coordinates and intensity look like
@@ -173,7 +173,7 @@ def _layout(values: NDArray[Any], length: int) -> BinLayout:
 
 
 def _lengths(values: NDArray[Any], size: int, each: int, reasons: list[str]) -> list[int]:
-    """Return the lengths of rows whose columns look right; say of the others why not."""
+    """Return the lengths of rows with plausible columns; append to ``reasons`` why the others are not."""
     found = []
     for length in _LENGTHS:
         if size % (length * each):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan from one file: PCD, NPZ, or bare rows (``.bin``); or from any cloud file that shmmap reads."""
+"""One scan from one file: PCD, NPZ, bare rows (``.bin``), any cloud that shmmap reads; and a thinner one."""
 
 from __future__ import annotations
 
@@ -14,20 +14,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import MapDataError, MapMissing, read_cloud
+from shmmap import MapDataError, MapMissing, build_layer, read_cloud
 from shmmap_clients.scans.bin_layout import BinLayout, guess_layout
 
-__all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "read_scan_fields"]
+__all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "read_scan_fields", "thinned"]
 
 SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
 MIN_RANGE_M: Final = 0.5
 """Programs leave out nearer points: no-returns at (0, 0, 0), and the vehicle's own parts."""
-
 _NO_ARCHIVE: Final = (
     ValueError, KeyError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 _METRES: Final = {"xyz": 1.0, "xyz_4mm": 0.004}
-
 Columns = dict[str, NDArray[Any]]
 
 
@@ -37,7 +35,7 @@ def _silent(note: str) -> None:
 
 @dataclass(slots=True)
 class ScanReader:
-    """Reads the scans of a program, all in one way.
+    """Reads all scans of a program alike.
 
     Attributes
     ----------
@@ -47,7 +45,7 @@ class ScanReader:
         `screened` leaves out nearer points, metres from the sensor; None: it leaves out nothing, also
         not what is not finite.
     say
-        Called with what a user should know of how files are read, once each.
+        Called once with each note on how files are read.
     too_near, not_finite
         Points that `screened` has left out.
     """
@@ -167,3 +165,24 @@ def _from_npz(name: str) -> Columns:
             others = {k: v for k, v in arrays.items() if v.ndim and len(v) == len(xyz)}
             return {"xyz": xyz, **others}
     raise MapDataError(f"{name}: no array called xyz or xyz_4mm", hint="save it with np.savez(file, xyz=...)")
+
+
+def thinned(points: NDArray[np.floating], edge: float | None) -> NDArray[np.floating]:
+    """Return the mean of the points in each cube of ``edge`` metres; the points themselves without an edge.
+
+    Parameters
+    ----------
+    points : (N, 3)
+        Metres.
+    edge
+        Metres; None: all points.
+
+    Raises
+    ------
+    BadRequest
+        The edge makes no sense.
+    """
+    if edge is None or not len(points):
+        return points
+    columns = build_layer(f"voxel(leaf={edge!r})", points).columns
+    return np.asarray(columns["xyz"], points.dtype)

@@ -72,7 +72,7 @@ class ScanSequence:
     """The scans in a directory (PCD, NPZ or ``.bin``), by name, ``s_9`` before ``s_10``; read when
     their turn comes.
 
-    Which scan has which pose, and in which order they come then, is said in `pair_with_poses`.
+    See `pair_with_poses` for which scan has which pose, and for their order then.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans over ZeroMQ: whoever makes them binds a publisher, whoever wants them subscribes.
+"""Scans over ZeroMQ: their source binds a publisher, their readers subscribe.
 
 A message has a first frame in msgpack, ``{"shmmap_scan": 1, "name", "stamp_s", "pose", "columns"}``,
 and one frame of plain bytes for each column.  ``pose`` is null or 16 numbers, the rows of
@@ -91,7 +91,7 @@ def decode_scan(frames: list[bytes]) -> Scan | None:
 
 
 class ScanPublisher(Publisher):
-    """Sends scans to whoever listens.
+    """Sends scans to all subscribers.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class ScanPublisher(Publisher):
 
 
 class ScanSubscriber(Subscriber):
-    """Scans from a publisher: iterate until it has sent the last one; then nobody listens here any more.
+    """Scans from a publisher: iterate until it has sent the last one, which ends the subscription.
 
     Parameters
     ----------
@@ -135,6 +135,6 @@ class ScanSubscriber(Subscriber):
     def __next__(self) -> Scan:
         scan = None if self.closed else decode_scan(self.receive())
         if scan is None:
-            self.close()  # the publisher repeats the end for as long as somebody listens
+            self.close()  # the publisher repeats the end until no subscriber is left
             raise StopIteration
         return scan

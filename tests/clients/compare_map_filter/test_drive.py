@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 from shmmap_clients.compare_map_filter.drive import ComparedScan, DriveStatistics
 from shmmap_clients.compare_map_filter.filter import Comparison
-from shmmap_clients.compare_map_filter.picture import TopView
+from shmmap_clients.compare_map_filter.output import TopView
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import KEPT
 

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-from shmmap_clients.compare_map_filter.picture import TopView
+from shmmap_clients.compare_map_filter.output import TopView
 
 from tests.support.pictures import SVG, rasters
 
@@ -35,7 +35,7 @@ def test_a_picture_of_nothing() -> None:
 
 
 def test_a_long_drive_takes_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmmap_clients.compare_map_filter.picture._MOST", 500)
+    monkeypatch.setattr("shmmap_clients.compare_map_filter.output._MOST", 500)
     fine, view = np.random.default_rng(3).uniform(-40, 40, (4000, 3)), TopView(0.1)
     kept = fine[:, 0] > 0
     for part in range(0, 4000, 400):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.elevation_map.grid import FILLED, MEASURED, NOTHING, ElevationGrid
+from shmmap_clients.elevation_map.heights import ElevationRule
 from shmmap_clients.elevation_map.holes import fill_holes
-from shmmap_clients.elevation_map.rule import ElevationRule
 from shmmap_clients.elevation_map.seams import Columns, Seams, column_boxes
 from shmmap_clients.elevation_map.surface import surface_heights
 

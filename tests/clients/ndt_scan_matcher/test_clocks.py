@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is predicted where a clock jumps, stands or runs back: never a motion that nobody has seen."""
+"""Predictions where a clock jumps, stands or runs back: never a motion that was not measured."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import (
     first_twist,
     twist_on_route,
 )
-from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener
+from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
 from shmmap_clients.scans.trajectory import Trajectory
 
 
@@ -131,7 +131,7 @@ def test_odometry_that_begins_again_is_another_run() -> None:
 def test_a_listener_forgets_odometry_of_before_the_clock_was_set_back(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    listener = OdometryListener(f"ipc://{tmp_path_factory.mktemp('s')}/none")
+    listener = OdometrySubscriber(f"ipc://{tmp_path_factory.mktemp('s')}/none")
     try:
         for stamp in (100.0, 100.2, 100.1, 0.0, 0.1):
             listener._take(pose_stream.PoseMessage(stamp, np.eye(4).ravel().tolist()))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from shmmap_clients.ndt_scan_matcher import TrustLimits
 from shmmap_clients.ndt_scan_matcher.cli import main
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
 from tests.clients.ndt_scan_matcher.scene import scan_from, street
 

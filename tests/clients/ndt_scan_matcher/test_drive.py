@@ -22,17 +22,18 @@ from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, m
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
-from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics, frame_document
-from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
-from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher, decode_pose
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import (
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import (
+    DriveStatistics,
     RunningErrors,
     TrajectoryErrors,
+    frame_document,
     pose_errors,
 )
-from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
-from shmmap_clients.scans.thinning import thinned
+from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
+from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
+from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher, decode_pose
+from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
+from shmmap_clients.scans.scan_file import thinned
 from shmmap_clients.scans.trajectory import Trajectory
 from shmmap_clients.spread import KEPT
 
@@ -255,18 +256,18 @@ def test_poses_and_odometry_travel(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/poses"
     drive = arc(5)
     with PosePublisher(address) as publisher:
-        listener = OdometryListener(address)
+        listener = OdometrySubscriber(address)
         try:
-            assert publisher.wait_for_listener(60.0)
+            assert publisher.wait_for_subscriber(60.0)
             for index, T in enumerate(drive.T_map_sensor):
                 publisher.send(frame(index, T, None))
             assert listener.wait_until(float(drive.stamps_s[-1]), 60.0)
             assert not listener.wait_until(float(drive.stamps_s[-1]) + 0.1, 0.0)
-            heard = listener.trajectory
+            received = listener.trajectory
         finally:
             listener.close()
-    np.testing.assert_allclose(heard.T_map_sensor, drive.T_map_sensor)
-    np.testing.assert_allclose(heard.stamps_s, drive.stamps_s)
+    np.testing.assert_allclose(received.T_map_sensor, drive.T_map_sensor)
+    np.testing.assert_allclose(received.stamps_s, drive.stamps_s)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +302,7 @@ def test_addresses_that_make_no_sense_are_refused() -> None:
     with pytest.raises(shmmap.BadRequest, match="cannot bind"):
         PosePublisher("nonsense")
     with pytest.raises(shmmap.BadRequest, match="cannot connect"):
-        OdometryListener("nonsense")
+        OdometrySubscriber("nonsense")
 
 
 def test_what_scans_are_called_is_not_obeyed_by_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

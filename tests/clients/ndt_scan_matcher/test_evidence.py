@@ -18,9 +18,8 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
     voxel_cell,
 )
-from shmmap_clients.ndt_scan_matcher.matching.trust import extent_of
-from shmmap_clients.scans.scan_file import read_scan
-from shmmap_clients.scans.thinning import thinned
+from shmmap_clients.ndt_scan_matcher.matching.result import extent_of
+from shmmap_clients.scans.scan_file import read_scan, thinned
 from shmmap_clients.scans.trajectory import read_trajectory
 
 from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street

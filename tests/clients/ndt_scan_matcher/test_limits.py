@@ -28,11 +28,10 @@ from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
+from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.matching import matcher as matcher_module
 from shmmap_clients.ndt_scan_matcher.matching import newton
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import derivatives_of_poses, matrices_from_poses
-from shmmap_clients.ndt_scan_matcher.matching.time_bound import predict_time_bound
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street, worth
@@ -158,7 +157,7 @@ def test_the_bound_of_time_is_measured_where_the_work_is_done(
 ) -> None:
     with NdtMatcher(Settings(backend=backend), limits=Limits(source_points=800)) as matcher:
         matcher.set_map(matcher.prepare(map_of(points, 2.0)))
-        bound = predict_time_bound(matcher, scan, GUESS)
+        bound = matcher.time_bound(scan, GUESS)
         begin = time.perf_counter()
         matcher.evaluate(scan, TRUTH[None])
         took_ms = (time.perf_counter() - begin) * 1e3
@@ -170,7 +169,7 @@ def test_the_bound_of_time_is_measured_where_the_work_is_done(
     assert took_ms > 0
     with NdtMatcher(Settings(backend=backend), limits=Limits(source_points=800, deadline_s=1e-4)) as matcher:
         matcher.set_map(matcher.prepare(map_of(points, 2.0)))
-        bounded = predict_time_bound(matcher, scan, GUESS)
+        bounded = matcher.time_bound(scan, GUESS)
     assert bounded.total_ms == pytest.approx(0.1 + bounded.pass_ms)
     assert "0.0001 s" in bounded.describe()
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS, search_step
+from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS, line_search
 
 KINK = 0.00024
 
@@ -20,15 +20,14 @@ def kink(a: float) -> tuple[float, float]:
 
 def trials(*, by_upper_end: bool, first: float = 0.1) -> list[float]:
     """Step lengths that were looked at, in order."""
-    seen: list[float] = []
-
-    def phi(a: float) -> tuple[float, float]:
-        seen.append(a)
-        return kink(a)
-
-    found, count = search_step(first, 1e-9, 0.1, *kink(0.0), phi, by_upper_end=by_upper_end)
-    assert found == seen[-1]
-    assert len(seen) == count + 1
+    search = line_search(first, 1e-9, 0.1, *kink(0.0), by_upper_end=by_upper_end)
+    seen, found = [next(search)], None
+    while found is None:
+        try:
+            seen.append(search.send(kink(seen[-1])))
+        except StopIteration as ended:
+            found = ended.value
+    assert found == (seen[-1], len(seen) - 1)
     return seen
 
 

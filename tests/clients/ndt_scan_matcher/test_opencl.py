@@ -390,7 +390,7 @@ def test_a_map_in_place_stays_while_it_is_in_use_beside_the_next_ones(
     for number in range(20):
         last = map_of(points, 2.0, edge=5.0 + number % 4)
         there.prepare(last, how)
-        gc.collect()  # tables that nobody kept would be overwritten by the next map's
+        gc.collect()  # tables without an owner would be overwritten by the next map's
         assert same_bits(worth(there, NEAR, how), before)
     there.set_map(last)
     assert off(worth(there, NEAR, how), worth(ready("numba", last, scan), NEAR, how)) <= 1e-12

@@ -16,19 +16,19 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import DeviceOptions, Limits, NdtMatcher, Scoring, Settings, VoxelMap
 from shmmap_clients.ndt_scan_matcher.backends import opencl_backend
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend
-from shmmap_clients.ndt_scan_matcher.backends.opencl import devices
-from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import (
-    choose_device,
-    list_devices,
-    vendors_with_nvidia,
-)
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
+from shmmap_clients.ndt_scan_matcher.backends.backend import (
+    Backend,
     DeviceError,
     DeviceHung,
     DeviceMemory,
     KernelBuildFailed,
     NoDevice,
+)
+from shmmap_clients.ndt_scan_matcher.backends.opencl import devices
+from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import (
+    choose_device,
+    list_devices,
+    vendors_with_nvidia,
 )
 from shmmap_clients.ndt_scan_matcher.backends.opencl.map_memory import MapBuffers, in_large_pages
 from shmmap_clients.ndt_scan_matcher.backends.opencl_backend import OpenclBackend

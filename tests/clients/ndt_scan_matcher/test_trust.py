@@ -17,8 +17,8 @@ from shmmap_clients.ndt_scan_matcher import (
     VoxelMap,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
-from shmmap_clients.ndt_scan_matcher.matching.trust import Evidence, default_nvtl, default_sharpness
+from shmmap_clients.ndt_scan_matcher.drive.follower import Tracking
+from shmmap_clients.ndt_scan_matcher.matching.result import Evidence, default_nvtl, default_sharpness
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street
@@ -149,7 +149,9 @@ def test_a_vehicle_is_lost_after_so_many_results(points: NDArray[np.float64]) ->
     tracking = Tracking(3)
     assert tracking.state == "uncertain"
     states = [tracking.update(one) for one in (trusted, doubtful, doubtful, trusted)]
-    assert states == ["tracking", "uncertain", "uncertain", "tracking"], "a trusted one begins anew"
+    assert states == ["tracking", "uncertain", "uncertain", "tracking"], (
+        "a trusted one starts the count again"
+    )
     states = [tracking.update(one) for one in (doubtful, doubtful, doubtful, doubtful, trusted)]
     assert states == ["uncertain", "uncertain", "lost", "lost", "tracking"]
     assert tracking.update(nowhere) == "lost", "there is nothing to wait for"

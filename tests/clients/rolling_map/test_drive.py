@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
-from shmmap_clients.rolling_map.drive import DriveStatistics, MappedScan
+from shmmap_clients.rolling_map.live_map import DriveStatistics, MappedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import KEPT
 

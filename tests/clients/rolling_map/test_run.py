@@ -24,7 +24,7 @@ def words(tmp_path: Path) -> list[str]:
     poses = tmp_path / "poses.txt"
     poses.write_text("0.0 0.0 2.0 0.5 0 0 0 1\n", encoding="utf-8")
     files = ["--scans", str(scans), "--poses", str(poses)]
-    return ["run", "--live", "lidar", *files, "--endpoint", str(tmp_path / "nobody.sock")]
+    return ["run", "--live", "lidar", *files, "--endpoint", str(tmp_path / "none.sock")]
 
 
 @pytest.mark.parametrize(

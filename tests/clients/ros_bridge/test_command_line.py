@@ -26,7 +26,7 @@ from shmmap_clients.ros_bridge.cli import main
 )
 def test_impossible_values_exit_2(capsys: pytest.CaptureFixture[str], more: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        main([*more, "--endpoint", "/nowhere/nobody.sock"])
+        main([*more, "--endpoint", "/nowhere/none.sock"])
     assert ended.value.code == 2
     assert f"argument {more[0]}: expected " in capsys.readouterr().err
 
@@ -35,10 +35,10 @@ def test_without_a_daemon_it_says_so(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
-    assert main(["--endpoint", "/nowhere/nobody.sock"]) == 69
-    assert "nobody.sock" in capsys.readouterr().err
+    assert main(["--endpoint", "/nowhere/none.sock"]) == 69
+    assert "none.sock" in capsys.readouterr().err
     monkeypatch.setenv("ROS_DOMAIN_ID", "lidar")
-    assert main(["--endpoint", "/nowhere/nobody.sock"]) == 78
+    assert main(["--endpoint", "/nowhere/none.sock"]) == 78
     assert "'lidar'" in capsys.readouterr().err
 
 

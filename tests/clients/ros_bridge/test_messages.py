@@ -15,11 +15,20 @@ pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import cdr
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
-from shmmap_clients.ros_bridge.messages.autoware import CellMetaData, CellWithID, GetDifferentialResponse
-from shmmap_clients.ros_bridge.messages.bonxai import GetOccupiedResponse, VoxelGrid
-from shmmap_clients.ros_bridge.messages.parameters import ParameterValue
-from shmmap_clients.ros_bridge.messages.standard import Header, PointCloud2, PointField, Time
-from shmmap_clients.ros_bridge.messages.wire import Damaged, ready_made
+from shmmap_clients.ros_bridge.messages import (
+    CellMetaData,
+    CellWithID,
+    Damaged,
+    GetDifferentialResponse,
+    GetOccupiedResponse,
+    Header,
+    PointCloud2,
+    PointField,
+    Time,
+    VoxelGrid,
+    ready_made,
+)
+from shmmap_clients.ros_bridge.parameters import ParameterValue
 from shmmap_clients.ros_bridge.point_cloud import cloud_layout, fill_rows, write_cloud
 
 TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)

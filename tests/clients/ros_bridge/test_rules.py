@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import names
+from shmmap_clients.ros_bridge.catalogue import Requesters
 from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
-from shmmap_clients.ros_bridge.requesters import Requesters
 from shmmap_clients.ros_bridge.service_server import Request, Requester
 from shmmap_clients.ros_bridge.worker import MOST_OF_ONE, MOST_WAITING, WaitingRequests
 
@@ -68,10 +68,14 @@ def test_what_a_client_was_sent_is_what_it_holds() -> None:
 
 def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
     requesters = Requesters(most=2)
-    for who in ("one", "two", "one", "three"):
+    for client in ("one", "two", "one", "three"):
         requesters.answered(who, [], [], {"a": 1})
     assert len(requesters) == 2
-    assert [requesters.held(who, ["a"], {"a": 5})[0].version for who in ("one", "two", "three")] == [1, 5, 1]
+    assert [requesters.held(client, ["a"], {"a": 5})[0].version for client in ("one", "two", "three")] == [
+        1,
+        5,
+        1,
+    ]
     requesters.keep_only({"three", "four"})
     assert len(requesters) == 1
     assert requesters.held("three", ["a"], {})[0].version == 1
@@ -214,7 +218,7 @@ def test_cells_are_kept_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not recent.release_idle()
     recent.kept([second])
     now_s[0] += 1.9
-    assert (recent.release_idle(), len(recent)) == (False, 3), "somebody has asked"
+    assert (recent.release_idle(), len(recent)) == (False, 3), "a client has asked"
     now_s[0] += 0.2
     assert (recent.release_idle(), len(recent), recent.release_idle()) == (True, 0, False)
     assert recent.kept([cell("a", 1)])[0] is not first

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a bridge tells about itself: the file, and what `shmmap doctor` makes of it."""
+"""A bridge's status: the file, and what `shmmap doctor` makes of it."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def finding(socket: str, tmp_path: Path) -> Finding:
     return check_ros_bridge(examine(load_config(flags), ""))
 
 
-def bridge(socket: str, domain: int, told: object) -> subprocess.Popen[str]:
-    """Another process with the file: who holds a lock does not see it itself."""
+def bridge(socket: str, domain: int, status: object) -> subprocess.Popen[str]:
+    """Another process with the file: the holder of a lock does not see it itself."""
     pipe = subprocess.PIPE
-    words = [sys.executable, "-c", HOLDER, socket, str(domain), json.dumps(told)]
+    words = [sys.executable, "-c", HOLDER, socket, str(domain), json.dumps(status)]
     made = subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True)
     assert made.stdout is not None
     assert made.stdout.readline().strip().endswith(status_name("town", domain))
@@ -53,11 +53,11 @@ def bridge(socket: str, domain: int, told: object) -> subprocess.Popen[str]:
 def test_doctor_names_strangers_of_bridges_that_run(socket: str, tmp_path: Path) -> None:
     assert finding(socket, tmp_path).skipped
     fast = {"service": "/map/get_partial_pointcloud_map", "vendor": "Fast DDS"}
-    told = {"domain": 3, "clients": 5, "strangers": [fast, fast, {"service": "/x", "vendor": ""}]}
+    status = {"domain": 3, "clients": 5, "strangers": [fast, fast, {"service": "/x", "vendor": ""}]}
     with bridge(socket, 0, {"domain": 0, "clients": 1, "strangers": []}) as first:
         found = finding(socket, tmp_path)
         assert (found.state, found.fact) == ("ok", "domain 0: 1 client")
-        with bridge(socket, 3, told) as second:
+        with bridge(socket, 3, status) as second:
             found = finding(socket, tmp_path)
             assert found.state == "warn"
             assert "2 clients of /map/get_partial_pointcloud_map, of Fast DDS; 1 client of /x" in found.fact
@@ -70,11 +70,11 @@ def test_doctor_names_strangers_of_bridges_that_run(socket: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    "told", ["", "[]", "{", '{"domain": 1}', '{"domain": "x", "clients": 1, "strangers": []}', "\0"]
+    "status", ["", "[]", "{", '{"domain": 1}', '{"domain": "x", "clients": 1, "strangers": []}', "\0"]
 )
-def test_doctor_survives_what_is_no_bridge_s_file(socket: str, tmp_path: Path, told: str) -> None:
+def test_doctor_survives_what_is_no_bridge_s_file(socket: str, tmp_path: Path, status: str) -> None:
     with bridge(socket, 1, {"domain": 1, "clients": 0, "strangers": []}) as one:
-        Path(tmp_path, status_name("town", 1)).write_text(told)
+        Path(tmp_path, status_name("town", 1)).write_text(status)
         assert finding(socket, tmp_path).skipped
         one.kill()
 

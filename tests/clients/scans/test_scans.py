@@ -221,7 +221,7 @@ def test_messages_that_are_no_scans() -> None:
 def test_scans_over_a_socket(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/scans"
     with ScanPublisher(endpoint) as publisher, ScanSubscriber(endpoint) as subscriber:
-        assert publisher.wait_for_listener(30.0)
+        assert publisher.wait_for_subscriber(30.0)
         for n in range(3):
             publisher.send(Scan(f"s{n}", n, make_scan().columns))
         publisher.send(None)
@@ -237,25 +237,25 @@ def test_a_slow_reader_hears_the_end(tmp_path: Path) -> None:
     sent = 1000  # more than fit into both queues
     publisher = ScanPublisher(endpoint)
     with ScanSubscriber(endpoint) as subscriber:
-        assert publisher.wait_for_listener(30.0)
+        assert publisher.wait_for_subscriber(30.0)
         for n in range(sent):
             publisher.send(Scan(str(n), n, {"xyz": np.zeros((1000, 3), np.float32)}))
         publisher.send(None)
         closing = threading.Thread(target=publisher.close)
         closing.start()
-        heard = [int(scan.name) for scan in subscriber]
+        received = [int(scan.name) for scan in subscriber]
         closing.join()
         assert list(subscriber) == []
-    assert 0 < len(heard) < sent  # it was slow: it has missed some
-    assert heard == sorted(set(heard))
+    assert 0 < len(received) < sent  # it was slow: it has missed some
+    assert received == sorted(set(received))
 
 
 def test_nobody_who_does_not_read_holds_up_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scan_stream, "_LINGER_MS", 50)
     endpoint = f"ipc://{tmp_path}/scans"
     with ScanPublisher(endpoint) as publisher:
-        assert not publisher.wait_for_listener(0.0)
+        assert not publisher.wait_for_subscriber(0.0)
         publisher.send(None)
     with ScanSubscriber(endpoint), ScanPublisher(endpoint) as publisher:
-        assert publisher.wait_for_listener(30.0)
+        assert publisher.wait_for_subscriber(30.0)
         publisher.send(None)  # and closes, the reader still there

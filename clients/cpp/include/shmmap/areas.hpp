@@ -47,7 +47,7 @@ using Area = std::variant<Circle, Square, Box>;
 struct Intent {
   double x = 0.0, y = 0.0, vx = 0.0, vy = 0.0;
   std::optional<double> heading = std::nullopt;
-  /// The polyline ahead, to be given with every pose; of more than 512 places so many are sent, equally far apart.
+  /// The polyline ahead, to be given with every pose; of more than 512 places 512 are sent, equally far apart.
   std::vector<std::array<double, 2>> route = {};
 };
 

@@ -19,7 +19,7 @@
 //
 // They never throw.  Cells are waited for, because a node that was given nothing, or a part, asks again only
 // 20 m further on: `LoaderOptions::wait` seconds for cells that are being loaded, or until there is a daemon;
-// and `Options::patience` seconds more if it does not answer at all.
+// and `Options::timeout` seconds more if it does not answer at all.
 
 #ifndef SHMMAP_AUTOWARE_HPP
 #define SHMMAP_AUTOWARE_HPP
@@ -56,7 +56,7 @@ struct Difference {
   std::string frame_id;
 };
 
-/// Remembers the versions of the cells that somebody holds by id, and asks for what he lacks.
+/// Remembers the versions of the cells that a caller holds by id, and asks for those that it lacks.
 class HeldCells {
  public:
   HeldCells(LoaderOptions options, std::string layer)
@@ -66,7 +66,7 @@ class HeldCells {
 
   /// What `cached` lacks of an area, each cell as `make` makes it out of the mapped one, and what it has in
   /// vain; no value, and nothing forgotten, where something is missing and no other cell has come.  Cells are
-  /// let go of as soon as they are made: an area may be larger than the daemon's memory.
+  /// released as soon as they are made: an area may be larger than the daemon's memory.
   template <typename Make, typename Made = std::invoke_result_t<const Make&, const Cell&>>
   std::optional<Difference<Made>> difference(const Area& area, const std::vector<std::string>& cached,
                                              const Make& make) {
@@ -110,7 +110,7 @@ class HeldCells {
           no_room = no_room || failure.code == "over_budget" || failure.code == "no_space";
         }
         for (const auto& [id, layer] : answer.pending) lacks(id, id + ": it is still being loaded");
-        // room comes of what is let go here; and for a map that is not known yet no request waits
+        // room comes from cells that are released here; and for a map that is not known yet no request waits
         again = (!covered || !answer.pending.empty() || (no_room && !answer.cells.empty())) &&
                 Clock::now() < until && is_wanted();
         if (again && answer.cells.empty()) ::poll(nullptr, 0, 20);
@@ -135,11 +135,11 @@ class HeldCells {
     return found;
   }
 
-  /// Tell what went wrong; the caller's function must not cost him his node.
+  /// Log what went wrong; an error in the caller's function does not end its node.
   void say(const std::string& message) const noexcept {
     try {
       if (options_.log) options_.log("shmmap: " + message);
-    } catch (...) {  // NOLINT(bugprone-empty-catch): there is nobody left to tell
+    } catch (...) {  // NOLINT(bugprone-empty-catch): there is no other log
     }
   }
 
@@ -272,7 +272,7 @@ std::vector<Leaf> ndt_leaves(const Cell& cell) {
   return leaves;
 }
 
-/// Voxels where `PcdLoader` has points: the same requests, and nobody has to make voxels any more.
+/// Voxels where `PcdLoader` has points: the same requests, without making voxels.
 template <typename Leaf>
 class NdtLeaves {
  public:

@@ -46,7 +46,7 @@ struct HashOfCellKey {
   }
 };
 
-/// What was unmapped, by whatever thread, and the daemon was not told of yet.
+/// Unmapped by any thread, and not yet reported to the daemon.
 class Unmapped {
  public:
   void add(const CellKey& key) noexcept {
@@ -68,12 +68,12 @@ class Unmapped {
 
 }  // namespace detail
 
-/// How a client finds the daemon and what it says of itself.
+/// How a client finds the daemon, and its own name and limits.
 struct Options {
   std::string endpoint = {};  ///< the socket's path; empty: the environment says, as for every client
   std::string name = {};      ///< how the program is listed (`shmmap top`); at most 64 characters
   std::string shm_dir = {};   ///< where this process finds segments; empty: `SHMMAP_SHM_DIR`, or as the daemon says
-  double patience = 5.0;      ///< seconds to wait for an answer, beyond those that the daemon may take
+  double timeout = 5.0;       ///< seconds to wait for an answer, beyond those that the daemon may take
   /// Asked ten times a second while a request waits; where it returns false the request ends with `Interrupted`.
   std::function<bool()> keep_waiting = {};
 };
@@ -91,8 +91,8 @@ struct Exchange {
   double pause = 0.0;                      // until then; 0: it has not been sent on this connection
   std::string reply = {};                  // where it came while another answer was waited for
 
-  [[nodiscard]] Clock::time_point overdue(double patience) const {
-    return since + std::chrono::duration_cast<Clock::duration>(Seconds(std::min(wait + patience, 1e6)));
+  [[nodiscard]] Clock::time_point overdue(double timeout) const {
+    return since + std::chrono::duration_cast<Clock::duration>(Seconds(std::min(wait + timeout, 1e6)));
   }
 };
 
@@ -213,7 +213,7 @@ class Client {
     ask(number, message.data(), "released", 0.0, reply);
   }
 
-  /// Counts the daemon's lives.
+  /// Number of the daemon's run.
   [[nodiscard]] std::uint64_t epoch() const noexcept { return welcome_.epoch; }
   /// Which state of the map the last answer was about; 0 before the first one.
   [[nodiscard]] std::uint64_t map_version() const noexcept { return map_version_; }
@@ -374,7 +374,7 @@ class Client {
   /// Send a request until it is answered; `reply` is what came.
   void ask(std::uint64_t number, const std::string& message, std::string_view tag, double wait, std::string& reply) {
     check_size(message);
-    const auto deadline = after(wait + options_.patience);
+    const auto deadline = after(wait + options_.timeout);
     double pause = wait + 1.0;
     bool may_be_back = true;  // the first time it is asked at once
     while (true) {
@@ -385,7 +385,7 @@ class Client {
         pause *= 2.0;
         if (is_answered(number, tag, reply, until)) return;
         if (Clock::now() >= deadline)
-          throw Unreachable("no_answer", path() + ": no answer within " + detail::short_text(wait + options_.patience) +
+          throw Unreachable("no_answer", path() + ": no answer within " + detail::short_text(wait + options_.timeout) +
                                              " s", "is the daemon stopped, hung or overloaded? see `shmmap health`");
       } catch (const Refused& error) {
         if (error.code() != "no_session" || Clock::now() >= deadline) throw;
@@ -413,7 +413,7 @@ class Client {
   bool is_finished(std::string& reply, Clock::time_point until) {
     for (bool may_be_back = true;; may_be_back = false) {
       try {
-        const auto overdue = exchange_->overdue(options_.patience);
+        const auto overdue = exchange_->overdue(options_.timeout);
         if (const auto limit = std::min(until, overdue); is_welcome(limit) && is_exchanged(reply, limit)) {
           exchange_.reset();
           return true;
@@ -524,13 +524,13 @@ class Client {
     if (wait && !(*wait >= 0.0 && *wait <= 3600.0))
       throw BadRequest("bad_request", "wait is 0 to 3600 seconds, not " + detail::short_text(*wait));
     report_unmapped();
-    const auto deadline = after(wait.value_or(0.0) + options_.patience);
+    const auto deadline = after(wait.value_or(0.0) + options_.timeout);
     auto found = one_reply(tag, wait.value_or(0.0), write, elements);
     Answer& answer = found.answer;
     std::vector<CellPtr> places(found.handles.size());
     std::vector<std::size_t> gone;
-    const auto patience = [] { return after(attach_s); };
-    for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer, patience());
+    const auto limit = [] { return after(attach_s); };
+    for (std::size_t at = 0; at < places.size(); ++at) take(found.handles[at], at, places, gone, answer, limit());
     for (int attempt = 0; !gone.empty() && attempt < attempts && Clock::now() < deadline; ++attempt) {
       ask_again(found.handles, places, gone, answer);
       if (!gone.empty()) check_visible();  // not at first: a daemon that ends takes all its segments away
@@ -578,7 +578,7 @@ class Client {
     }
   }
 
-  /// Ask anew for the handles whose segments were gone before they could be attached.
+  /// Ask again for the handles whose segments were gone before they could be attached.
   void ask_again(std::vector<detail::Handle>& handles, std::vector<CellPtr>& places, std::vector<std::size_t>& gone,
                  Answer& answer) {
     std::vector<std::string> ids, layers;
@@ -586,7 +586,7 @@ class Client {
       if (std::find(to.begin(), to.end(), one) == to.end()) to.push_back(one);
     };
     for (const auto at : gone) add(ids, handles[at].id), add(layers, handles[at].layer);
-    const std::optional<double> wait = options_.patience / 2.0;
+    const std::optional<double> wait = options_.timeout / 2.0;
     auto found = one_reply("selected", *wait, [&](detail::Writer& to) {
       detail::write(to, ids);
       detail::write(to, layers);

@@ -30,7 +30,7 @@ class Error : public std::runtime_error {
 struct BadRequest : Error { using Error::Error; };
 /// There is no such column.
 struct NoColumn : BadRequest { using BadRequest::BadRequest; };
-/// Nobody answers: `no_socket`, `no_permission`, `stale_socket`, `connection_lost` or `no_answer`.
+/// No answer: `no_socket`, `no_permission`, `stale_socket`, `connection_lost` or `no_answer`.
 struct Unreachable : Error { using Error::Error; };
 /// `Options::keep_waiting` has ended a wait (`interrupted`).
 struct Interrupted : Error { using Error::Error; };

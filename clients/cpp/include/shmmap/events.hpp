@@ -25,7 +25,7 @@
 
 namespace shmmap {
 
-/// One thing that happened: `kind` and what it tells, by the names that PROTOCOL.md gives ("Events").
+/// One thing that happened: `kind` and its fields, by the names that PROTOCOL.md gives ("Events").
 struct Event {
   std::string kind;
   std::uint64_t seq = 0;  ///< its number in its epoch, from 1 without gaps
@@ -47,7 +47,7 @@ struct Event {
   }
 };
 
-/// Events that are lost: what they told has to be found out otherwise, by asking for cells again.
+/// Events that are lost: ask for cells again to learn what they reported.
 struct Missed {
   std::uint64_t epoch = 0, first = 0, last = 0;
 };
@@ -102,10 +102,10 @@ inline Event read_event(Row& row) {
 
 }  // namespace detail
 
-/// What happens in the daemon, in order.  When the daemon is restarted it goes on with the next life's events.
+/// What happens in the daemon, in order.  After a restart of the daemon, events of its next run follow.
 class EventStream {
  public:
-  /// `since`: begin with what happened in the last so many seconds, as far as the daemon remembers; none: now.
+  /// `since`: begin with the events of the last `since` seconds, as far as the daemon remembers; none: now.
   explicit EventStream(Options options = {}, std::optional<double> since = std::nullopt)
       : client_(std::move(options)), epoch_(client_.epoch()) {
     if (since && !(*since >= 0.0)) throw BadRequest("bad_request", "since is seconds, not below zero");
@@ -119,7 +119,7 @@ class EventStream {
     while (!catch_up(0, static_cast<std::uint64_t>(std::max(from, 0.0)))) epoch_ = recent(0, 0, 0).epoch;
   }
 
-  /// The next event, or what was missed; nothing if nothing happens within so many seconds (0: what is there).
+  /// The next event, or what was missed; nothing if nothing happens within `timeout` seconds (0: what is there).
   std::optional<Happening> next(double timeout) {
     const auto until = Client::after(timeout);
     while (ready_.empty()) {
@@ -128,7 +128,7 @@ class EventStream {
         if (!socket_.is_open()) subscribe();
         if (!socket_.receive(message, until)) return std::nullopt;
         pause_ms_ = first_pause_ms;
-      } catch (const Unreachable&) {  // it ended; nobody says when the next one listens
+      } catch (const Unreachable&) {  // it ended; when the next one listens is unknown
         socket_ = detail::Socket();
         const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(until - detail::Clock::now()).count();
         if (left <= 0) return std::nullopt;
@@ -136,14 +136,14 @@ class EventStream {
         pause_ms_ = std::min(2 * pause_ms_, longest_pause_ms);
         continue;
       }
-      hear(message);
+      take(message);
     }
     Happening first = std::move(ready_.front());
     ready_.pop_front();
     return first;
   }
 
-  /// The daemon's present life.
+  /// The daemon's present run.
   [[nodiscard]] std::uint64_t epoch() const noexcept { return epoch_; }
   /// For event loops: readable when `next(0.0)` may have something; -1 while the daemon is away.
   [[nodiscard]] int fd() const noexcept { return socket_.fd(); }
@@ -194,7 +194,7 @@ class EventStream {
                        [&event](const auto& known) { return known.kind == event.kind; });
   }
 
-  void hear(const std::string& message) {
+  void take(const std::string& message) {
     detail::Reader reader(message);
     detail::Row row(reader);
     Event event = detail::read_event(row);
@@ -211,14 +211,14 @@ class EventStream {
     if (is_known(event)) ready_.emplace_back(std::move(event));
   }
 
-  /// Nobody will ever tell what is missing up to this number.
+  /// Report what is missing up to this number as lost.
   void miss(std::uint64_t last) {
     if (last < expected_) return;
     ready_.emplace_back(Missed{epoch_, expected_, last});
     expected_ = last + 1;
   }
 
-  /// Fetch what is missing; false if that is of an earlier life of the daemon.  One that does not answer now has
+  /// Fetch what is missing; false if that is of a previous run of the daemon.  One that does not answer now has
   /// more to say when it is back.
   bool tried_to_catch_up() {
     try {

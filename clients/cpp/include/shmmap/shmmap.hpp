@@ -15,7 +15,7 @@
 //
 // A `Client` is one connection and one session: move it, do not share it among threads.  Cells may be used by
 // any thread, outlive their client and the daemon, and are unmapped with their last owner.  Nothing here starts
-// threads, handles signals or keeps globals.  Whatever is read is checked first; who cannot be trusted costs an
+// threads, handles signals or keeps globals.  Whatever is read is checked first; damaged bytes cost an
 // exception, no crash.
 //
 // One header for each concept, in the order in which they explain each other.

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How the daemon is and what it keeps, read from its statistics segment: nobody is asked, so it also works while
+// How the daemon is and what it keeps, read from its statistics segment without a request: so it also works while
 // the daemon is busy, stopped, hung or dead.  The bytes are in shmmap/statistics/STATISTICS.md.
 
 #ifndef SHMMAP_STATISTICS_HPP
@@ -35,7 +35,7 @@ namespace shmmap {
 /// How a daemon is: no segment, no process, stopped by a signal, no beat for 5 s, or well.
 enum class DaemonState { absent, dead, stopped, hung, healthy };
 
-/// One number of the daemon's: a counter only grows during its life, a gauge is a present amount.
+/// One number of the daemon's: a counter only grows during its run, a gauge is a present amount.
 struct Counter {
   std::string name, unit, help;
   bool is_gauge = false;
@@ -343,7 +343,7 @@ class StatisticsReader {
     return letter == 'T' || letter == 't' ? DaemonState::stopped : by_beat;
   }
 
-  /// So many rows of a table; each is left out that is free, or just being changed.
+  /// The first `count` rows of a table; free rows, and those just being changed, are left out.
   template <typename Read>
   void each_row(std::uint64_t offset, std::uint64_t count, std::uint64_t row_bytes, std::uint64_t checked,
                 const Read& read) const {

@@ -43,7 +43,7 @@ struct Departed {
   double age = 0.0;
 };
 
-/// Says of each departed cell whether to keep it attached.
+/// Decides for each departed cell whether to keep it attached.
 using RetentionPolicy = std::function<std::vector<bool>(const std::vector<Departed>&)>;
 
 /// Keeps cells up to a distance, a sum of bytes and an age, the nearest first; the default keeps nothing.
@@ -157,7 +157,7 @@ class Window {
   /// Waits until nothing is missing, at most `wait` seconds, and no longer than half a second where what is missing
   /// does not fit in the daemon's memory, or cannot be reached.  Throws BadRequest, and whatever keeps the daemon from
   /// being asked: Unreachable at once where no daemon listens and `wait` is below 20 ms, else when that time is over, and
-  /// `no_answer` where it has been silent for `Options::patience` seconds.  The window keeps what it has.
+  /// `no_answer` where it has been silent for `Options::timeout` seconds.  The window keeps what it has.
   WindowUpdate move_to(const Intent& pose, double wait = default_wait) {
     check_pose(pose);
     if (!(wait >= 0.0)) throw BadRequest("bad_request", "wait must not be below zero");

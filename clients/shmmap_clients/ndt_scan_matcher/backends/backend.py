@@ -1,35 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
 """`Backend`: what computes score and derivatives, one small contract for several kinds of hardware.
 
-Beside it stands what backends have in common: the scan's buffer, the options of a device, and the count of
-what was written to one.
+Beside it stands what backends have in common: the scan's buffer, the options of a device, the count of what
+was written to one, and what can be wrong with it.  After none of these errors is another device taken
+silently::
+
+    DeviceError
+    ├── NoDevice           no driver, no such device, or it cannot do what was asked
+    ├── KernelBuildFailed  the driver refuses the program
+    ├── DeviceMemory       the device has not the memory that the limits ask for
+    └── DeviceHung         it did not answer in time
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Final, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+from shmmap import BadRequest, ShmmapError
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Scoring
 
 __all__ = [
     "Backend",
+    "DeviceError",
+    "DeviceHung",
+    "DeviceMemory",
     "DeviceOptions",
+    "KernelBuildFailed",
     "MapMemory",
+    "NoDevice",
     "Precision",
     "ScanBuffer",
     "UploadStatistics",
     "check_batch",
+    "device_errors",
 ]
 
 Precision = Literal["auto", "double", "float"]
 MapMemory = Literal["auto", "svm", "copy"]
+_OUT_OF_MEMORY = (
+    "MEM_OBJECT_ALLOCATION_FAILURE",
+    "OUT_OF_RESOURCES",
+    "OUT_OF_HOST_MEMORY",
+    "INVALID_BUFFER_SIZE",
+)
+_LESS: Final = "lower limits (--max-voxels, --max-map-bytes, --max-points) need less"
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,3 +194,64 @@ class ScanBuffer:
             with np.errstate(over="ignore"):
                 np.copyto(self._buffer, points[np.arange(most) * given // most], casting="same_kind")
         return given - self._count
+
+
+class DeviceError(ShmmapError):
+    """A device cannot do what it is asked to."""
+
+    code = "device_error"
+    exit_code = 69
+    advice = "`shmmap-ndt device-check` examines it; `--backend numba` needs no device"
+
+
+class NoDevice(DeviceError):
+    """There is no such device, or it cannot do what was asked."""
+
+    code = "no_device"
+
+
+class KernelBuildFailed(DeviceError):
+    """The device's driver cannot build the program."""
+
+    code = "kernel_build_failed"
+
+
+class DeviceMemory(DeviceError):
+    """The device has not as much memory as the limits ask for."""
+
+    code = "device_memory"
+
+
+class DeviceHung(DeviceError):
+    """The device did not answer in time."""
+
+    code = "device_hung"
+
+
+@contextmanager
+def device_errors(device: str, what: str) -> Iterator[None]:
+    """Turn pyopencl's errors, and a lack of memory, into those of this module.
+
+    Parameters
+    ----------
+    device
+        The device's name.
+    what
+        What is asked of it, as in "device X cannot ...".
+    """
+    import pyopencl as cl
+
+    try:
+        yield
+    except cl.Error as error:
+        said = " ".join(str(error).split())[:300]
+        if isinstance(error, cl.MemoryError) or any(name in said for name in _OUT_OF_MEMORY):
+            raise DeviceMemory(
+                f"device {device!r} has not enough memory to {what}: {said}",
+                hint=_LESS,
+            ) from None
+        raise DeviceError(f"device {device!r} cannot {what}: {said}") from None
+    except MemoryError as error:  # of this process, which a processor's memory is
+        raise DeviceMemory(
+            f"device {device!r} has not enough memory to {what}: {error}", hint=_LESS
+        ) from None

@@ -3,7 +3,7 @@
 
 Importing this module compiles the kernels, or loads them from numba's cache (tenths of a second).
 Everything that a loop reads again and again is in local variables: a compiler that cannot know that a
-store does not change an array would load it anew each time.
+store does not change an array would load it again each time.
 """
 
 from __future__ import annotations

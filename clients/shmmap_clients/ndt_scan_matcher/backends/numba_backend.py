@@ -22,7 +22,7 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     gauss_for,
     search_columns,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
 __all__ = ["NumbaBackend"]
 

@@ -27,13 +27,13 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     gauss_for,
     search_columns,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
     derivatives_of_poses,
     evaluations_of,
     matrices_from_poses,
     numpy_step,
 )
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
 __all__ = ["NumpyBackend"]
 

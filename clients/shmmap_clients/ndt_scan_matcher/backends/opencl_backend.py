@@ -17,20 +17,17 @@ from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends import opencl
 from shmmap_clients.ndt_scan_matcher.backends.backend import (
+    DeviceHung,
+    DeviceMemory,
     DeviceOptions,
+    KernelBuildFailed,
     ScanBuffer,
     UploadStatistics,
     check_batch,
-)
-from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, choose_device
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import (
-    DeviceHung,
-    DeviceMemory,
-    KernelBuildFailed,
     device_errors,
 )
+from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, Waiting, choose_device
 from shmmap_clients.ndt_scan_matcher.backends.opencl.map_memory import MapBuffers, MapInPlace, PlacedMap
-from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     CHUNK_POINTS,
@@ -40,13 +37,13 @@ from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     Scoring,
     gauss_for,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import (
     derivatives_of_poses,
     evaluations_of,
     matrices_from_poses,
     numpy_step,
 )
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
 __all__ = ["OpenclBackend", "build_kernel", "kernel_source"]
 

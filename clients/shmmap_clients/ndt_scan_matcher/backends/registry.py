@@ -14,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest, needed_packages
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceOptions, UploadStatistics
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+from shmmap_clients.ndt_scan_matcher.backends.backend import (
+    Backend,
+    DeviceError,
+    DeviceOptions,
+    UploadStatistics,
+)
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Scoring
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits
 
 __all__ = ["BACKENDS", "FallbackBackend", "backend_named"]
 

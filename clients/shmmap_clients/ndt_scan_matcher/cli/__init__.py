@@ -4,14 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 from shmmap_clients.command_line import run_program
 from shmmap_clients.ndt_scan_matcher.cli import align, follow, machine
 
 __all__ = ["main"]
-
-_VERBS: Final = (align, follow, machine)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -19,6 +16,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_program(
         "shmmap-ndt",
         "Find where LiDAR scans were taken in a point-cloud map, by the normal distributions transform.",
-        _VERBS,
+        (align.add_parser, follow.add_parser, machine.add_parser),
         argv,
     )

@@ -20,22 +20,19 @@ from numpy.typing import NDArray
 
 import shmmap
 from shmmap_clients.command_line import complain, print_line, write_text
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceOptions
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, DeviceOptions
 from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import NO_DRIVER_HINT, DeviceInfo, list_devices
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
-from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance, VoxelCell, VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     Evaluation,
     Neighbors,
     Scoring,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.matching.limits import Limits
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 from shmmap_clients.ndt_scan_matcher.matching.result import Result
-from shmmap_clients.ndt_scan_matcher.matching.settings import Settings
+from shmmap_clients.ndt_scan_matcher.matching.settings import Limits, Settings
 
 __all__ = ["BOUNDS", "SCENES", "run"]
 
@@ -141,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _checked(info: DeviceInfo, scenes: list[_Scene]) -> Iterator[dict[str, Any]]:
-    """Check a device in every precision that it has, and every way that it reads maps."""
+    """Check a device in every precision that it has, and each memory that it can read maps from."""
     print_line(info.describe())
     options = [DeviceOptions(str(info.index), "float", "copy")]
     if info.fp64:
@@ -257,7 +254,7 @@ def _check_evaluations(scene: _Scene, device: DeviceOptions, most: int) -> _Chec
 
 
 def _check_repeats(scene: _Scene, device: DeviceOptions) -> _Check:
-    """Compare repeats, and a batch of poses with the poses one by one, bit for bit."""
+    """Compare repeats, and a batch of poses with single poses, bit for bit."""
     there = _ready(scene, "opencl", scene.limits, device)
     first, *repeats = [there.evaluate(scene.guess[None], _RADIUS)[0] for _ in range(_REPEATS + 1)]
     unlike = sum(not _same(again, first) for again in repeats)

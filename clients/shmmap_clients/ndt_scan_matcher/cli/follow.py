@@ -6,24 +6,91 @@ from __future__ import annotations
 import argparse
 import contextlib
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from shmmap_clients.command_line import add_verb, connect, print_json, write_text
-from shmmap_clients.ndt_scan_matcher.cli.alignment_options import matcher_from
-from shmmap_clients.ndt_scan_matcher.cli.follow_options import EPILOG, add_options
-from shmmap_clients.pose_option import pose_from
-from shmmap_clients.shared_options import scoring_settings, trust_from
+from shmmap_clients.command_line import (
+    add_allow_empty,
+    add_daemon_options,
+    add_json_option,
+    add_verb,
+    at_least,
+    connect,
+    not_negative,
+    output_file,
+    positive,
+    print_json,
+    seconds,
+    write_text,
+)
+from shmmap_clients.ndt_scan_matcher.cli.align import add_alignment_options, matcher_from
+from shmmap_clients.shared_options import (
+    FAILED_LIMITS,
+    add_height_option,
+    add_leaf_option,
+    add_pose_format_option,
+    add_pose_option,
+    add_quiet_option,
+    add_radius_option,
+    add_scans_option,
+    add_sigma_options,
+    add_thin_option,
+    pose_from,
+    scoring_settings,
+    trust_from,
+)
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
-    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
     from shmmap_clients.pose_initializer import Relocalizer
     from shmmap_clients.scans.scan_sequence import Scan
 
-__all__ = ["add_parser", "run"]
+__all__ = ["EPILOG", "add_options", "add_parser", "run"]
+
+EPILOG: Final = f"""\
+A scan's result is trusted when it is within all limits of trust.  A vehicle is
+  tracking   when its last result was trusted,
+  uncertain  at the beginning, and when its last result was not trusted,
+  lost       after --lost-after such results in a row, or where there is no map.
+A pose that is not trusted is marked so; the next scan is then predicted from
+odometry or constant velocity alone, and without odometry a lost vehicle stands.
+A time that is not 0 to 1 s after the one before (a clock that was set, a pause)
+says nothing of motion: without odometry none is predicted there.
+
+JSON (fields may be added, none is removed).
+--json prints one document at the end:
+  {{"frames", "converged", "trustworthy", "no_map": scans, "lost": scans,
+   "relocalized": times, "clock_jumps": scans, "too_near", "not_finite": points
+   of the scans left out, "failed_limits": {{name: scans}},
+   "trust": {{"nvtl", "transform_probability", "oscillations", "points",
+     "distance", "angle", "sharpness", "spread"}}: limits in force,
+   "waited": for the map, "too_slow": times that the map did not keep up,
+   "cut_frames": cut by limits, "cut_by": {{limit: scans}}: points, neighbors,
+     voxels, map_bytes, deadline,
+   "backend": that computed last, "fault": why it is the fallback, or null,
+   "errors": null without a truth, else {{"ate_rmse_m", "ate_m": spread,
+     "ate_deg": spread, "rte": {{metres: metres per 100 m}}}},
+   "transform_probability", "nvtl", "iterations", "latency_ms", "align_ms",
+   "thin_ms", "map_ms", "map_request_ms", "map_build_ms",
+   "map_prepare_ms": its part of the backend: spread each,
+   "map_updates", "cells_added", "cells_removed", "map_private_bytes",
+   "map_written_bytes", "map_writes": to a device,
+   "map_laid_out_anew": maps written again for lack of room}}
+  A spread is {{"mean", "variance", "p50", "p99", "max"}}; ate is the distance
+  of the poses to the true ones in metres, or degrees.
+--json-lines writes a line for each scan, as soon as it is localized:
+  {{"name", "stamp_s", "pose": [x, y, z, qx, qy, qz, qw], "converged",
+   "trustworthy", "failed_limits": [name], "no_map",
+   "state": tracking, uncertain or lost, "relocalized", "clock_jumped": bool,
+   "iterations", "transform_probability", "nvtl", "waited", "latency_ms",
+   "error_m", "error_deg": to the true pose, null without a truth}}
+{FAILED_LIMITS}
+
+Exit code: 0; 1 when a scan was not trusted (with --allow-empty: for another
+reason than no map), the map did not keep up, or there was no scan."""
 
 
 def add_parser(subparsers: Any) -> None:
@@ -45,9 +112,8 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
     from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
     from shmmap_clients.ndt_scan_matcher.drive.drive_summary import frame_document
-    from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame
-    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometryListener, PosePublisher
-    from shmmap_clients.ndt_scan_matcher.drive.tracking import Tracking
+    from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame, Tracking
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher
     from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
     from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.scans.trajectory import read_route, tum_line
@@ -56,16 +122,16 @@ def run(args: argparse.Namespace) -> int:
     plot = DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
     with contextlib.ExitStack() as stack:
-        # all sockets before the first scan: who waits for this program's subscription finds it
+        # all sockets before the first scan: a publisher may wait for this program's subscription
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
         listener = None
         if args.odometry is not None and is_endpoint(args.odometry):
-            listener = OdometryListener(args.odometry)
+            listener = OdometrySubscriber(args.odometry)
             stack.callback(listener.close)
         drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
         tum = drive.open_text(str(args.tum)) if args.tum else None
         if publisher is not None and args.listener_wait > 0:
-            publisher.wait_for_listener(args.listener_wait)
+            publisher.wait_for_subscriber(args.listener_wait)
         first = drive.first()
         if first is None:
             return drive.no_scans()
@@ -142,7 +208,7 @@ def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], 
 def _prediction(
     args: argparse.Namespace,
     T_first: NDArray[np.float64],
-    listener: OdometryListener | None,
+    listener: OdometrySubscriber | None,
     source: Iterable[Scan],
 ) -> MotionPrediction:
     """Return what predicts the next pose; the first velocity is the truth's, or that of the route's times."""
@@ -183,3 +249,114 @@ def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Reloc
         return stack.enter_context(made)
 
     return Relocalizer(initializer, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    add_scans_option(parser)
+    parser.add_argument(
+        "--truth",
+        metavar="FILE",
+        help="true poses of the scans of a directory, TUM format, to compare with and to start from; a"
+        " publisher's scans bring theirs",
+    )
+    add_pose_option(
+        parser,
+        "--init",
+        "start pose of the frame that the points are in (default: the first scan's true pose)",
+    )
+    add_pose_format_option(parser)
+    parser.add_argument(
+        "--odometry",
+        metavar="FILE|ENDPOINT",
+        help="motion between scans: a TUM file, or poses over ZeroMQ (default: constant velocity)",
+    )
+    parser.add_argument(
+        "--odometry-wait",
+        type=seconds,
+        default=0.0,
+        metavar="SECONDS",
+        help="how long a scan may wait until an endpoint's odometry has reached its time; else constant"
+        " velocity is assumed from the last entry on (default: 0)",
+    )
+    add_thin_option(parser, default=1.0)
+    parser.add_argument("--frames", type=at_least(1), metavar="N", help="stop after N scans")
+    parser.add_argument(
+        "--rate", type=positive, metavar="HZ", help="read at most HZ scans a second from a directory"
+    )
+    window = parser.add_argument_group("map around the vehicle, as in Autoware")
+    add_leaf_option(window)
+    add_radius_option(window)
+    window.add_argument(
+        "--update-distance",
+        type=not_negative,
+        default=20.0,
+        metavar="M",
+        help="distance after which the next map is asked for (default: 20)",
+    )
+    window.add_argument(
+        "--lidar-radius",
+        type=not_negative,
+        default=100.0,
+        metavar="M",
+        help="range of the scanner: a scan waits where the map does not reach so far (default: 100)",
+    )
+    window.add_argument(
+        "--route",
+        metavar="FILE",
+        help="the vehicle's path, in the map's frame: a TUM file, or x,y a line in a .csv; the"
+        " daemon fetches the map along it beforehand (default: along the predicted motion)",
+    )
+    _add_relocalization_options(parser)
+    add_alignment_options(parser)
+    _add_output_options(parser)
+    add_daemon_options(parser, json=False)
+
+
+def _add_relocalization_options(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("when the vehicle is lost")
+    group.add_argument(
+        "--lost-after",
+        type=at_least(1),
+        default=5,
+        metavar="N",
+        help="lost after N results in a row that are not trusted (default: 5)",
+    )
+    group.add_argument(
+        "--relocalize",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="search for a lost vehicle as shmmap-pose-init does, around its last trusted pose and what"
+        " odometry has added: with each scan until it is found, each time twice as far, up to eight times"
+        " --sigma; without odometry, at the beginning and after a jump of the clock, with the first scan that"
+        " is not trusted (default: for a directory, not for a publisher)",
+    )
+    add_pose_option(
+        group,
+        "--rough",
+        "start pose that is metres and degrees off: search around it; --relocalize is then the default",
+    )
+    add_sigma_options(group)
+    add_height_option(group, default=None, shown="keep the z of the pose that is searched around")
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    out = parser.add_argument_group("output")
+    out.add_argument("--tum", type=output_file, metavar="FILE", help="write the poses, TUM format")
+    out.add_argument("--publish", metavar="ENDPOINT", help="publish the poses at this ZeroMQ address")
+    out.add_argument(
+        "--listener-wait",
+        type=seconds,
+        default=0.0,
+        metavar="SECONDS",
+        help="how long to wait for the first subscriber, which then gets every pose (default: 0)",
+    )
+    out.add_argument(
+        "--plot", type=output_file, metavar="FILE", help="write an SVG of the path, errors and latency"
+    )
+    out.add_argument(
+        "--json-lines", metavar="FILE", help="write a line of JSON for each scan (-: to standard output)"
+    )
+    add_quiet_option(out)
+    add_allow_empty(parser)
+    add_json_option(parser)

@@ -16,16 +16,16 @@ __all__ = ["FollowReport", "print_summary"]
 
 
 class FollowReport:
-    """Counts the frames of a drive, and says on stderr what a reader has to know.
+    """Counts the frames of a drive, and reports on stderr what a reader has to know.
 
     Parameters
     ----------
     drive
-        Whose scans they are; says it.
+        Of the scans; prints the reports.
     client, matcher, maps, relocalizer
         What the drive works with.
     hint
-        What finds a lost vehicle where nothing searches for it; said once.
+        Hint for a lost vehicle where nothing searches for it; printed once.
     """
 
     def __init__(

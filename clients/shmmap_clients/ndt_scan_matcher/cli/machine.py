@@ -94,8 +94,7 @@ def warmup_alignment(settings: Settings | None = None) -> Result:
     """
     import numpy as np
 
-    from shmmap_clients.ndt_scan_matcher.map.voxel_cell import voxel_cell
-    from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+    from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap, voxel_cell
     from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 
     line = np.arange(0.1, 8.0, 0.25)

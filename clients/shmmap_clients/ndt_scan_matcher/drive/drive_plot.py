@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from shmmap.formats.svg import Axes, Page, box_around, dash, element
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
-from shmmap_clients.ndt_scan_matcher.drive.trajectory_error import pose_errors
 from shmmap_clients.spread import Decimated
 
 __all__ = ["DrivePlot"]

@@ -1,38 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Localization of a drive, scan by scan: predict, take the newest map, align, judge; search when lost."""
+"""Localization of a drive, scan by scan: predict, take the newest map, align, judge; search when lost.
+
+A vehicle is followed or lost::
+
+    uncertain --trusted--> tracking --not trusted--> uncertain --not trusted, again and again--> lost
+    tracking, uncertain --no map--> lost
+    lost --trusted, or relocalized--> tracking
+
+A drive begins ``uncertain``, or ``lost`` where its first pose is only roughly known.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap import BadRequest
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
-from shmmap_clients.ndt_scan_matcher.drive.tracking import State, Tracking
 from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
 from shmmap_clients.ndt_scan_matcher.matching.result import Result
+from shmmap_clients.scans.scan_file import thinned
 from shmmap_clients.scans.scan_sequence import Scan
-from shmmap_clients.scans.thinning import thinned
 
-__all__ = ["Follower", "Frame", "Relocalize"]
+__all__ = ["LOST_AFTER", "Follower", "Frame", "Relocalize", "State", "Tracking"]
 
+State = Literal["tracking", "uncertain", "lost"]
+LOST_AFTER: Final = 5  # as many rejected poses make Autoware's ndt_scan_matcher report an error
 _BLIND_SEARCHES: Final = 4
 """With one scan, each twice as far: a vehicle that was not lost cannot be farther."""
 _SHORT_S: Final = 0.2  # in which a vehicle goes no farther than an alignment finds back
 _SAME_M: Final = 0.5
-
 Relocalize = Callable[[NDArray[np.floating], NDArray[np.float64]], Result | None]
+
+
+class Tracking:
+    """The state after each result.
+
+    Parameters
+    ----------
+    lost_after
+        Number of results in a row that are not trusted after which it is lost; one without a map suffices.
+    lost
+        Whether it is lost at the beginning.
+    """
+
+    def __init__(self, lost_after: int = LOST_AFTER, *, lost: bool = False) -> None:
+        if lost_after < 1:
+            raise BadRequest(f"lost_after must be positive, it is {lost_after}")
+        self._lost_after = lost_after
+        self._untrusted = 0
+        self.state: State = "lost" if lost else "uncertain"
+
+    def update(self, result: Result) -> State:
+        """Return the state after the next result."""
+        if result.trustworthy:
+            self._untrusted = 0
+            self.state = "tracking"
+            return self.state
+        self._untrusted += 1
+        if self.state != "lost":
+            lost = result.no_map or self._untrusted >= self._lost_after
+            self.state = "lost" if lost else "uncertain"
+        return self.state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What became of one scan.
+    """The result of one scan.
 
     Attributes
     ----------

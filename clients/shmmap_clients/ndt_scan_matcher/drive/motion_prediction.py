@@ -85,7 +85,7 @@ class ConstantVelocity:
         return self._twist is None or elapsed_s is None or elapsed_s >= _STEADY_S
 
     def correct(self, stamp_s: float, T_map_base: Matrix | None) -> None:
-        """Take in where a scan was taken; None: that is not known."""
+        """Learn where a scan was taken; None: that is not known."""
         elapsed_s = self._elapsed(stamp_s)
         if elapsed_s is None or elapsed_s > LONGEST_STEP_S:
             self._twist = None
@@ -98,7 +98,7 @@ class ConstantVelocity:
         self._stamp_s = stamp_s
 
     def hold(self) -> None:
-        """Forget the velocity: the last two poses do not tell it, or it was long ago."""
+        """Forget the velocity: the last two poses do not give it, or are too old."""
         self._twist = None
 
     @property
@@ -143,7 +143,7 @@ class Odometry(ConstantVelocity):
         return super().is_blind(stamp_s) and self._motion(stamp_s) is None
 
     def correct(self, stamp_s: float, T_map_base: Matrix | None) -> None:
-        """Take in where a scan was taken; None: as far as odometry says from the last known pose."""
+        """Learn where a scan was taken; None: as far as odometry says from the last known pose."""
         if T_map_base is None and (motion := self._motion(stamp_s)) is not None:
             T_map_base = np.asarray(self.T_known @ motion, np.float64)
         if self._stamp_s is not None and stamp_s < self._stamp_s:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses over ZeroMQ, one msgpack message each: what localization publishes, and odometry that it hears.
+"""Poses over ZeroMQ, one msgpack message each: what localization publishes, and odometry that it gets.
 
 A message is ``{"shmmap_pose": 1, "name", "stamp_s", "T" (16 numbers, rows of T_map_base), "converged",
 "trustworthy", "iterations", "transform_probability", "nvtl", "no_map", "state", "failed_limits"}``, the last
 three as in `frame_document`; of odometry only ``stamp_s`` and ``T`` are read.
 
-Whoever sends binds and knows who has subscribed: a sender that waits for its listener before the first
-message loses none to it, as long as the listener stays less than 1000 messages behind.
+The sender binds and knows its subscribers: if it waits for one before the first message, that one misses
+none as long as it stays less than 1000 messages behind.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.scans.trajectory import Trajectory, pose_of
 from shmmap_clients.streams import Publisher, Subscriber
 
-__all__ = ["OdometryListener", "PoseMessage", "PosePublisher", "decode_pose"]
+__all__ = ["OdometrySubscriber", "PoseMessage", "PosePublisher", "decode_pose"]
 
 _VERSION = 1
 _QUEUE = 1000  # messages that wait for a slow reader; what comes meanwhile is lost
@@ -104,7 +104,7 @@ class PosePublisher(Publisher):
         self.publish([_encoder.encode(message)])
 
 
-class OdometryListener:
+class OdometrySubscriber:
     """Collects odometry from an endpoint in a thread of its own.
 
     Raises
@@ -118,44 +118,44 @@ class OdometryListener:
         self._entries: list[PoseMessage] = []
         self._latest_s = -math.inf
         self._closing = threading.Event()
-        self._heard = threading.Condition()
-        self._thread = threading.Thread(target=self._listen, name="ndt-odometry", daemon=True)
+        self._arrived = threading.Condition()
+        self._thread = threading.Thread(target=self._receive, name="ndt-odometry", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening."""
+        """End the subscription."""
         self._closing.set()
         self._thread.join()
         self._subscriber.close()
 
     def wait_until(self, stamp_s: float, timeout_s: float) -> bool:
-        """Wait until odometry of this time or a later one was heard; False if it was not in time."""
-        with self._heard:
-            return self._heard.wait_for(lambda: self._latest_s >= stamp_s, timeout_s)
+        """Wait for odometry of this time or later; False if none came within the timeout."""
+        with self._arrived:
+            return self._arrived.wait_for(lambda: self._latest_s >= stamp_s, timeout_s)
 
     @property
     def trajectory(self) -> Trajectory:
-        """What was heard so far, in order of time."""
-        with self._heard:
+        """The odometry so far, in order of time."""
+        with self._arrived:
             entries = sorted(self._entries, key=lambda entry: entry.stamp_s)
         poses = np.array([entry.T for entry in entries]).reshape(-1, 4, 4)
         return Trajectory(np.array([entry.stamp_s for entry in entries]), poses)
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         while not self._closing.is_set():
             if self._subscriber.poll(_POLL_MS):
                 try:
                     entry = decode_pose(self._subscriber.receive()[0])
                 except BadRequest:
-                    continue  # somebody else's message
+                    continue  # a message of another program
                 self._take(entry)
 
     def _take(self, entry: PoseMessage) -> None:
-        with self._heard:
+        with self._arrived:
             if entry.stamp_s < self._latest_s - _RESTARTED_S:
                 self._entries.clear()  # its clock was set back, or it began again
                 self._latest_s = -math.inf
             self._entries.append(entry)
             del self._entries[:-_KEPT]
             self._latest_s = max(self._latest_s, entry.stamp_s)
-            self._heard.notify_all()
+            self._arrived.notify_all()

@@ -23,15 +23,70 @@ from numpy.typing import NDArray
 
 from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
-from shmmap_clients.ndt_scan_matcher.map.update_statistics import UpdateStatistics
-from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell, cell_from_layer
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap, cell_from_layer
+from shmmap_clients.spread import RunningSpread
 
-__all__ = ["MapRules", "MapUpdater"]
+__all__ = ["MapRules", "MapUpdater", "UpdateStatistics"]
 
 _REFRESH_S: Final = 1.0  # Autoware's timer; also how soon a changed map is noticed
 _STEP_S: Final = 5.0  # how often the daemon is asked whether a map is still being loaded
 _ARRIVAL_S: Final = 60.0
+
+
+class UpdateStatistics:
+    """What the changes of the map in use were like.
+
+    Attributes
+    ----------
+    updates
+        How many there were.
+    added, removed
+        Cells, over all of them.
+    request_ms
+        From asking until the daemon's cells were attached, milliseconds.
+    build_ms
+        For the map beside the one in use, milliseconds.
+    prepare_ms
+        The part of it in which the backend got ready: covariances, tables, writing to a device.
+    private_bytes
+        This process's own memory for a map, at most.
+    uploads
+        What was written to a device, also for a map that had to be written again.
+
+    Parameters
+    ----------
+    uploads
+        Where that is counted.
+    """
+
+    def __init__(self, uploads: UploadStatistics | None = None) -> None:
+        self.updates = 0
+        self.added = 0
+        self.removed = 0
+        self.request_ms = RunningSpread()
+        self.build_ms = RunningSpread()
+        self.prepare_ms = RunningSpread()
+        self.private_bytes = 0
+        self.uploads = uploads if uploads is not None else UploadStatistics()
+
+    def add(
+        self,
+        *,
+        added: int,
+        removed: int,
+        request_s: float,
+        build_s: float,
+        prepare_s: float,
+        private_bytes: int,
+    ) -> None:
+        """Count one change."""
+        self.updates += 1
+        self.added += added
+        self.removed += removed
+        self.request_ms.add(request_s * 1e3)
+        self.build_ms.add(build_s * 1e3)
+        self.prepare_ms.add(prepare_s * 1e3)
+        self.private_bytes = max(self.private_bytes, private_bytes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +149,7 @@ class MapUpdater:
     name
         Of its own session, for ``shmmap clients``.
     route
-        The way that the vehicle will take, (N, 2), metres, map frame, as far as it is known: the daemon
+        The path that the vehicle will take, (N, 2), metres, map frame, as far as it is known: the daemon
         fetches what lies along it before it is asked for.
 
     Raises

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`NdtMatcher`: aligns scans with a map of Gaussians; and Autoware's `Regularization`."""
+"""`NdtMatcher`: aligns scans with a map of Gaussians, and says how long that takes at most."""
 
 from __future__ import annotations
 
@@ -14,28 +14,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import BadRequest
-from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, UploadStatistics
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceError
+from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, UploadStatistics
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
-from shmmap_clients.ndt_scan_matcher.matching.evaluation import Evaluation, Neighbors, Scoring, gauss_for
-from shmmap_clients.ndt_scan_matcher.matching.limits import Cut, Limits
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
+    Evaluation,
+    Neighbors,
+    Scoring,
+    gauss_for,
+    pose_from_matrix,
+)
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import MAX_TRIALS
-from shmmap_clients.ndt_scan_matcher.matching.newton import Ascent, StepRule, ascend, climb, started
-from shmmap_clients.ndt_scan_matcher.matching.result import Result
-from shmmap_clients.ndt_scan_matcher.matching.settings import Settings, rule_of
-from shmmap_clients.ndt_scan_matcher.matching.trust import (
+from shmmap_clients.ndt_scan_matcher.matching.newton import (
+    VARIANTS,
+    Ascent,
+    StepRule,
+    ascend,
+    climb,
+    started,
+    variant_named,
+)
+from shmmap_clients.ndt_scan_matcher.matching.result import (
     Extent,
+    Result,
     TrustLimits,
     covariance_of,
     evidence_of,
     extent_of,
     oscillations,
 )
-from shmmap_clients.ndt_scan_matcher.matching.variants import VARIANTS, variant_named
+from shmmap_clients.ndt_scan_matcher.matching.settings import Cut, Limits, Settings, TimeBound, rule_of
 
 __all__ = ["NdtMatcher", "Regularization"]
 
+_REPEATS = 3
 _REACH: Final = {"direct1": 1, "direct7": 7, "radius": 27}
 _SHARED_PLACES: Final = 4  # at a corner of four cells each has its own voxel in one lattice place
 
@@ -169,20 +181,6 @@ class NdtMatcher:
         return self._neighbors
 
     @property
-    def most_neighbors(self) -> int:
-        """Voxels that one point can be scored against, at most."""
-        return min(self.limits.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
-
-    @property
-    def most_evaluations(self) -> int:
-        """Passes over the scan that one alignment can take, at most."""
-        steps = self._rule.max_iterations + (2 if self._variant.stop == "step_late" else 0)
-        # a line search ends with the Hessian of where it ended
-        coarse = 1 + steps * (MAX_TRIALS + 2 if self._rule.line_search else 1)
-        fine = 1 + self._rule.max_iterations if self.settings.mode == "coarse_fine" else 0
-        return coarse + fine
-
-    @property
     def trust(self) -> TrustLimits:
         """What a result has to reach to be trusted, with the map's leaf."""
         return self._trust_in_force
@@ -265,6 +263,37 @@ class NdtMatcher:
         self._backend.set_source(points)
         variant = self._variant
         return self._evaluate(poses, Scoring(self._neighbors, variant.covariance, variant.pitch_sign))
+
+    def time_bound(self, points: NDArray[np.floating], T: NDArray[np.float64]) -> TimeBound:
+        """Predict how long an alignment takes at most, from the limits and from evaluations of one scan.
+
+        Parameters
+        ----------
+        points : (N, 3)
+            A typical scan.
+        T : (4, 4)
+            Where it lies.
+        """
+        pose = pose_from_matrix(T)[None, :]
+        costs, per_point = [], 1.0
+        self.evaluate(points, pose)
+        for _ in range(_REPEATS):
+            # what a device does is in no thread of this process
+            clock = time.perf_counter_ns if self.on_device else time.thread_time_ns
+            begin = clock()
+            at = self.evaluate(points, pose)[0]
+            costs.append(clock() - begin)
+            per_point = max(at.neighbours / max(len(points), 1), 1.0)
+        used = max(min(len(points), self.limits.source_points), 1)
+        most_neighbors = min(self.limits.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
+        # what a point costs grows no faster than its neighbours
+        point_ns = min(costs) / used * max(1.0, most_neighbors / per_point)
+        steps = self._rule.max_iterations + (2 if self._variant.stop == "step_late" else 0)
+        # a line search ends with the Hessian of where it ended
+        evaluations = 1 + steps * (MAX_TRIALS + 2 if self._rule.line_search else 1)
+        if self.settings.mode == "coarse_fine":
+            evaluations += 1 + self._rule.max_iterations
+        return TimeBound(evaluations, self.limits.source_points, point_ns, self.limits.deadline_s)
 
     def _evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
         most = self.limits.poses

@@ -2,18 +2,18 @@
 """The line search of More and Thuente (1994) as PCL and ndt_omp have it, to the letter.
 
 Where the originals divide by zero they continue with an infinity or a NaN; so does this.  They differ in one
-case, see `search_step`.
+case, see `line_search`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-__all__ = ["MAX_TRIALS", "line_search", "search_step"]
+__all__ = ["MAX_TRIALS", "line_search"]
 
 MAX_TRIALS: Final = 10
 Search = Generator[float, tuple[float, float], tuple[float, int]]
@@ -30,17 +30,18 @@ class _Point:
     g: np.float64
 
 
-def search_step(
+def line_search(
     first: float,
     step_min: float,
     step_max: float,
     phi_0: float,
-    slope_0: float,
-    phi: Callable[[float], tuple[float, float]],
+    dphi_0: float,
     *,
     by_upper_end: bool,
-) -> tuple[float, int]:
-    """Return a step length along a descent direction, and how many trials it took after the first.
+) -> Search:
+    """Find a step length along a descent direction, and how many trials it took after the first.
+
+    It yields each trial, a step length, and is sent the negated score and its slope there.
 
     Parameters
     ----------
@@ -48,85 +49,36 @@ def search_step(
         Newton's own step length.
     step_min, step_max
         Bounds of the step length; without room between them the first is taken.
-    phi_0, slope_0
+    phi_0, dphi_0
         The negated score and its slope at the start; the slope is negative.
-    phi
-        The same at a step length.
     by_upper_end
         Where the last trial has become the lower end: PCL 1.13 takes the cubic through the upper end,
         ndt_omp divides by zero.
     """
-    search = line_search(first, step_min, step_max, phi_0, slope_0, by_upper_end=by_upper_end)
-    a = next(search)
-    try:
-        while True:
-            a = search.send(phi(a))
-    except StopIteration as ended:
-        found: tuple[float, int] = ended.value
-        return found
-
-
-def line_search(
-    first: float,
-    step_min: float,
-    step_max: float,
-    phi_0: float,
-    slope_0: float,
-    *,
-    by_upper_end: bool,
-) -> Search:
-    """Search as `search_step`, for who has value and slope of each trial only later: yields the trials."""
-    search = _search(first, step_min, step_max, np.float64(phi_0), np.float64(slope_0), by_upper_end)
+    zero, value_0, slope_0 = np.float64(0.0), np.float64(phi_0), np.float64(dphi_0)
     with np.errstate(all="ignore"):
-        trial = next(search)
-    while True:
-        value_and_slope = yield trial
-        try:
-            with np.errstate(all="ignore"):
-                trial = search.send(value_and_slope)
-        except StopIteration as ended:
-            found: tuple[float, int] = ended.value
-            return found
-
-
-def _search(
-    first: float,
-    step_min: float,
-    step_max: float,
-    phi_0: np.float64,
-    slope_0: np.float64,
-    by_upper_end: bool,
-) -> Search:
-    zero = np.float64(0.0)
-    # psi(a) = phi(a) - phi(0) - mu phi'(0) a, eq. 2.1
-    low = _Point(zero, zero, slope_0 - _MU * slope_0)
-    high = _Point(zero, zero, slope_0 - _MU * slope_0)
-    converged, opened = step_max - step_min < 0, True
+        # psi(a) = phi(a) - phi(0) - mu phi'(0) a, eq. 2.1
+        low, high = (_Point(zero, zero, slope_0 - _MU * slope_0) for _ in range(2))
+    converged, opened, trials = step_max - step_min < 0, True, 0
     a = np.float64(_clip(first, step_min, step_max))
-    value, slope = yield float(a)
-    at_phi = _Point(a, np.float64(value), np.float64(slope))
-    at_psi = _psi(at_phi, phi_0, slope_0)
-    trials = 0
-    while not converged and trials < MAX_TRIALS and not (at_psi.f <= 0 and at_phi.g <= -_NU * slope_0):
-        a = np.float64(
-            _clip(_trial(low, high, at_psi if opened else at_phi, by_upper_end), step_min, step_max)
-        )
+    while True:
         value, slope = yield float(a)
-        at_phi = _Point(a, np.float64(value), np.float64(slope))
-        at_psi = _psi(at_phi, phi_0, slope_0)
-        if opened and at_psi.f <= 0 and at_psi.g >= 0:
-            opened = False
-            for end in (low, high):
-                # the sign before mu is that of the originals
-                end.f = end.f + phi_0 - _MU * slope_0 * end.a
-                end.g = end.g + _MU * slope_0
-        converged = _update(low, high, at_psi if opened else at_phi)
+        with np.errstate(all="ignore"):
+            at_phi = _Point(a, np.float64(value), np.float64(slope))
+            at_psi = _Point(a, at_phi.f - value_0 - _MU * slope_0 * a, at_phi.g - _MU * slope_0)
+            if trials:
+                if opened and at_psi.f <= 0 and at_psi.g >= 0:
+                    opened = False
+                    for end in (low, high):
+                        # the sign before mu is that of the originals
+                        end.f = end.f + value_0 - _MU * slope_0 * end.a
+                        end.g = end.g + _MU * slope_0
+                converged = _update(low, high, at_psi if opened else at_phi)
+            if converged or trials == MAX_TRIALS or (at_psi.f <= 0 and at_phi.g <= -_NU * slope_0):
+                return float(a), trials
+            trial = _trial(low, high, at_psi if opened else at_phi, by_upper_end)
+            a = np.float64(_clip(trial, step_min, step_max))
         trials += 1
-    return float(a), trials
-
-
-def _psi(at: _Point, phi_0: np.float64, slope_0: np.float64) -> _Point:
-    return _Point(at.a, at.f - phi_0 - _MU * slope_0 * at.a, at.g - _MU * slope_0)
 
 
 def _clip(a: float, low: float, high: float) -> float:

@@ -1,36 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Newton's method on the score: the alignment itself (algorithm 2 of Magnusson 2009)."""
+"""Newton's method on the score: the alignment itself (algorithm 2 of Magnusson 2009).
+
+Three programs differ in it (`VARIANTS`): covariances, stop rule, one sign.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap import BadRequest
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     NOTHING,
     Evaluation,
+    Neighbors,
     matrix_from_pose,
     pose_from_matrix,
 )
 from shmmap_clients.ndt_scan_matcher.matching.more_thuente import line_search
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import numpy_step
-from shmmap_clients.ndt_scan_matcher.matching.variants import Variant
 
-__all__ = ["Ascent", "Step", "StepRule", "ascend", "climb", "started"]
+__all__ = [
+    "VARIANTS",
+    "Ascent",
+    "Step",
+    "StepRule",
+    "Stop",
+    "Variant",
+    "ascend",
+    "climb",
+    "started",
+    "variant_named",
+]
 
+Stop = Literal["step", "step_late", "squared_translation"]
 _BACK: Final = 0.5  # negated cosine between steps of which one goes back on the other
 _MAY_LOSE: Final = 0.1  # of the score, by one steady step
-
 Evaluate = Callable[[NDArray[np.float64], float], Evaluation]
 Step = Callable[[Evaluation, bool], NDArray[np.float64]]
 Climb = Generator[tuple[NDArray[np.float64], float], Evaluation, None]
 """Asks for evaluations, each at a pose vector and with a pitch sign, and gets them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One program's alignment.
+
+    Attributes
+    ----------
+    name
+    covariance
+        How voxels' covariances come from their moments.
+    stop
+        ``"step"``: the step's 6-norm falls below epsilon, or iterations are up.  ``"step_late"``: the same,
+        but never after the first step, and two iterations later.  ``"squared_translation"``: the step's
+        translation, squared, is at most epsilon.
+    pitch_sign
+        Sign in the second derivative after pitch; ndt_omp has the wrong one, but not in the Hessian that
+        it computes after a line search.
+    line_search
+        Whether More-Thuente's line search is the default; else Newton's step is clipped.
+    neighbors, epsilon, max_iterations
+        Defaults.
+    """
+
+    name: str
+    covariance: Covariance
+    stop: Stop
+    pitch_sign: float
+    line_search: bool
+    neighbors: Neighbors
+    epsilon: float
+    max_iterations: int
+
+
+VARIANTS: Final = {
+    variant.name: variant
+    for variant in (
+        # autoware_core 2026-08, multigrid_ndt_omp; defaults of ndt_scan_matcher.param.yaml
+        Variant("autoware", "autoware", "step", -1.0, False, "radius", 0.01, 30),
+        # koide3/ndt_omp
+        Variant("pclomp", "pclomp", "step_late", 1.0, True, "direct7", 0.1, 35),
+        # PCL 1.13, pcl::NormalDistributionsTransform
+        Variant("pcl", "pcl", "squared_translation", -1.0, True, "radius", 0.1, 35),
+    )
+}
+
+
+def variant_named(name: str) -> Variant:
+    """Return one of `VARIANTS`; `BadRequest` lists them for another name."""
+    if name not in VARIANTS:
+        raise BadRequest(f"unknown variant {name!r}", hint=f"variants are: {', '.join(VARIANTS)}")
+    return VARIANTS[name]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +134,7 @@ class StepRule:
 
 @dataclass(slots=True)
 class Ascent:
-    """The way from the guess to the peak, as far as it has come."""
+    """A climb from the guess to the peak, as far as it has come."""
 
     pose: NDArray[np.float64]
     transforms: list[NDArray[np.float64]]
@@ -77,7 +146,7 @@ class Ascent:
 
 
 def started(T_guess: NDArray[np.float64]) -> Ascent:
-    """Return the beginning of a way."""
+    """Return an ascent that is still at the guess."""
     return Ascent(pose_from_matrix(T_guess), [T_guess])
 
 
@@ -103,24 +172,24 @@ def ascend(
         Of `time.monotonic`: no evaluation but the first begins after it.
     """
     ascent = started(T_guess)
-    way = climb(ascent, rule, step_of)
-    asked = next(way)
+    climbing = climb(ascent, rule, step_of)
+    asked = next(climbing)
     with suppress(StopIteration):
         while not ascent.time_is_up:
-            asked = way.send(evaluate(*asked))
+            asked = climbing.send(evaluate(*asked))
             ascent.time_is_up = deadline_s is not None and time.monotonic() >= deadline_s
     return ascent
 
 
 def climb(ascent: Ascent, rule: StepRule, step_of: Step = numpy_step) -> Climb:
-    """Climb, one evaluation after the other; who gives them may climb many ways at once, or stop."""
+    """Climb, one evaluation after the other; a caller may run many climbs side by side, or stop."""
     at = yield ascent.pose, rule.variant.pitch_sign
     ascent.last = at
     ascent.evaluations.append(at)
     longest, before, settling = rule.max_step, np.zeros(6), False
     while True:
         step = step_of(at, rule.steady)
-        wanted = float(np.linalg.norm(step))
+        wanted = math.sqrt(step @ step)
         if wanted == 0.0 or wanted != wanted:
             ascent.converged = wanted == 0.0 and at.found > 0
             return
@@ -179,7 +248,7 @@ def _take_step(
             length, trials = ended.value
             break
     if trials and sign > 0:
-        # ndt_omp computes the Hessian anew after a search, and there with the right sign
+        # ndt_omp computes the Hessian again after a search, and there with the right sign
         latest = yield start + direction * length, -1.0
     return length, direction, latest
 

@@ -1,17 +1,288 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an alignment gives."""
+"""What an alignment gives, what it rests on, and which results are trusted.
+
+NVTL is at most -d1, which grows with the leaf: 2.22 at 1 m, 4.20 at 2 m, 5.40 at 3 m.  Autoware's threshold
+of 2.3 is for its leaf of 2 m, and 0.548 of that.  The same share separates right poses from wrong ones at
+other leaf sizes.  True covariances (``coarse_fine``) fit more closely, and score lower below 2 m: there the
+share falls to 0.41 at 1 m.
+
+A score says how well points fit where they lie.  A single point, a stretch of road, or what lies within a
+few metres fits in many places: `Evidence` bounds that.  The Hessian of the score is the information about the
+pose, up to a factor.  ``sharpness`` is the least curvature of the score when the scan is moved in any
+direction without being turned.  ``spread`` compares directions, with turns left free: the covariance of the
+position is the translational block of the inverse Hessian (the Schur complement of the rotations); how round
+it is depends neither on the number of points nor on units.  Degeneracy by the smallest eigenvalue: Zhang,
+Kaess and Singh, "On degeneracy of optimization-based state estimation problems", ICRA 2016; translations and
+rotations by themselves, for metres and radians do not compare: Tuna et al., "X-ICP", IEEE T-RO 2024.
+
+The limits were chosen on parts of recorded and simulated scans; ``python -m tests.benchmarks.ndt_trust``
+measures how well they separate right poses from wrong ones.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.matching.limits import Cut
-from shmmap_clients.ndt_scan_matcher.matching.trust import Evidence
+from shmmap import BadRequest
+from shmmap_clients.ndt_scan_matcher.matching.evaluation import gauss_for
+from shmmap_clients.ndt_scan_matcher.matching.settings import Cut
 
-__all__ = ["Result"]
+__all__ = [
+    "FAR_POINTS",
+    "Evidence",
+    "Extent",
+    "Result",
+    "TrustLimits",
+    "covariance_of",
+    "default_nvtl",
+    "default_sharpness",
+    "evidence_of",
+    "extent_of",
+    "oscillations",
+]
+
+FAR_POINTS: Final = 20
+_ANGLE_POINTS: Final = 512  # of a scan, evenly over it: enough for its angle
+# ndt_scan_matcher.param.yaml of autoware_core: converged_param_nearest_voxel_transformation_likelihood,
+# and the oscillations of count_oscillation
+_AUTOWARE_NVTL: Final = 2.3
+_AUTOWARE_LEAF: Final = 2.0
+_MAX_OSCILLATIONS: Final = 10
+_INVERSION: Final = -0.9  # cosine between two steps that counts as going back
+_SHARE: Final = _AUTOWARE_NVTL / -gauss_for(_AUTOWARE_LEAF).d1
+_FINE_SHARE: Final = 0.41  # at a leaf of 1 m and below
+_SHARPNESS: Final = 2.7
+_FINE_SHARPNESS: Final = 3.4  # true covariances are narrower
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """Where the points of a scan lie: ``distance`` and ``angle`` as in `Evidence`."""
+
+    distance: float
+    angle: float
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What a pose rests on.
+
+    Attributes
+    ----------
+    points
+        Points of the scan that have a voxel of the map near.
+    distance
+        How far from the frame's origin at least `FAR_POINTS` points of the scan are, metres.
+    angle
+        How widely their headings are spread, degrees: the width of a sector, up to 281 for all around.
+    sharpness
+        Least curvature of the score per matched point, over all directions: the smallest eigenvalue of the
+        negated Hessian's translational block, divided by ``points`` and by the highest score of a point,
+        times leaf^1.5: with that power right poses have about the same at leaves of 1 m to 3 m.
+    spread
+        Smallest eigenvalue of the position's covariance divided by its largest, 0 to 1; 0 where the Hessian
+        is not definite.  0.04: the position is five times as uncertain in one direction as in another.
+    """
+
+    points: int
+    distance: float
+    angle: float
+    sharpness: float
+    spread: float
+
+
+def extent_of(points: NDArray[np.floating]) -> Extent:
+    """Return where points lie, (N, 3), metres; what is not finite counts as lying at the origin.
+
+    The angle follows from R, the mean resultant length of the headings (Mardia and Jupp, "Directional
+    Statistics", 2.3.1): a sector of width w, evenly filled, has R = sin(w/2) / (w/2), about 1 - w^2/24.
+    Of fewer than `FAR_POINTS` points the distance is that of the nearest.
+    """
+    if not len(points):
+        return Extent(0.0, 0.0)
+    x, y = points[:: -(-len(points) // _ANGLE_POINTS), :2].T
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        squared = np.einsum("ij,ij->i", points, points)
+        level = np.sqrt(x * x + y * y)
+        cosine, sine = x / level, y / level
+        known = np.isfinite(cosine + sine)
+    squared[~np.isfinite(squared)] = 0.0
+    place = max(len(squared) - FAR_POINTS, 0)
+    squared.partition(place)
+    count = max(int(np.count_nonzero(known)), 1)
+    resultant = math.hypot(float(cosine[known].sum()), float(sine[known].sum())) / count
+    angle = math.degrees(math.sqrt(24.0 * max(1.0 - resultant, 0.0))) if known.any() else 0.0
+    return Extent(math.sqrt(float(squared[place])), angle)
+
+
+def covariance_of(hessian: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the inverse of the negated Hessian, or None if that is not positive definite."""
+    try:
+        np.linalg.cholesky(-hessian)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(np.linalg.inv(-hessian), np.float64)
+
+
+def oscillations(transforms: NDArray[np.float64]) -> int:
+    """Count as Autoware's count_oscillation: the longest run of reversed steps."""
+    steps = np.diff(transforms[:, :3, 3], axis=0)
+    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
+    units = steps / np.where(lengths > 0, lengths, 1.0)
+    run = longest = 0
+    for cosine in (units[1:] * units[:-1]).sum(axis=1):
+        run = run + 1 if cosine < _INVERSION else 0
+        longest = max(longest, run)
+    return longest
+
+
+def evidence_of(
+    hessian: NDArray[np.float64],
+    covariance: NDArray[np.float64] | None,
+    extent: Extent,
+    *,
+    points: int,
+    leaf: float,
+    highest: float,
+) -> Evidence:
+    """Return what a pose rests on.
+
+    Parameters
+    ----------
+    hessian, covariance : (6, 6) float64
+        Of the score at the pose, and the inverse of the negated; None where there is none.
+    extent
+        Of the scan.
+    points
+        As in `Evidence`.
+    leaf
+        Edge of a voxel, metres.
+    highest
+        Score of a point in the middle of a voxel.
+    """
+    if covariance is None or not np.isfinite(covariance).all():
+        return Evidence(points, extent.distance, extent.angle, 0.0, 0.0)
+    curvature, variance = np.linalg.eigvalsh(np.stack([-hessian[:3, :3], covariance[:3, :3]]))
+    sharpness = float(curvature[0]) * leaf**1.5 / (points * highest)
+    spread = max(float(variance[0] / variance[2]), 0.0)
+    return Evidence(points, extent.distance, extent.angle, sharpness, spread)
+
+
+def default_nvtl(leaf: float, *, fine: bool = False) -> float:
+    """Return the lowest NVTL of a trusted result.
+
+    Parameters
+    ----------
+    leaf
+        Edge of a voxel, metres.
+    fine
+        Whether the result is one of true covariances (``coarse_fine``).
+    """
+    share = _SHARE
+    if fine and leaf < _AUTOWARE_LEAF:
+        share = _FINE_SHARE + (_SHARE - _FINE_SHARE) * max(leaf - 1.0, 0.0)
+    return share * -gauss_for(leaf).d1
+
+
+def default_sharpness(*, fine: bool = False) -> float:
+    """Return the lowest sharpness of a trusted result; ``fine`` as in `default_nvtl`."""
+    return _FINE_SHARPNESS if fine else _SHARPNESS
+
+
+@dataclass(frozen=True, slots=True)
+class TrustLimits:
+    """What a result has to reach to be trusted.
+
+    No score detects every divergence: a pose metres away may reach them all.
+
+    Attributes
+    ----------
+    nvtl
+        Lowest nearest-voxel transformation likelihood; None: `default_nvtl` of the map's leaf.
+    transform_probability
+        Lowest transform probability; None: any.
+    oscillations
+        Most reversals of the step.
+    points, distance, angle, sharpness, spread
+        Least `Evidence`; None for ``sharpness``: `default_sharpness`.
+    """
+
+    nvtl: float | None = None
+    transform_probability: float | None = None
+    oscillations: int = _MAX_OSCILLATIONS
+    points: int = 80
+    distance: float = 10.0  # required_distance of ndt_scan_matcher.param.yaml
+    angle: float = 35.0
+    sharpness: float | None = None
+    spread: float = 0.03
+
+    def __post_init__(self) -> None:
+        for limit in fields(self):
+            value = getattr(self, limit.name)
+            if value is not None and not value >= 0:
+                raise BadRequest(f"a limit of trust must not be negative, {limit.name} is {value}")
+
+    def for_leaf(self, leaf: float, *, fine: bool = False) -> TrustLimits:
+        """Return the limits with numbers for ``nvtl`` and ``sharpness``; parameters as in `default_nvtl`."""
+        return replace(
+            self,
+            nvtl=default_nvtl(leaf, fine=fine) if self.nvtl is None else self.nvtl,
+            sharpness=default_sharpness(fine=fine) if self.sharpness is None else self.sharpness,
+        )
+
+    def failed(
+        self,
+        *,
+        no_map: bool,
+        converged: bool,
+        nvtl: float,
+        transform_probability: float,
+        oscillations: int,
+        evidence: Evidence,
+    ) -> tuple[str, ...]:
+        """Return the names of what a result fails, none if it is trusted.
+
+        Returns
+        -------
+        tuple of str
+            ``no_map`` alone, where there was nothing to match; else of ``converged``, ``nvtl``,
+            ``transform_probability``, ``oscillations``, ``points``, ``distance``, ``angle``, ``sharpness``,
+            ``spread``.
+        """
+        if no_map:
+            return ("no_map",)
+        failed = {
+            "converged": not converged,
+            "nvtl": nvtl < (self.nvtl or 0.0),
+            "transform_probability": transform_probability < (self.transform_probability or 0.0),
+            "oscillations": oscillations > self.oscillations,
+            "points": evidence.points < self.points,
+            "distance": evidence.distance < self.distance,
+            "angle": evidence.angle < self.angle,
+            "sharpness": not evidence.sharpness >= (self.sharpness or 0.0),
+            "spread": not evidence.spread >= self.spread,
+        }
+        return tuple(name for name, fails in failed.items() if fails)
+
+    def describe(self, name: str) -> str:
+        """Return in words what it means to fail a limit, as `failed` names it."""
+        return {
+            "no_map": "no map",
+            "converged": "not converged",
+            "nvtl": f"NVTL below {self.nvtl or 0.0:.2f}",
+            "transform_probability": f"transform probability below {self.transform_probability or 0.0:.2f}",
+            "oscillations": f"more than {self.oscillations} oscillations",
+            "points": f"fewer than {self.points} points matched",
+            "distance": f"fewer than {FAR_POINTS} points beyond {self.distance:g} m",
+            "angle": f"all points in a sector of less than {self.angle:g} degrees",
+            "sharpness": f"a direction is hardly held (sharpness below {self.sharpness or 0.0:.2f})",
+            "spread": f"a direction is held much less than others (spread below {self.spread:.3g})",
+        }[name]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -137,7 +137,7 @@ class Reader {
     skip(1);
     return std::string();
   }
-  /// Leave out so many values, whatever they are.
+  /// Skip `values` values of any kind.
   void skip(std::uint64_t values) {
     for (; values > 0; --values) {  // nested ones are counted, not recursed into
       const unsigned tag = byte();

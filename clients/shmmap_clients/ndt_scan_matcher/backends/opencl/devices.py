@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCL devices of this machine: which there are, what they can do, which one is taken.
+"""OpenCL devices of this machine: which there are, what they can do, which one is taken, how to wait for it.
 
 The loader of drivers reads files in /etc/OpenCL/vendors, each of which names a driver's library.  Containers
 with NVIDIA's driver often have the library without the file: then a folder with one is made for this process,
@@ -9,21 +9,24 @@ with copies of those that are there.
 from __future__ import annotations
 
 import atexit
+import ctypes
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceOptions
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import NoDevice
+from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceError, DeviceHung, DeviceOptions, NoDevice
 
 __all__ = [
     "NO_DRIVER_HINT",
+    "TIMEOUT_S",
     "Device",
     "DeviceInfo",
+    "Waiting",
     "choose_device",
     "list_devices",
     "vendors_with_nvidia",
@@ -49,6 +52,8 @@ _FOLDERS: Final = tuple(
         "/usr/local/cuda/compat",
     )
 )
+TIMEOUT_S: Final = 10.0  # for any command, where no deadline is nearer
+_NAP_S: Final = 20e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +166,7 @@ def choose_device(options: DeviceOptions) -> Device:
         )
     double = info.fp64 if options.precision == "auto" else options.precision == "double"
     if options.memory == "svm" and not double:
-        # A device without doubles has no instruction that reads them.  One that has them, and is told to use
+        # A device without doubles has no instruction that reads them.  One that has them, and is set to use
         # floats because its doubles are slow, would have to subtract and convert nine doubles for each
         # neighbour at each evaluation, at the slow rate and with twice the bytes read; copying does it once.
         raise NoDevice(
@@ -207,11 +212,11 @@ def _found() -> list[tuple[DeviceInfo, Any]]:
 
 
 def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
-    def asked(name: str, otherwise: Any) -> Any:
+    def asked(name: str, default: Any) -> Any:
         try:
             return getattr(handle, name)
         except cl.Error:  # an older driver does not know the question
-            return otherwise
+            return default
 
     kinds = {
         cl.device_type.GPU: "GPU",
@@ -273,3 +278,66 @@ def _make_drivers_known() -> None:
     if made is not None:
         os.environ["OCL_ICD_VENDORS"] = str(made)
         atexit.register(shutil.rmtree, made, ignore_errors=True)
+
+
+class Waiting:
+    """Waits for events of one device.
+
+    It sleeps for most of the time that the last wait took, then looks again and again: a wait costs the
+    processor little, and ends microseconds after the event.
+
+    Parameters
+    ----------
+    device
+        Its name, for errors.
+    """
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        self._usual_s = 0.0
+
+    def until(self, event: Any, deadline_s: float | None = None) -> None:
+        """Wait until a command has ended.
+
+        Parameters
+        ----------
+        event
+            Of the command; its queue has been flushed.
+        deadline_s
+            Of `time.monotonic`; None: `TIMEOUT_S` from now.
+
+        Raises
+        ------
+        DeviceHung
+            It has not ended then.
+        DeviceError
+            It failed.
+        """
+        began_s = time.monotonic()
+        latest_s = began_s + TIMEOUT_S
+        if deadline_s is not None:
+            latest_s = min(latest_s, deadline_s)
+        if self._usual_s > 4 * _NAP_S and not _ended(event):
+            time.sleep(min(0.6 * self._usual_s, max(latest_s - began_s, 0.0)))
+        while not _ended(event):
+            if time.monotonic() >= latest_s:
+                _never_free(event)
+                raise DeviceHung(
+                    f"device {self._device!r} has not answered within {time.monotonic() - began_s:.3f} s",
+                    hint="a higher --deadline gives it more time; --fallback numba goes on without it",
+                )
+            time.sleep(_NAP_S)
+        status = event.command_execution_status
+        if status < 0:
+            raise DeviceError(f"device {self._device!r} failed: OpenCL error {status}")
+        took_s = time.monotonic() - began_s
+        self._usual_s = min(took_s, 0.9 * self._usual_s + 0.1 * took_s) if self._usual_s else took_s
+
+
+def _ended(event: Any) -> bool:
+    return bool(event.command_execution_status <= 0)  # CL_COMPLETE is 0, an error is negative
+
+
+def _never_free(event: Any) -> None:
+    """Keep an event: to free one of a hung device is to wait for it, even when the process ends."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))

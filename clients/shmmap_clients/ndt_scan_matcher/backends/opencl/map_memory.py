@@ -21,12 +21,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
-from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device
-from shmmap_clients.ndt_scan_matcher.backends.opencl.errors import DeviceMemory, device_errors
-from shmmap_clients.ndt_scan_matcher.backends.opencl.waiting import Waiting
-from shmmap_clients.ndt_scan_matcher.map.voxel_cell import VoxelCell
-from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelMap
+from shmmap_clients.ndt_scan_matcher.backends.backend import DeviceMemory, UploadStatistics, device_errors
+from shmmap_clients.ndt_scan_matcher.backends.opencl.devices import Device, Waiting
+from shmmap_clients.ndt_scan_matcher.map.voxel_map import TABLE_COLUMNS, Covariance, VoxelCell, VoxelMap
 
 __all__ = ["MapBuffers", "MapInPlace", "PlacedMap", "in_large_pages"]
 

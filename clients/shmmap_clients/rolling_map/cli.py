@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-rolling run``: map scan after scan into a live map of the daemon."""
+"""The program ``shmmap-rolling``: ``run`` a drive into a live map, ``config`` from a parameter file."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import contextlib
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap import BadRequest, ConfigError
@@ -25,6 +26,7 @@ from shmmap_clients.command_line import (
     positive,
     print_json,
     print_line,
+    run_program,
     seconds,
     write_text,
 )
@@ -37,16 +39,16 @@ from shmmap_clients.shared_options import (
 
 if TYPE_CHECKING:
     from shmmap import LiveMap, LiveMapper, ScanFilter
-    from shmmap_clients.rolling_map.drive import DriveStatistics
+    from shmmap_clients.rolling_map.live_map import DriveStatistics
     from shmmap_clients.rolling_map.parameters import Parameters, Shown
     from shmmap_clients.scan_drive import ScanDrive
 
-__all__ = ["add_parser", "run"]
+__all__ = ["main"]
 
 _NAME: Final = "shmmap-rolling"
 _PARTS: Final = ("occupied", "free", "chunks", "usage")
 _LIMITS: Final = ("min_range", "max_range", "min_z", "max_z")
-_EPILOG: Final = """\
+_RUN_JSON: Final = """\
 JSON (fields may be added, none is removed):
   {"map", "scans", "points",
    "counts": {"near": in range, "far": beyond it, "too_near", "outside_z",
@@ -60,18 +62,23 @@ JSON (fields may be added, none is removed):
 
 Exit code: 0; 1 when there was no scan, no point of any scan counted, or the
 last scan was not on the disk after --wait."""
+_CONFIG_NOTE: Final = """\
+The section makes a map like the one that the file is for: voxels, what a hit
+and a miss are worth, a window of the 26 neighbours that follows at once.
+Ranges, the z band and what is shown belong to the program that maps: give the same file
+to `shmmap-rolling run --params`."""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
+def _add_run(subparsers: Any) -> None:
+    """Add ``run``."""
     parser = add_verb(
         subparsers,
         "run",
-        run,
+        _run,
         help="map scan after scan",
         description="Map scan after scan into a live map of the daemon (`shmmap serve --live NAME`).  The"
         " map's window follows the poses.",
-        epilog=_EPILOG,
+        epilog=_RUN_JSON,
     )
     parser.add_argument("--live", required=True, metavar="NAME", help="name of the live map")
     add_scans_option(parser, min_range=False)
@@ -198,9 +205,9 @@ def _shown_from(args: argparse.Namespace, parameters: Parameters | None) -> Show
     return parameters.shown if parameters is not None else Shown(usage=True)
 
 
-def run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> int:
     """Map the scans to their end."""
-    from shmmap_clients.rolling_map.drive import DriveStatistics, map_scan
+    from shmmap_clients.rolling_map.live_map import DriveStatistics, map_scan
     from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.streams import is_endpoint
 
@@ -285,9 +292,8 @@ def _settled(
 def _draw(args: argparse.Namespace, live: LiveMap, shown: Shown, statistics: DriveStatistics) -> None:
     import numpy as np
 
-    from shmmap_clients.rolling_map.drive import usage_text
+    from shmmap_clients.rolling_map.live_map import all_voxels, usage_text
     from shmmap_clients.rolling_map.picture import MapContent, map_picture
-    from shmmap_clients.rolling_map.voxel_parts import all_voxels
 
     nothing = np.empty((0, 3))
     content = MapContent(
@@ -303,7 +309,7 @@ def _draw(args: argparse.Namespace, live: LiveMap, shown: Shown, statistics: Dri
 
 
 def _report(args: argparse.Namespace, live: LiveMap, mapper: LiveMapper, statistics: DriveStatistics) -> None:
-    from shmmap_clients.rolling_map.drive import states_text, usage_text
+    from shmmap_clients.rolling_map.live_map import states_text, usage_text
 
     usage, chunks = live.status(), live.chunks(saved=True)
     summary = statistics.summary(applied=mapper.applied, durable=mapper.durable)
@@ -325,3 +331,54 @@ def _report(args: argparse.Namespace, live: LiveMap, mapper: LiveMapper, statist
         f"{statistics.scans} scans, {statistics.points} points, {statistics.counted} count{left_out}{spent}"
     )
     print(f"live map {live.name}: {usage_text(usage)}; {states_text(chunks)}")
+
+
+def _add_config(subparsers: Any) -> None:
+    """Add ``config``."""
+    parser = add_verb(
+        subparsers,
+        "config",
+        _config,
+        help="the daemon's settings from Rolling-Bonxai's parameter file",
+        description="Print the section of the daemon's settings (TOML) for a live map as a parameter file of"
+        " Rolling-Bonxai, version 1, has it.  No daemon is needed.",
+        epilog=_CONFIG_NOTE,
+    )
+    parser.add_argument("params", metavar="FILE", help="Rolling-Bonxai's parameter file (YAML)")
+    parser.add_argument("--name", required=True, metavar="NAME", help="name of the live map")
+    parser.add_argument(
+        "--path", metavar="DIR", help="directory of the map's files (default: the file's c_chunk_folder_path)"
+    )
+    parser.add_argument(
+        "--out", type=output_file, metavar="FILE", help="write the section into this file, not to stdout"
+    )
+
+
+def _config(args: argparse.Namespace) -> int:
+    """Read, and print or write."""
+    import msgspec
+
+    from shmmap_clients.rolling_map.parameters import live_section, read_parameters
+
+    parameters = read_parameters(args.params)
+    settings = parameters.live
+    if args.path is not None:
+        settings = msgspec.structs.replace(settings, path=args.path)
+    section = live_section(args.name, settings)
+    if parameters.warning:
+        complain(_NAME, f"warning: {args.params}: {parameters.warning}")
+    if args.out:
+        write_text(args.out, section)
+    else:
+        print(section, end="")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    return run_program(
+        _NAME,
+        "Map LiDAR scans with poses into a live map: which voxels are occupied, and which are free.",
+        (_add_run, _add_config),
+        argv,
+    )

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive: each scan on its way into the map at its pose, with counts and times of all of them."""
+"""The live map as this program uses it: scans sent to it, all its voxels, its memory."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from shmmap import (
+    Box,
     ChunkInfo,
     Counts,
     DaemonUnreachable,
@@ -17,16 +22,20 @@ from shmmap import (
     LiveMap,
     LiveMapper,
     LiveMapRow,
+    OverBudget,
+    ZRange,
 )
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import Decimated, RunningSpread
 
-__all__ = ["DriveStatistics", "MappedScan", "map_scan", "states_text", "usage_text"]
+__all__ = ["DriveStatistics", "MappedScan", "all_voxels", "map_scan", "states_text", "usage_text"]
+
+_SIDE: Final = 64  # of a chunk, voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedScan:
-    """A scan that was sent.
+    """A scan that was sent to the map.
 
     Attributes
     ----------
@@ -35,7 +44,7 @@ class MappedScan:
     number
         Of this mapper's scans.
     counts
-        What became of its points.
+        Of its points, by what became of them.
     on_their_way
         Scans that were sent and are not applied, this one included.
     add_s
@@ -99,7 +108,7 @@ class DriveStatistics:
 
     @property
     def counted(self) -> int:
-        """Points that said something: in range, or beyond it."""
+        """Points that counted: in range, or beyond it."""
         return self._counts["near"] + self._counts["far"]
 
     @property
@@ -164,3 +173,59 @@ def states_text(chunks: Sequence[ChunkInfo]) -> str:
 def _left_out(counts: Counter[str] | dict[str, int]) -> str:
     reasons = (("too_near", "too near"), ("outside_z", "too low or high"), ("not_finite", "not finite"))
     return ", ".join(f"{counts[name]} {words}" for name, words in reasons if counts[name])
+
+
+def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.float64]:
+    """Middles of all occupied or free voxels, (N, 3) metres in the map's frame.
+
+    Parameters
+    ----------
+    kind, scope
+        As `shmmap.LiveMap.voxels` takes them.
+
+    Raises
+    ------
+    OverBudget
+        The daemon has no memory for a list at all.
+    """
+    rows = live.chunks(saved=scope != "memory")
+    keys = np.array([row.key for row in rows], np.int64).reshape(-1, 3) * _SIDE
+    counts = np.array([row.occupied if kind == "occupied" else row.free for row in rows], np.int64)
+    found = [np.empty((0, 3))]
+    if not len(keys):
+        return found[0]
+    waiting = [(keys.min(axis=0), keys.max(axis=0) + _SIDE)]
+    too_many = math.inf
+    while waiting:
+        low, high = waiting.pop()
+        inside = (keys < high).all(axis=1) & (keys + _SIDE > low).all(axis=1)
+        expected = int(counts[inside].sum())
+        if expected and (expected < too_many or inside.sum() == 1):
+            try:
+                found.append(live.voxels(kind, _box(low, high, live.resolution), scope=scope).xyz)
+            except OverBudget:
+                if (high - low).max() == 1:
+                    raise
+                too_many = min(too_many, expected)
+                waiting += _halves(low, high)
+        elif expected:
+            waiting += _halves(low, high)
+    return np.concatenate(found)
+
+
+def _box(low: NDArray[np.int64], high: NDArray[np.int64], resolution: float) -> Box:
+    """The box of voxels from ``low`` to below ``high``: no voxel has its middle on its faces."""
+    (x0, y0, z0), (x1, y1, z1) = (low * resolution).tolist(), (high * resolution).tolist()
+    return Box(x0, y0, x1, y1, ZRange(z0, z1))
+
+
+def _halves(
+    low: NDArray[np.int64], high: NDArray[np.int64]
+) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Two halves along the longest axis, between chunks as long as there are several."""
+    axis = int((high - low).argmax())
+    size = int(high[axis] - low[axis])
+    half = size // 2 if size <= _SIDE else size // _SIDE // 2 * _SIDE
+    middle_high, middle_low = high.copy(), low.copy()
+    middle_high[axis] = middle_low[axis] = low[axis] + half
+    return [(low, middle_high), (middle_low, high)]

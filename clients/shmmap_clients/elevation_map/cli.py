@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-elevation build``: the whole map, one cell at a time."""
+"""The program ``shmmap-elevation``: ``build`` the elevation of the whole map, one cell at a time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,6 +26,7 @@ from shmmap_clients.command_line import (
     positive,
     print_json,
     print_line,
+    run_program,
     seconds,
     writing_errors,
 )
@@ -32,9 +34,9 @@ from shmmap_clients.shared_options import add_quiet_option
 
 if TYPE_CHECKING:
     from shmmap_clients.elevation_map.build import BuildProgress
-    from shmmap_clients.elevation_map.rule import ElevationRule
+    from shmmap_clients.elevation_map.heights import ElevationRule
 
-__all__ = ["add_parser", "run"]
+__all__ = ["main"]
 
 _ATTEMPTS = 3
 _EVERY_S = 0.5
@@ -42,8 +44,7 @@ _NAMED: Final = 5  # of the cells that were left out
 _NAME: Final = "shmmap-elevation"
 _FEW: Final = 0.5
 """Share of the columns with points that should have a height; a map of sparse points has fewer."""
-
-_EPILOG: Final = """\
+_JSON: Final = """\
 JSON (fields may be added, none is removed):
   {"map_version": hex, "cells", "loaded": cells that this run loaded,
    "rows", "columns": of the grid, "resolution", "origin": south-west corner,
@@ -57,16 +58,16 @@ JSON (fields may be added, none is removed):
 Exit code: 0; 1 when cells could not be loaded, or no column has a height."""
 
 
-def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
+def _add_build(subparsers: Any) -> None:
+    """Add ``build``."""
     parser = add_verb(
         subparsers,
         "build",
-        run,
+        _build,
         help="make an elevation map of the whole map",
         description="Make an elevation map of the daemon's whole map, one cell at a time, and write it.  What"
         " was made before is cached for each version of the map, and an interrupted run continues.",
-        epilog=_EPILOG,
+        epilog=_JSON,
     )
     parser.add_argument(
         "--out",
@@ -138,16 +139,16 @@ def add_parser(subparsers: Any) -> None:
     add_daemon_options(parser, json=False)
 
 
-def run(args: argparse.Namespace) -> int:
+def _build(args: argparse.Namespace) -> int:
     """Build and write."""
     import numpy as np
 
     from shmmap import BadRequest
     from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
     from shmmap_clients.elevation_map.grid import FILLED, MEASURED
+    from shmmap_clients.elevation_map.heights import ElevationRule
     from shmmap_clients.elevation_map.holes import fill_reach
     from shmmap_clients.elevation_map.output import check_output, write_elevation, write_hillshade
-    from shmmap_clients.elevation_map.rule import ElevationRule
     from shmmap_clients.map_extent import map_extent
 
     rule = ElevationRule(args.rule, args.resolution, args.tolerance, args.height_range, args.min_points)
@@ -241,7 +242,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _sparse(rule: ElevationRule, measured: int, occupied: int) -> str:
-    """Say that few columns have a height, why, and what helps."""
+    """Return that few columns have a height, why, and what helps."""
     return (
         f"{measured} of {occupied} columns with points ({100 * measured / occupied:.1f} %) have a height;"
         f" a column of {rule.resolution:g} m needs {rule.min_points} points within {rule.tolerance:g} m of"
@@ -257,7 +258,7 @@ def _cache(named: str | None) -> Path:
 
 
 class _Progress:
-    """Shows how far a build is, now and then: cells come faster than anything can be read."""
+    """Shows the progress of a build now and then: cells come faster than a person reads."""
 
     def __init__(self, line: ProgressLine, rows: str) -> None:
         self._line = line
@@ -269,3 +270,8 @@ class _Progress:
         if now_s >= self._next_s or progress.done == progress.cells:
             self._next_s = now_s + (_EVERY_S if self._line.written_over else 10 * _EVERY_S)
             self._line.show(f"{progress.done} of {progress.cells} cells, {progress.rows} {self._rows}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb and return the exit code."""
+    return run_program(_NAME, "Make the elevation map of a point-cloud map of any size.", (_add_build,), argv)

@@ -19,17 +19,20 @@ from shmmap_clients.command_line import (
     print_json,
     run_command,
 )
-from shmmap_clients.pose_option import add_pose_format_option, add_pose_option, pose_from, pose_text
 from shmmap_clients.shared_options import (
     FAILED_LIMITS,
     add_height_option,
     add_leaf_option,
+    add_pose_format_option,
+    add_pose_option,
     add_radius_option,
     add_scan_option,
     add_scoring_options,
     add_sigma_options,
     add_thin_option,
     add_trust_options,
+    pose_from,
+    pose_text,
     reader_from,
     scoring_settings,
     trust_from,
@@ -102,7 +105,7 @@ def _run(args: argparse.Namespace) -> int:
     from shmmap_clients.map_extent import NoMapHere
     from shmmap_clients.ndt_scan_matcher import pose_from_matrix
     from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, RoughPose
-    from shmmap_clients.scans.thinning import thinned
+    from shmmap_clients.scans.scan_file import thinned
 
     x, y, z, roll, pitch, yaw = pose_from_matrix(pose_from(args, "--pose")).tolist()
     rough = RoughPose(x, y, z, roll, pitch, yaw, sigma_m=args.sigma, sigma_yaw=args.sigma_yaw)

@@ -81,7 +81,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         type=_renamed,
         default=[],
         metavar="WHAT=NAME",
-        help="call a service or topic otherwise; see below; may be repeated",
+        help="remap a name; see below; may be repeated",
     )
     parser.add_argument(
         "--wait",

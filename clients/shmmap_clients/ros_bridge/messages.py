@@ -1,0 +1,384 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2 messages and services as IDL, and how they become samples of DDS and back.
+
+The packages are ``builtin_interfaces``, ``std_msgs``, ``sensor_msgs``; ``autoware_map_msgs``, read at version
+1.12; and ``bonxai_msgs``, as Rolling-Bonxai's own packages have it since version 2.
+
+A request and a reply begin with 16 bytes that rmw_cyclonedds_cpp puts in front of the message (its
+``serdata.hpp``): which client asked, and its number of the request.  The server sends both back, and the
+client takes the reply that has its own.  Each type here that has them is a request or a reply.
+
+Replies with points are written by hand (`shmmap_clients.ros_bridge.cdr`): the serializer of `cyclonedds`
+handles each byte of a sequence in Python.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.annotations import final
+from cyclonedds.idl.types import float32, float64, int32, int64, sequence, uint8, uint32, uint64
+
+__all__ = [
+    "DIFFERENTIAL",
+    "FREE",
+    "OCCUPIED",
+    "PARTIAL",
+    "SELECTED",
+    "AreaInfo",
+    "CellMetaData",
+    "CellMetaDataWithID",
+    "CellWithID",
+    "Damaged",
+    "GetDifferentialRequest",
+    "GetDifferentialResponse",
+    "GetFreeRequest",
+    "GetFreeResponse",
+    "GetOccupiedRequest",
+    "GetOccupiedResponse",
+    "GetPartialRequest",
+    "GetPartialResponse",
+    "GetSelectedRequest",
+    "GetSelectedResponse",
+    "Header",
+    "MapMetaData",
+    "PointCloud2",
+    "PointField",
+    "ServiceKind",
+    "Time",
+    "VoxelGrid",
+    "ready_made",
+    "sample",
+]
+
+_Sample = TypeVar("_Sample")
+
+
+@dataclass
+class Damaged:
+    """What came instead of a message: bytes that are no message of its type.
+
+    Attributes
+    ----------
+    reason
+        What is wrong with them.
+    """
+
+    reason: str
+
+
+def sample(kind: type[_Sample]) -> type[_Sample]:
+    """Let a class of messages be sent as bytes that were made ready, and survive bytes that are no message.
+
+    It is laid out as all of ROS: fields one after another and nothing else (``final``).
+    """
+    kind.serialize = _serialize  # type: ignore[attr-defined]
+    kind.deserialize = classmethod(_deserialize)  # type: ignore[attr-defined]
+    kind.ready = None  # type: ignore[attr-defined]  # no annotation: it is no field of the message
+    return final(kind)  # type: ignore[no-any-return]
+
+
+def _serialize(
+    self: Any, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None
+) -> bytes | bytearray:
+    """Return those bytes, or make some of the fields."""
+    made: bytes | bytearray = (
+        self.__idl__.serialize(self, buffer=buffer, endianness=endianness, use_version_2=use_version_2)
+        if self.ready is None
+        else self.ready
+    )
+    return made
+
+
+def _deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
+    """Return the message, or `Damaged`.
+
+    Cyclone has dropped before what does not fit the type; texts that are not UTF-8 are left, for one.
+    """
+    try:
+        return cls.__idl__.deserialize(data, has_header=has_header, use_version_2=use_version_2)
+    except (ValueError, struct.error, IndexError, OverflowError, MemoryError) as error:
+        return Damaged(f"{type(error).__name__}: {error}")
+
+
+def ready_made(kind: type[_Sample], content: bytearray) -> _Sample:
+    """Return a message that is sent as these bytes, encapsulation included; its fields are not set."""
+    one = kind.__new__(kind)
+    one.ready = content  # type: ignore[attr-defined]
+    return one
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceKind:
+    """A service's types.
+
+    Attributes
+    ----------
+    name
+        As ROS writes it, ``autoware_map_msgs/srv/GetPartialPointCloudMap``.
+    request, reply
+        Classes of the messages.
+    """
+
+    name: str
+    request: type[Any]
+    reply: type[Any]
+
+
+@dataclass
+@sample
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    """A moment: seconds and nanoseconds since 1970."""
+
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+@sample
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    """When, and in which frame."""
+
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+@sample
+class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
+    """One value of each point: where in the point, of which type (1 int8 to 8 float64), how many."""
+
+    name: str
+    offset: uint32
+    datatype: uint8
+    count: uint32
+
+
+@dataclass
+@sample
+class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
+    """Points as bytes: ``width`` x ``height`` of ``point_step`` bytes each."""
+
+    header: Header
+    height: uint32
+    width: uint32
+    fields: sequence[PointField]
+    is_bigendian: bool
+    point_step: uint32
+    row_step: uint32
+    data: sequence[uint8]
+    is_dense: bool
+
+
+@dataclass
+@sample
+class AreaInfo(IdlStruct, typename="autoware_map_msgs::msg::dds_::AreaInfo_"):
+    """An area around a place, metres in the map frame."""
+
+    center_x: float32
+    center_y: float32
+    radius: float32
+
+
+@dataclass
+@sample
+class CellMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellMetaData_"):
+    """A cell's box, metres in the map frame."""
+
+    min_x: float32
+    min_y: float32
+    max_x: float32
+    max_y: float32
+
+
+@dataclass
+@sample
+class CellMetaDataWithID(
+    IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellMetaDataWithID_"
+):
+    """A cell without its points."""
+
+    cell_id: str
+    metadata: CellMetaData
+
+
+@dataclass
+@sample
+class CellWithID(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapCellWithID_"):
+    """A cell."""
+
+    cell_id: str
+    pointcloud: PointCloud2
+    metadata: CellMetaData
+
+
+@dataclass
+@sample
+class MapMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudMapMetaData_"):
+    """All cells of the map, without their points."""
+
+    header: Header
+    metadata_list: sequence[CellMetaDataWithID]
+
+
+@dataclass
+@sample
+class GetPartialRequest(IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Request_"):
+    """Which cells touch an area?"""
+
+    client: uint64
+    number: int64
+    area: AreaInfo
+
+
+@dataclass
+@sample
+class GetPartialResponse(
+    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Response_"
+):
+    """Those cells, in the order of their ids."""
+
+    client: uint64
+    number: int64
+    header: Header
+    new_pointcloud_with_ids: sequence[CellWithID]
+
+
+@dataclass
+@sample
+class GetDifferentialRequest(
+    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Request_"
+):
+    """Which cells touch an area, beside those that the client has?"""
+
+    client: uint64
+    number: int64
+    area: AreaInfo
+    cached_ids: sequence[str]
+
+
+@dataclass
+@sample
+class GetDifferentialResponse(
+    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Response_"
+):
+    """Those cells, and which ids the client may drop."""
+
+    client: uint64
+    number: int64
+    header: Header
+    new_pointcloud_with_ids: sequence[CellWithID]
+    ids_to_remove: sequence[str]
+
+
+@dataclass
+@sample
+class GetSelectedRequest(
+    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Request_"
+):
+    """Which cells have these ids?"""
+
+    client: uint64
+    number: int64
+    cell_ids: sequence[str]
+
+
+@dataclass
+@sample
+class GetSelectedResponse(
+    IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Response_"
+):
+    """Those cells, in the order asked for."""
+
+    client: uint64
+    number: int64
+    header: Header
+    new_pointcloud_with_ids: sequence[CellWithID]
+
+
+PARTIAL: Final = ServiceKind(
+    "autoware_map_msgs/srv/GetPartialPointCloudMap", GetPartialRequest, GetPartialResponse
+)
+
+DIFFERENTIAL: Final = ServiceKind(
+    "autoware_map_msgs/srv/GetDifferentialPointCloudMap", GetDifferentialRequest, GetDifferentialResponse
+)
+
+SELECTED: Final = ServiceKind(
+    "autoware_map_msgs/srv/GetSelectedPointCloudMap", GetSelectedRequest, GetSelectedResponse
+)
+
+
+@dataclass
+@sample
+class VoxelGrid(IdlStruct, typename="bonxai_msgs::msg::dds_::VoxelGrid_"):
+    """Voxels by their indices, ``floor(position / resolution)`` along each axis, and the box around them."""
+
+    header: Header
+    resolution: float64
+    x: sequence[int32]
+    y: sequence[int32]
+    z: sequence[int32]
+    num_voxels: uint32
+    min_x: int32
+    min_y: int32
+    min_z: int32
+    max_x: int32
+    max_y: int32
+    max_z: int32
+
+
+@dataclass
+@sample
+class GetOccupiedRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Request_"):
+    """All occupied voxels; ROS gives messages without fields one byte."""
+
+    client: uint64
+    number: int64
+    structure_needs_at_least_one_member: uint8
+
+
+@dataclass
+@sample
+class GetOccupiedResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Response_"):
+    """Those voxels; the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
+
+    client: uint64
+    number: int64
+    voxel_grid: VoxelGrid
+    occupied_count: uint64
+    total_active_cells: uint64
+    occupancy_ratio: float32
+    memory_mb: float32
+    success: bool
+
+
+@dataclass
+@sample
+class GetFreeRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Request_"):
+    """All free voxels."""
+
+    client: uint64
+    number: int64
+    structure_needs_at_least_one_member: uint8
+
+
+@dataclass
+@sample
+class GetFreeResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Response_"):
+    """Those voxels, as in `GetOccupiedResponse`."""
+
+    client: uint64
+    number: int64
+    voxel_grid: VoxelGrid
+    free_count: uint64
+    total_active_cells: uint64
+    occupancy_ratio: float32
+    memory_mb: float32
+    success: bool
+
+
+OCCUPIED: Final = ServiceKind("bonxai_msgs/srv/GetOccupiedVoxels", GetOccupiedRequest, GetOccupiedResponse)
+
+FREE: Final = ServiceKind("bonxai_msgs/srv/GetFreeVoxels", GetFreeRequest, GetFreeResponse)
