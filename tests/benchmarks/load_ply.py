@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from shmmap.formats.cloud import read_cloud
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.formats.ply_writer import ply_header
+from shmmap.formats.ply_header import ply_header
 
 LIMIT = 1.3
 
