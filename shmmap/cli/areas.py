@@ -170,7 +170,7 @@ def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
     map_dir = os.path.dirname(os.path.dirname(id_prefix + "_"))
     if not os.path.exists(os.path.join(map_dir, "shmmap_divide.json")):
         return None
-    from shmmap.origin.map_frame import read_map_frame
+    from shmmap.origin.map_report import read_map_frame
 
     origin = read_map_frame(map_dir).origin
     return origin if any(origin) else None

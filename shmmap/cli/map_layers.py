@@ -11,7 +11,7 @@ from shmmap.cli.options import add_unit_options, at_least
 from shmmap.cli.screens.output import print_line
 
 if TYPE_CHECKING:
-    from shmmap.origin.map_origin import MapOrigin
+    from shmmap.origin.catalogue import MapOrigin
     from shmmap.prepare.run import Failure
 
 __all__ = [

@@ -70,10 +70,10 @@ from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.optional_packages import needed_packages
+from shmmap.origin.catalogue import NoMap
+from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.map_layout import absolute_path
-from shmmap.origin.no_map import NoMap
 from shmmap.origin.remote.store import is_published, is_url, read_url
-from shmmap.origin.sidecar import default_cache_directory
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.exclusive_name import refuse_second
@@ -201,7 +201,7 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
             )  # fmt: skip
     with needed_packages("a published map"):
         from shmmap.daemon.map.published_origin import PublishedOrigin
-        from shmmap.origin.remote.serving_store import ServedFrom
+        from shmmap.origin.remote.opened_store import ServedFrom
         from shmmap.origin.remote.store import may_be_plain
 
         insecure_http = may_be_plain(path, insecure_http=config.insecure_http, trust=config.trust)

@@ -17,10 +17,9 @@ import time
 from typing import Final
 
 from shmmap.dividing.divide import divide
-from shmmap.dividing.report import LINK_NAME
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError, ShmmapError
-from shmmap.origin.map_frame import read_report
+from shmmap.origin.map_report import LINK_NAME, read_report
 from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["main"]

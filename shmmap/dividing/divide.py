@@ -16,7 +16,7 @@ import numpy as np
 
 from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit
 from shmmap.dividing.finishing import thin_out, write_encoded
-from shmmap.dividing.frame import choose_frame
+from shmmap.dividing.frame import choose_frame, choose_units
 from shmmap.dividing.inputs import (
     InputFile,
     check_output_directory,
@@ -25,22 +25,17 @@ from shmmap.dividing.inputs import (
     find_inputs,
 )
 from shmmap.dividing.lattice import CellLattice
-from shmmap.dividing.memory import memory_left
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
-from shmmap.dividing.progress import NoProgress, Progress
-from shmmap.dividing.report import DividedMap, write_report
-from shmmap.dividing.row_layout import AXES, RowLayout, common_rows
-from shmmap.dividing.settings import DivideSettings, lattice_of
-from shmmap.dividing.sources import Source, open_source
-from shmmap.dividing.units import choose_units
+from shmmap.dividing.settings import DivideSettings, NoProgress, Progress, lattice_of, memory_left
+from shmmap.dividing.sources import AXES, RowLayout, Source, common_rows, open_source
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
-from shmmap.formats.causes import refusal
-from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
+from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.reader import PcdReader
-from shmmap.origin.far_cells import far_cells_notes
-from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
+from shmmap.formats.source_file import refusal
+from shmmap.origin.map_report import DividedMap, far_cells_notes, write_report
+from shmmap.origin.metadata import METADATA_NAME, metadata_text
 from shmmap.quantities import format_bytes
 
 __all__ = ["divide"]

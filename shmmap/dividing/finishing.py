@@ -17,8 +17,8 @@ from shmmap.dividing.cell_files import CellFiles
 from shmmap.dividing.kernels import assign_cells
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
-from shmmap.dividing.progress import Progress
-from shmmap.dividing.row_layout import AXES
+from shmmap.dividing.settings import Progress
+from shmmap.dividing.sources import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import write_pcd
 

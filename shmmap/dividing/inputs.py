@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from shmmap.errors import BadRequest, MapMissing
-from shmmap.formats.block_reader import CLOUD_SUFFIXES
-from shmmap.formats.causes import refusal
-from shmmap.origin.map_frame import REPORT_NAME
-from shmmap.origin.metadata_text import METADATA_NAME
+from shmmap.formats.cloud import CLOUD_SUFFIXES
+from shmmap.formats.source_file import refusal
+from shmmap.origin.map_report import REPORT_NAME
+from shmmap.origin.metadata import METADATA_NAME
 
 __all__ = ["InputFile", "check_output_directory", "check_output_place", "check_unchanged", "find_inputs"]
 

@@ -20,7 +20,7 @@ from shmmap.dividing.inputs import check_output_directory
 from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest
-from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
+from shmmap.origin.metadata import METADATA_NAME, metadata_text
 
 __all__ = ["MapWriter", "WrittenMap"]
 

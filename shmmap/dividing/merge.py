@@ -11,16 +11,14 @@ from typing import IO, Any, Final
 
 import numpy as np
 
+from shmmap.dividing.frame import choose_units
 from shmmap.dividing.inputs import InputFile, check_output_place, check_unchanged, find_inputs
-from shmmap.dividing.memory import memory_left
-from shmmap.dividing.progress import NoProgress, Progress
-from shmmap.dividing.row_layout import AXES, NO_MOVE, RowLayout, common_rows
-from shmmap.dividing.sources import Source, open_source
-from shmmap.dividing.units import choose_units
+from shmmap.dividing.settings import NoProgress, Progress, memory_left
+from shmmap.dividing.sources import AXES, NO_MOVE, RowLayout, Source, common_rows, open_source
 from shmmap.errors import BadRequest, CannotWrite, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header, pcd_rows
-from shmmap.origin.map_frame import read_report
+from shmmap.origin.map_report import read_report
 from shmmap.quantities import format_bytes
 
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from shmmap.dividing.cell_files import CellFiles, Slot, write_at
 from shmmap.dividing.kernels import assign_cells, count_cells, scatter_rows
 from shmmap.dividing.lattice import CellLattice
-from shmmap.dividing.row_layout import word_view
+from shmmap.dividing.sources import word_view
 from shmmap.errors import BadRequest
 
 __all__ = ["Partition", "block_points_for", "worker_count"]

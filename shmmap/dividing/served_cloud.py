@@ -24,18 +24,15 @@ from typing import Any, Final
 
 from xxhash import xxh3_64_hexdigest
 
-from shmmap.dividing.report import LINK_NAME
 from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing, error_from_wire
-from shmmap.formats.block_reader import READABLE_SUFFIXES
+from shmmap.formats.cloud import READABLE_SUFFIXES
 from shmmap.formats.coordinate_system import FEET
 from shmmap.logfmt import log
-from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.map_directory import MapDirectory, open_map
-from shmmap.origin.map_frame import read_report
+from shmmap.origin.catalogue import Catalogue, MapOrigin
+from shmmap.origin.catalogue_bytes import default_cache_directory
+from shmmap.origin.map_directory import MapDirectory, is_served_whole, open_map
 from shmmap.origin.map_layout import absolute_path
-from shmmap.origin.map_origin import MapOrigin
-from shmmap.origin.sidecar import default_cache_directory
-from shmmap.origin.single_pcd import is_served_whole
+from shmmap.origin.map_report import LINK_NAME, read_report
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.processes.start_child import how_ended, start_child
 
@@ -69,7 +66,7 @@ def find_origin(
     metadata, strict, cache_dir
         As in `open_map`; empty ones are looked for, or the user's.
     unit, vertical_unit
-        Of a cloud's coordinates, as in `shmmap.dividing.units.choose_units`.
+        Of a cloud's coordinates, as in `shmmap.dividing.frame.choose_units`.
     tell
         Sends ``KEY=value`` lines of progress to the service manager, see `DividedCloud`.
 

@@ -1,19 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a map is to be divided."""
+"""How a map is to be divided: the settings, the memory that is left, and how progress is reported."""
 
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
+from typing import Final, Protocol
 
 from shmmap.dividing.frame import Translation
 from shmmap.dividing.lattice import CellLattice
-from shmmap.dividing.memory import MIN_MEMORY_BYTES
-from shmmap.dividing.row_layout import AXES
+from shmmap.dividing.sources import AXES
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.header import ENCODINGS
 
-__all__ = ["DivideSettings", "lattice_of"]
+__all__ = [
+    "MIN_MEMORY_BYTES",
+    "DivideSettings",
+    "NoProgress",
+    "Progress",
+    "lattice_of",
+    "memory_left",
+    "peak_memory_bytes",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +41,7 @@ class DivideSettings:
         What ``auto`` adds where that leaves float32 precise enough: what an earlier state of the same cloud
         was moved by, so that its map stays where it is.
     unit, vertical_unit
-        Of the inputs' coordinates, in the plane and in height; see `shmmap.dividing.units`.
+        Of the inputs' coordinates, in the plane and in height; see `shmmap.dividing.frame`.
     leaf
         Side of the voxels whose points become one, metres; 0 keeps every point.
     prefix
@@ -110,3 +119,54 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
             hint=f"at least {MIN_MEMORY_BYTES >> 20}M: code and libraries are counted",
         )
     return lattice
+
+
+MIN_MEMORY_BYTES: Final = 384 << 20
+"""The smallest limit that makes sense: Python, numpy, numba and its compiler take 200 MiB."""
+
+_SPARE_BYTES: Final = 96 << 20  # what the compiler, the decompressors and the tables of cells come to take
+
+
+def memory_left(limit_bytes: int) -> int:
+    """Bytes that this process may still take under ``limit_bytes``, with some to spare."""
+    with open("/proc/self/statm", "rb") as file:
+        resident = int(file.read().split()[1]) * os.sysconf("SC_PAGESIZE")
+    return max(32 << 20, limit_bytes - resident - _SPARE_BYTES)
+
+
+def peak_memory_bytes() -> int:
+    """Most memory that this program ever had resident.
+
+    From ``VmHWM``: ``ru_maxrss`` would begin with the memory of whoever started the process.
+    """
+    with open("/proc/self/status", "rb") as file:
+        for line in file:
+            if line.startswith(b"VmHWM:"):
+                return int(line.split()[1]) << 10
+    raise OSError("/proc/self/status has no VmHWM")
+
+
+class Progress(Protocol):
+    """Hears what a run is doing; called from one thread, a few times a second at least."""
+
+    def stage(self, name: str, total: int) -> None:
+        """A stage begins, of ``total`` points; 0 where that is not known."""
+
+    def advance(self, points: int) -> None:
+        """So many more points are done."""
+
+    def done(self, points: int) -> None:
+        """Everything is done."""
+
+
+class NoProgress:
+    """Tells nobody."""
+
+    def stage(self, name: str, total: int) -> None:
+        """A stage begins."""
+
+    def advance(self, points: int) -> None:
+        """So many more points are done."""
+
+    def done(self, points: int) -> None:
+        """Everything is done."""

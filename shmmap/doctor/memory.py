@@ -14,7 +14,7 @@ from shmmap.daemon.host.memory import room_in_group
 from shmmap.disk_budget import OBJECTS, DiskBudget, why_not_private
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient
-from shmmap.origin.sidecar import default_cache_directory
+from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
 

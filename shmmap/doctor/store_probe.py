@@ -152,7 +152,7 @@ def _ask_credentials(question: StoreQuestion, answer: StoreAnswer) -> None:
 
 def _ask_objects(question: StoreQuestion, answer: StoreAnswer) -> None:
     from shmmap.origin.remote.map_versions import read_current, read_entry
-    from shmmap.origin.remote.serving_store import ServedFrom, open_for_serving
+    from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
     from shmmap.origin.remote.store import StoreRefused, Timeouts
 
     if answer.error or answer.credentials_error:

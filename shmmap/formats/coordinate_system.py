@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file says of its coordinate system: its name, its units in the plane and in height.
+"""What a file says of its coordinate system (name, units in the plane and in height), and what is said of it.
 
 Read from WKT (OGC 01-009 and ISO 19162, so WKT 1 and 2) and from GeoTIFF keys (OGC 19-008), as LAS files have
-them.  No projection library: a unit's length stands in the text, and codes of units are few.
+them.  No projection library: a unit's length stands in the text, and codes of units are few.  Coordinates
+that are no metres are warned of: of longitude and latitude no map can be made, since a whole town would fall
+into one cell.
 """
 
 from __future__ import annotations
@@ -13,7 +15,23 @@ import struct
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-__all__ = ["FEET", "METRE", "UNITS", "CoordinateSystem", "LengthUnit", "geokey_system", "wkt_system"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "FEET",
+    "GEOGRAPHIC_SYSTEM",
+    "METRE",
+    "UNITS",
+    "CoordinateSystem",
+    "LengthUnit",
+    "degrees_warning",
+    "geokey_system",
+    "unit_text",
+    "unit_warnings",
+    "units_text",
+    "wkt_system",
+]
 
 
 class LengthUnit(NamedTuple):
@@ -286,3 +304,64 @@ def _coded(numbers: dict[int, float], key: int, size_key: int = 0) -> LengthUnit
     if code == _USER_DEFINED and size_key in numbers:
         return _length("", numbers[size_key])
     return _UNIT_CODES.get(code, LengthUnit(f"unit EPSG:{code}", 0.0))
+
+
+GEOGRAPHIC_SYSTEM: Final = (
+    "its coordinate system is geographic: x and y are degrees, not metres; convert it to a metric "
+    "system first,"
+    " such as UTM"
+)
+
+_MOST_DEGREES: Final = 5.0  # of x and of y; larger clouds are divided by other means
+_FLATNESS: Final = 20.0  # heights are in metres, so such a cloud seems to be far higher than wide
+_OFF_ORIGIN: Final = 1.0  # what small thing stands at the origin may be as slender as that
+
+
+def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -> str:
+    """Return a warning where bounds ((3,) each) look like degrees, else an empty text.
+
+    They do where x and y are possible as longitude and latitude, span few degrees, and heights span many
+    times as much: a town is 0.05 degrees wide and 50 m high.
+    """
+    if not (np.isfinite(lowest).all() and np.isfinite(highest).all()):
+        return ""
+    farthest = np.maximum(np.abs(lowest), np.abs(highest))
+    spans = highest - lowest
+    wide = float(max(spans[0], spans[1]))
+    if not (farthest[0] <= 180.0 and farthest[1] <= 90.0 and max(farthest[:2]) > _OFF_ORIGIN):
+        return ""
+    if not (0.0 < wide <= _MOST_DEGREES and spans[2] > _FLATNESS * wide):
+        return ""
+    return (
+        f"x and y look like degrees, not metres: x {lowest[0]:.6g} .. {highest[0]:.6g},"
+        f" y {lowest[1]:.6g} .. {highest[1]:.6g}; if they are longitude and latitude, convert the cloud to a"
+        " metric system first, such as UTM"
+    )
+
+
+def unit_warnings(crs: CoordinateSystem | None) -> tuple[str, ...]:
+    """Return what has to be said of a file's units: that they are degrees, or no metres."""
+    if crs is None:
+        return ()
+    plane, height = crs.units
+    said = [GEOGRAPHIC_SYSTEM] if crs.geographic else []
+    if crs.geographic and height != METRE:
+        said.append(f"heights are in {unit_text(height)}, not metres")
+    elif not crs.geographic and (plane, height) != (METRE, METRE):
+        said.append(f"coordinates are not in metres: {units_text(plane, height)}")
+    return tuple(said)
+
+
+def units_text(plane: LengthUnit, height: LengthUnit) -> str:
+    """Say units in the plane and in height, each with its length."""
+    if plane == height:
+        return f"x, y and z are in {unit_text(plane)}"
+    return f"x and y are in {unit_text(plane)}, z in {unit_text(height)}"
+
+
+def unit_text(unit: LengthUnit) -> str:
+    """Name a unit with its length."""
+    if unit == METRE:
+        return "metres"
+    name = re.sub(r"\bfoot\b", "feet", unit.name)
+    return f"{name} ({unit.metres:.12g} m)" if unit.metres else f"{name} (of a length not known)"

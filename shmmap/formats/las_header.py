@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from typing import IO, Final
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import refusal
 from shmmap.formats.coordinate_system import CoordinateSystem, geokey_system, wkt_system
-from shmmap.formats.source_file import open_regular
+from shmmap.formats.source_file import open_regular, refusal
 
 __all__ = ["LasHeader", "read_las_header"]
 

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError, PackageMissing
-from shmmap.formats.causes import refusal
-from shmmap.formats.degrees import unit_warnings
+from shmmap.formats.coordinate_system import unit_warnings
 from shmmap.formats.las_header import read_las_header
 from shmmap.formats.laz_chunks import check_laz
+from shmmap.formats.source_file import refusal
 
 __all__ = ["LAS_SUFFIXES", "LasReader"]
 

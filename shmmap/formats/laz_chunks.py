@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import IO, Final
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import refusal
+from shmmap.formats.source_file import refusal
 
 __all__ = ["LazChunks", "check_laz"]
 

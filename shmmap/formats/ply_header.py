@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The header of a PLY file: its elements and their properties, checked against the file's size.
+"""The header of a PLY file: its elements and properties, checked against the file's size; and written.
 
 The format is Greg Turk's (The PLY Polygon File Format, 1994), with both families of type names.  Accepted
 beyond it, because such files exist: lines that end in CRLF or CR, `obj_info`, comments in any encoding, a
@@ -8,17 +8,25 @@ byte order mark, upper-case X, Y and Z, and 64-bit integers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from shmmap.columns import column_names
-from shmmap.errors import MapDataError
-from shmmap.formats.causes import refusal
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
+from shmmap.formats.source_file import refusal
 
-__all__ = ["HEADER_LIMIT_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "parse_ply_header"]
+__all__ = [
+    "HEADER_LIMIT_BYTES",
+    "PlyElement",
+    "PlyHeader",
+    "PlyProperty",
+    "parse_ply_header",
+    "ply_header",
+]
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
 """A header must end within these."""
@@ -304,3 +312,33 @@ class _Parser:
                     offset=self.file_bytes,
                 )
             left -= needed
+
+
+_WRITTEN_TYPES: Final = {
+    "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
+    "f8": "double",
+}  # fmt: skip
+
+
+def ply_header(
+    fields: Sequence[tuple[str, np.dtype[Any]]], points: int, *, comment: str = "", header_bytes: int = 0
+) -> bytes:
+    """Return the header of a binary file with ``fields`` (name, dtype of one value).
+
+    ``header_bytes`` asks for that length, got by spaces at the end of a comment: so a header can be written
+    last, before points whose number was not known.
+
+    Raises
+    ------
+    BadRequest
+        PLY has no such type, or the header is longer than asked for.
+    """
+    types = [_WRITTEN_TYPES.get(dtype.str.lstrip("<|")) for _, dtype in fields]
+    if None in types:
+        raise BadRequest(f"a PLY file cannot hold {', '.join(dtype.str for _, dtype in fields)}")
+    first = "ply\nformat binary_little_endian 1.0\n" + f"comment {comment}"
+    properties = (f"property {kind} {name}\n" for (name, _), kind in zip(fields, types, strict=True))
+    rest = f"\nelement vertex {points}\n" + "".join(properties) + "end_header\n"
+    if header_bytes and len(first) + len(rest) > header_bytes:
+        raise BadRequest(f"the header needs {len(first) + len(rest)} bytes, more than {header_bytes}")
+    return (first.ljust(header_bytes - len(rest)) + rest).encode("ascii")

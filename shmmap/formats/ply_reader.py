@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.formats.causes import refusal
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.body import record_blocks
 from shmmap.formats.pcd.table import FieldTable
 from shmmap.formats.ply_header import HEADER_LIMIT_BYTES, PlyElement, PlyHeader, parse_ply_header
-from shmmap.formats.source_file import FileReader, SourceFile
+from shmmap.formats.source_file import FileReader, SourceFile, refusal
 from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
 __all__ = ["PlyReader"]

@@ -1,20 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file, opened for what it is, and read once from front to back, digested on the way."""
+"""A cloud file, opened for what it is and read once from front to back; and all causes of a refusal.
+
+`MapDataError.cause` of any error that this package raises is a key of `CAUSES`; programs may rely on the
+names, people read the messages.
+"""
 
 from __future__ import annotations
 
 import os
 import stat
 from types import TracebackType
-from typing import Any, NoReturn, TypeVar
+from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from shmmap.formats.causes import refusal
+from shmmap.errors import MapDataError
 
-__all__ = ["FileReader", "SourceFile", "open_regular"]
+__all__ = [
+    "CAUSES",
+    "FileReader",
+    "SourceFile",
+    "open_regular",
+    "refusal",
+]
 
 _Self = TypeVar("_Self", bound="FileReader")
 
@@ -155,3 +165,37 @@ class SourceFile:
         raise refusal(
             "unreadable", f"cannot be read: {error.strerror}", path=self.path, offset=self.at
         ) from error
+
+
+CAUSES: Final[dict[str, str]] = {
+    "missing": "there is no such file",
+    "unreadable": "the operating system refuses to open or read it",
+    "not_regular": "a directory, pipe or device, not a file",
+    "empty_file": "no bytes at all",
+    "zero_filled": "nothing but zero bytes, as after a power loss",
+    "lfs_pointer": "a git-lfs pointer: the data was never fetched",
+    "not_pcd": "something else than PCD",
+    "bad_header": "the header contradicts itself or lacks a line",
+    "bad_type": "a type of values that the format does not have",
+    "no_xyz": "no usable x, y and z",
+    "unknown_encoding": "an encoding that the format does not have",
+    "too_many_points": "more points than the format can mean",
+    "too_large": "more points than a layer is computed of",
+    "changed": "the file changed while it was being read",
+    "truncated": "the file ends before its data does",
+    "bad_lzf": "the compressed block contradicts its sizes or cannot be decompressed",
+    "bad_row": "a row has too few or many values, or one that is not a number of its type",
+    "coordinate_range": "a 64-bit integer coordinate that float64 cannot hold exactly",
+    "unsupported_format": "a file format that is not read",
+    "not_metres": "coordinates in feet or another unit, and nothing that says to convert them",
+    "bad_las": "a LAS or LAZ file that contradicts itself or cannot be decompressed",
+}
+
+
+def refusal(
+    cause: str, message: str, *, path: str, offset: int | None = None, hint: str = ""
+) -> MapDataError:
+    """Return the error for ``cause`` (a key of `CAUSES`); the caller raises it."""
+    if cause not in CAUSES:
+        raise KeyError(cause)
+    return MapDataError(message, path=path, offset=offset, cause=cause, hint=hint)

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec, column_names
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import refusal
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.pcd.table import FieldTable
-from shmmap.formats.source_file import FileReader, SourceFile
+from shmmap.formats.source_file import FileReader, SourceFile, refusal
 from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
 
 __all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]

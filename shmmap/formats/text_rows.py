@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.table import FieldTable
-from shmmap.formats.source_file import SourceFile
+from shmmap.formats.source_file import SourceFile, refusal
 
 __all__ = ["NUMBER", "RowParser", "line_ends", "whole_lines"]
 

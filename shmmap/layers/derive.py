@@ -12,7 +12,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import refusal
+from shmmap.formats.source_file import refusal
 from shmmap.layers.build import build_spec
 from shmmap.layers.contract import Box
 from shmmap.layers.points import LAYER

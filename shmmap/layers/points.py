@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import Block, PcdReader
+from shmmap.formats.source_file import refusal
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.writer import SegmentWriter

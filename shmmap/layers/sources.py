@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.source_file import refusal
 from shmmap.layers.contract import Box, PointTable
 from shmmap.layers.points import OutsideBox
 from shmmap.quantities import format_bytes

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of one map at one moment: ids, boxes, stamps, versions, and which of them touch an area."""
+"""The cells of one map at one moment: ids, boxes, stamps, versions, what touches an area; and map origins."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +14,20 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
 from shmmap.origin.catalogue_change import CatalogueChange, compare
-from shmmap.origin.cell_names import CellNames
-from shmmap.origin.map_frame import UNKNOWN_FRAME, MapFrame
-from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.origin.cell_names import CellNames, common_directory
+from shmmap.origin.map_layout import OpenedDirectories
+from shmmap.origin.map_report import UNKNOWN_FRAME, MapFrame
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp, cell_version
 from shmmap.sparse_table import sparse_zeros
 
-__all__ = ["Catalogue", "common_directory"]
+__all__ = [
+    "Catalogue",
+    "MapOrigin",
+    "NoMap",
+]
 
 Indices = NDArray[np.intp]
 
@@ -298,11 +303,38 @@ class Catalogue:
         return self._index.query(area, most), True
 
 
-def common_directory(paths: Sequence[str]) -> str:
-    """Longest directory, with its final "/", that all ``paths`` start with; empty if none."""
-    if not paths:
-        return ""
-    # what the least and the greatest share, all share
-    least, greatest = min(paths), max(paths)
-    shared = next((i for i, (a, b) in enumerate(zip(least, greatest, strict=False)) if a != b), len(least))
-    return least[: least.rfind("/", 0, shared) + 1]
+class MapOrigin(Protocol):
+    """Where the cells of one map come from.
+
+    A cell is read by a loader.  What cannot be reached at present raises `Offline` there: the cell is
+    ``offline`` until it is tried again.
+    """
+
+    @property
+    def path(self) -> str:
+        """The map as a person would name it."""
+
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
+        """Find out which cells there are now.
+
+        ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.  What has not
+        changed since ``before``, an earlier state, may be shared with it.
+
+        Raises
+        ------
+        MapMissing, MapDataError
+            There is no map, or none that can be served.
+        Offline
+            Where it comes from cannot be reached at present.
+        """
+
+
+class NoMap:
+    """An origin without cells: whatever is asked for is not there."""
+
+    path = ""
+
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
+        """An empty catalogue."""
+        del fresh, before
+        return Catalogue.from_cells([])

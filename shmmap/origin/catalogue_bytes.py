@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A catalogue as bytes: in a file (`shmmap.origin.sidecar`) or a pipe (`shmmap.origin.reading_apart`).
+"""A catalogue as bytes: in a file of the cache or a pipe (`shmmap.origin.reading_apart`).
 
 Layout, little-endian::
 
@@ -17,9 +17,15 @@ Layout, little-endian::
 Zero bytes follow the header and each column to a multiple of 8.  The last two are what a catalogue would make
 of names and boxes: to sort them takes longer than to read everything.
 
-A reader takes one column after the other.  Names and boxes that are those of the map's state before are not
+A reader takes one column after the other.  Names and boxes that equal those of the map's state before are not
 kept a second time: of a million cells whose files have changed, a new state takes 24 bytes a cell.  A reader
-that tells the digest of its names and boxes gets the stamps alone, if they are those that it has.
+that gives the digest of its names and boxes gets the stamps alone if they are the same.
+
+The file in the cache directory, the *sidecar*, is only ever a copy: a missing, old or damaged one costs
+time, nothing else.  It names what it was made from (the metadata file and every directory that was
+listed, each with size, mtime, ctime and inode) and counts only while all of that is unchanged.  A
+file rewritten in place changes no directory, so its stamp here may be old: the loader of the cell
+compares it, and `MapDirectory.load(fresh=True)` looks at every file.
 """
 
 from __future__ import annotations
@@ -28,18 +34,30 @@ import math
 import os
 import stat
 import struct
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from typing import IO, Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from xxhash import xxh3_64
+from xxhash import xxh3_64, xxh3_64_hexdigest
 
+from shmmap.errors import MapDataError
+from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.spatial_index import Grid, GridFrame, MadeOfBoxes
 
-__all__ = ["Header", "Source", "read_catalogue", "write_catalogue"]
+__all__ = [
+    "Header",
+    "Source",
+    "default_cache_directory",
+    "load_sidecar",
+    "read_catalogue",
+    "save_sidecar",
+    "sidecar_file",
+    "write_catalogue",
+]
 
 _MAGIC: Final = b"SHMMAPCT"
 _VERSION: Final = 2
@@ -292,3 +310,78 @@ class _Columns:
 def _padding(size: int) -> int:
     """Zero bytes from an end to the next multiple of 8."""
     return -size % 8
+
+
+# File systems stamp files by the kernel's coarse clock, which ticks every 1 to 10 ms: a change right
+# after a scan can leave a directory's stamp as it was.  Younger sources are not trusted to be done.
+_SETTLED_NS = 20_000_000
+
+
+def default_cache_directory() -> str:
+    """``$CACHE_DIRECTORY`` (set by systemd), else ``$XDG_CACHE_HOME/shmmap``, else ``~/.cache/shmmap``."""
+    given = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
+    if given:
+        return given
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(home):
+        home = os.path.expanduser("~/.cache")
+    return os.path.join(home, "shmmap")
+
+
+def sidecar_file(cache_dir: str, key: str) -> str:
+    """Where the catalogue of the map that ``key`` describes is kept."""
+    return os.path.join(cache_dir, xxh3_64_hexdigest(os.fsencode(key)) + ".catalogue")
+
+
+def load_sidecar(path: str, key: str, at: Callable[[str], str] = str) -> Catalogue | None:
+    """Catalogue from the sidecar, or None when there is none, its sources changed, or it is damaged.
+
+    ``at`` says where to find what a source's path names.
+    """
+    try:
+        with open(path, "rb") as file:
+            header, catalogue = read_catalogue(file, os.fstat(file.fileno()).st_size)
+        return catalogue if header.key == key and _unchanged(header.sources, at) else None
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        log.warning("catalogue cache cannot be read", path=path, error=error.strerror)
+        return None
+    except (ValueError, MapDataError, msgspec.MsgspecError) as error:
+        log.warning("damaged catalogue cache ignored", path=path, error=error)
+        return None
+
+
+def _unchanged(sources: Sequence[Source], at: Callable[[str], str]) -> bool:
+    try:
+        return all(Source.of(source.path, os.stat(at(source.path))) == source for source in sources)
+    except OSError:
+        return False
+
+
+def save_sidecar(
+    path: str, key: str, sources: Sequence[Source], catalogue: Catalogue, scanned_ns: int
+) -> bool:
+    """Write the sidecar in one step; False (and a line in the log) if that was not possible.
+
+    ``sources`` were looked at before the scan, which began at ``scanned_ns`` (`time.time_ns`).
+    """
+    newest = max(max(source.mtime_ns, source.ctime_ns) for source in sources)
+    if newest > scanned_ns - _SETTLED_NS:
+        return False
+    try:
+        os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
+        with tempfile.NamedTemporaryFile(
+            dir=os.path.dirname(path), prefix=".catalogue-", delete=False
+        ) as file:
+            try:
+                write_catalogue(file, key, sources, catalogue)
+                file.flush()
+                os.replace(file.name, path)
+            except BaseException:
+                os.unlink(file.name)
+                raise
+    except OSError as error:
+        log.warning("catalogue not cached", path=path, error=error.strerror)
+        return False
+    return True

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import os
 from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 
-__all__ = ["CellNames", "base_names", "order_by_base"]
+__all__ = ["CellNames", "base_names", "common_directory", "order_by_base"]
 
 Names = NDArray[np.bytes_]
 
@@ -128,6 +129,16 @@ def order_by_base(names: Names) -> NDArray[np.int32]:
     if bases is names:
         return np.empty(0, np.int32)
     return np.argsort(bases, kind="stable").astype(np.int32)
+
+
+def common_directory(paths: Sequence[str]) -> str:
+    """Longest directory, with its final "/", that all ``paths`` start with; empty if none."""
+    if not paths:
+        return ""
+    # what the least and the greatest share, all share
+    least, greatest = min(paths), max(paths)
+    shared = next((i for i, (a, b) in enumerate(zip(least, greatest, strict=False)) if a != b), len(least))
+    return least[: least.rfind("/", 0, shared) + 1]
 
 
 def _encoded(wanted: str) -> bytes | None:

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import MapMissing
-from shmmap.origin.catalogue import common_directory
-from shmmap.origin.metadata_entries import list_some
+from shmmap.origin.cell_names import common_directory
+from shmmap.origin.map_layout import is_pcd
+from shmmap.origin.metadata import list_some
 
-__all__ = ["ScannedFiles", "is_pcd", "scan"]
+__all__ = ["ScannedFiles", "scan"]
 
 _BLOCK_FILES = 1 << 15
 
@@ -45,11 +46,6 @@ class ScannedFiles:
     stamps: NDArray[np.int64]
     directories: dict[str, os.stat_result]
     problems: tuple[str, ...]
-
-
-def is_pcd(name: bytes) -> bool:
-    """Whether a file name ends in .pcd, in upper or lower case."""
-    return name[-4:].lower() == b".pcd"
 
 
 @dataclass(slots=True)

@@ -13,20 +13,38 @@ from dataclasses import dataclass
 import numpy as np
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.formats.coordinate_system import degrees_warning
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
-from shmmap.origin.catalogue_bytes import Source
+from shmmap.origin.catalogue_bytes import (
+    Source,
+    default_cache_directory,
+    load_sidecar,
+    save_sidecar,
+    sidecar_file,
+)
 from shmmap.origin.cell_names import base_names
 from shmmap.origin.directory_scan import ScannedFiles, scan
-from shmmap.origin.map_frame import read_map_frame
-from shmmap.origin.map_layout import MapLayout, absolute_path, find_layout
-from shmmap.origin.metadata_entries import MapMetadata, list_some
-from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES, TOO_LARGE, metadata_bytes, parse_metadata
-from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.origin.map_layout import MapLayout, OpenedDirectories, absolute_path, find_layout
+from shmmap.origin.map_report import read_map_frame
+from shmmap.origin.metadata import (
+    MOST_METADATA_BYTES,
+    TOO_LARGE,
+    MapMetadata,
+    list_some,
+    metadata_bytes,
+    parse_metadata,
+)
 from shmmap.origin.reading_apart import read_apart
-from shmmap.origin.sidecar import default_cache_directory, load_sidecar, save_sidecar, sidecar_file
-from shmmap.origin.single_pcd import load_single_pcd
+from shmmap.segment.layout import SourceStamp
 
-__all__ = ["MapDirectory", "open_map"]
+__all__ = [
+    "MAX_SINGLE_PCD_BYTES",
+    "MapDirectory",
+    "is_served_whole",
+    "load_single_pcd",
+    "open_map",
+]
 
 # Smaller maps are scanned in a few milliseconds: a cached catalogue would only be less fresh.
 _CACHED_FROM_CELLS = 2000
@@ -230,3 +248,60 @@ def _joined(
         stamps=stamps,
         problems=problems,
     )
+
+
+MAX_SINGLE_PCD_BYTES = 256 << 20
+"""A larger file is refused: loading all of a map to use a part of it is what dividing avoids."""
+
+# What a compressed file of that size may hold; point clouds shrink to a half or a third.
+_MAX_POINT_BYTES = 4 * MAX_SINGLE_PCD_BYTES
+
+
+def is_served_whole(path: str) -> bool:
+    """Whether the PCD file at ``path`` is small enough to be one cell; also if it is no sound file."""
+    try:
+        if os.stat(path).st_size > MAX_SINGLE_PCD_BYTES:
+            return False
+        with PcdReader(path) as reader:
+            return reader.header.points * reader.header.point_bytes <= _MAX_POINT_BYTES
+    except (OSError, MapDataError):
+        return True  # who loads it says what is wrong
+
+
+def load_single_pcd(path: str) -> Catalogue:
+    """Catalogue of one cell whose box is the bounds of the points in ``path`` (read whole).
+
+    Raises
+    ------
+    MapMissing
+        The file vanished or may not be read.
+    MapDataError
+        The file is larger than 256 MiB (or its points than 1 GiB), is no sound PCD, or has no finite
+        point.
+    """
+    try:
+        status = os.stat(path)
+    except OSError as error:
+        raise MapMissing(f"cannot read {path}: {error.strerror}") from error
+    _refuse_large(path, "file", status.st_size, MAX_SINGLE_PCD_BYTES)
+    with PcdReader(path) as reader:
+        points_bytes = reader.header.points * reader.header.point_bytes
+        _refuse_large(path, "points", points_bytes, _MAX_POINT_BYTES)
+        for _ in reader.blocks():
+            pass
+        lower, upper = reader.bounds
+    if not np.isfinite(lower).all():
+        raise MapDataError("no finite point, so the map has no extent", path=path, cause="no_points")
+    box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
+    problems = [f"{path}: {warning}"] if (warning := degrees_warning(lower, upper)) else []
+    return Catalogue.from_cells([(path, box, SourceStamp.of(status))], problems=problems)
+
+
+def _refuse_large(path: str, what: str, size: int, limit: int) -> None:
+    if size > limit:
+        raise MapDataError(
+            f"{size / 2**20:.0f} MiB of {what}; a map of one file without metadata may have {limit >> 20}",
+            path=path,
+            cause="needs_dividing",
+            hint="divide it into cells: shmmap divide",
+        )

@@ -19,8 +19,8 @@ import msgspec
 from shmmap.errors import InternalError, ShmmapError
 from shmmap.origin.catalogue_bytes import write_catalogue
 from shmmap.origin.map_directory import MapDirectory
-from shmmap.origin.metadata_yaml import MOST_METADATA_BYTES
-from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.origin.map_layout import OpenedDirectories
+from shmmap.origin.metadata import MOST_METADATA_BYTES
 from shmmap.origin.reading_apart import Outcome
 from shmmap.processes.end_with_parent import die_with
 

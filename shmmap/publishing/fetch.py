@@ -16,18 +16,18 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.dividing.progress import Progress
+from shmmap.dividing.settings import Progress
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.origin.map_frame import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
-from shmmap.origin.metadata_text import METADATA_NAME, metadata_text
+from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame
+from shmmap.origin.metadata import METADATA_NAME, metadata_text
 from shmmap.origin.remote.map_versions import Current, read_entry, read_root, read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
-from shmmap.origin.remote.published_index import POINTS, Root, Shard
-from shmmap.origin.remote.published_object import ObjectName, read_bare_header, rows_of, unpack_object
+from shmmap.origin.remote.published_index import Root, Shard
+from shmmap.origin.remote.published_object import POINTS, ObjectName, read_bare_header, rows_of, unpack_object
 from shmmap.origin.remote.store import Store
 
 __all__ = ["FetchedMap", "fetch_map"]

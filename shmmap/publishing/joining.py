@@ -42,11 +42,17 @@ from shmmap.origin.remote.slice_part import (
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
+from shmmap.publishing.new_version import (
+    ASKED_AT_ONCE,
+    absent_objects,
+    begin_version,
+    refuse_if_late,
+    send_object,
+    switch_version,
+)
 from shmmap.publishing.publish import packed_root
 from shmmap.publishing.restore import object_sizes
-from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
 from shmmap.publishing.slicing import BaseVersion, changed_layers, new_objects, read_base
-from shmmap.publishing.switching import begin_version, refuse_if_late, switch_version
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner

@@ -43,11 +43,9 @@ from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import TaskPool
 from shmmap.prepare.work import CellTask
-from shmmap.publishing.known_objects import write_known_objects
-from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent
-from shmmap.publishing.sending import send_object
+from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent, write_known_objects
+from shmmap.publishing.new_version import begin_version, refuse_if_late, send_object, switch_version
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
-from shmmap.publishing.switching import begin_version, refuse_if_late, switch_version
 from shmmap.publishing.worker import TASKS_AHEAD
 
 if TYPE_CHECKING:

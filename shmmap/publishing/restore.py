@@ -22,8 +22,7 @@ from shmmap.origin.remote.published_index import LayerObjects, Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
-from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects
-from shmmap.publishing.switching import begin_version, switch_version
+from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, begin_version, switch_version
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner

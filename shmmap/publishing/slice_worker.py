@@ -26,13 +26,17 @@ from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.published_object import CellIdentity, ObjectName, write_segment
-from shmmap.origin.remote.published_source import stamp_of, unpack_source
+from shmmap.origin.remote.published_object import (
+    CellIdentity,
+    ObjectName,
+    stamp_of,
+    unpack_source,
+    write_segment,
+)
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from shmmap.prepare.work import CellTask, Ready, decode_task, encode
 from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.publishing.known_objects import KnownObjects
-from shmmap.publishing.messages import CellSent, NotSent, decode_slice_settings
+from shmmap.publishing.messages import CellSent, KnownObjects, NotSent, decode_slice_settings
 from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, Sender, make_and_send, run_worker
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp

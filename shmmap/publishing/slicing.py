@@ -33,15 +33,13 @@ from shmmap.origin.remote.published_index import (
     MAX_LAYERS,
     MAX_ROOT_BYTES,
     MAX_SHARD_BYTES,
-    POINTS,
     Root,
     Shard,
     pack_shard,
     unpack_root,
     unpack_shard,
 )
-from shmmap.origin.remote.published_object import STAMP_BYTES, blob_path
-from shmmap.origin.remote.published_source import LayerSource, pack_source
+from shmmap.origin.remote.published_object import POINTS, STAMP_BYTES, LayerSource, blob_path, pack_source
 from shmmap.origin.remote.slice_part import (
     MAX_PART_BYTES,
     MAX_SLICES,
@@ -59,8 +57,8 @@ from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import TaskPool
 from shmmap.prepare.work import CellTask
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings, decode_sent
+from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, send_object
 from shmmap.publishing.restore import object_sizes
-from shmmap.publishing.sending import ASKED_AT_ONCE, absent_objects, send_object
 from shmmap.publishing.shards import CellObjects
 from shmmap.publishing.worker import TASKS_AHEAD
 from shmmap.segment.source import Source

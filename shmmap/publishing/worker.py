@@ -12,20 +12,22 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from typing import Final
 
 import msgspec
 
 from shmmap.errors import InternalError, MapDataError, ShmmapError
+from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.making import make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES, SourceReader
+from shmmap.layers.source_reader import FILES, Files, SourceReader
+from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import MILLIMETRES
@@ -35,29 +37,31 @@ from shmmap.origin.remote.published_object import (
     bare_object,
     pack_object,
     read_bare_header,
+    to_millimetres,
 )
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.work import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import (
     CellSent,
+    KnownObjects,
     LayerSent,
     NotSent,
     decode_settings,
 )
-from shmmap.publishing.rounded_files import RoundedFiles
-from shmmap.publishing.sending import send_object
+from shmmap.publishing.new_version import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
+from shmmap.segment.source import Source
 
 __all__ = [
     "TASKS_AHEAD",
     "CellMaker",
     "LayerRefused",
     "MadeCell",
+    "RoundedFiles",
     "Sender",
     "main",
     "make_and_send",
@@ -300,3 +304,23 @@ def main(arguments: list[str]) -> int:
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))
+
+
+_XYZ: Final = "xyz"
+
+
+class RoundedFiles(Files):
+    """A `shmmap.layers.source_reader.SourceReader`: rows and coordinates as a reader of the map has them."""
+
+    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
+        """Read the file, its points rounded and in their new order."""
+        found = super().read(source, box, None if needs is None else [_XYZ, *(n for n in needs if n != _XYZ)])
+        table = found.points
+        columns = {name: values for name, values in table.columns.items() if needs is None or name in needs}
+        rounded = to_millimetres(table.columns[_XYZ])
+        if rounded is None:
+            return replace(found, points=replace(table, columns=columns))
+        xyz = rounded.xyz
+        ordered = {name: xyz if name == _XYZ else values[rounded.order] for name, values in columns.items()}
+        low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
+        return replace(found, points=replace(table, columns=ordered), z_min=low, z_max=high)

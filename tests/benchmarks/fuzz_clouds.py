@@ -27,9 +27,8 @@ import numpy as np
 import plyfile
 
 from shmmap.errors import MapDataError
-from shmmap.formats.block_reader import open_blocks
-from shmmap.formats.causes import CAUSES
-from shmmap.formats.cloud import read_cloud
+from shmmap.formats.cloud import open_blocks, read_cloud
+from shmmap.formats.source_file import CAUSES
 from tests.support.cloud_bytes import random_ply
 from tests.support.fuzzing import fuzz_in_children, print_outcomes
 

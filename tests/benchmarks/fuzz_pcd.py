@@ -23,9 +23,9 @@ import numpy as np
 import xxhash
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.source_file import CAUSES
 from tests.support.cloud_bytes import CODES, Field, Number, column, lzf_decode, lzf_encode, pcd
 from tests.support.fuzzing import fuzz_in_children, print_outcomes
 

@@ -36,11 +36,16 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.making import make_layer
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.map_versions import read_current, read_root, read_shards
-from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.published_index import POINTS, Root, Shard
-from shmmap.origin.remote.published_object import CellIdentity, ObjectName, write_segment
-from shmmap.origin.remote.published_source import LayerSource, pack_source
-from shmmap.origin.remote.serving_store import ServedFrom
+from shmmap.origin.remote.opened_store import ServedFrom, open_store
+from shmmap.origin.remote.published_index import Root, Shard
+from shmmap.origin.remote.published_object import (
+    POINTS,
+    CellIdentity,
+    LayerSource,
+    ObjectName,
+    pack_source,
+    write_segment,
+)
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from tests.benchmarks.hostile.stage import lift
 from tests.support.command_line import publish

@@ -34,7 +34,7 @@ Meanwhile = Callable[[str, Callable[[], object]], list[object]]
 def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
     """Do something when a publisher reaches a step for the first time; returns its result or error."""
     from shmmap.origin.remote import map_versions
-    from shmmap.publishing import joining, prune, publish, restore, sending
+    from shmmap.publishing import joining, new_version, prune, publish, restore
 
     def arrange(label: str, act: Callable[[], object]) -> list[object]:
         outcome: list[object] = []
@@ -48,7 +48,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
                 except ShmmapError as error:
                     outcome.append(error)
 
-        for module in (map_versions, publish, sending, restore, joining, prune):
+        for module in (map_versions, publish, new_version, restore, joining, prune):
             if hasattr(module, "step"):
                 monkeypatch.setattr(module, "step", step)
         return outcome

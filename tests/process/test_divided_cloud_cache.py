@@ -13,7 +13,7 @@ from shmmap.dividing import served_cloud
 from shmmap.dividing.served_cloud import DividedCloud, find_origin
 from shmmap.errors import CannotWrite, MapDataError, MapMissing
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.origin import single_pcd
+from shmmap.origin import map_directory
 from shmmap.origin.map_directory import MapDirectory
 
 
@@ -35,7 +35,7 @@ def test_which_maps_are_divided_first(tmp_path: Path, monkeypatch: pytest.Monkey
     assert kind(tmp_path) is MapDirectory
     (tmp_path / "bad.pcd").write_bytes(b"nothing like it")
     assert kind(tmp_path / "bad.pcd") is MapDirectory
-    monkeypatch.setattr(single_pcd, "MAX_SINGLE_PCD_BYTES", 500)
+    monkeypatch.setattr(map_directory, "MAX_SINGLE_PCD_BYTES", 500)
     assert kind(small) is DividedCloud
     with pytest.raises(MapMissing):
         kind(tmp_path / "gone.las")
@@ -75,7 +75,7 @@ def test_where_the_daemon_was_started_plays_no_part(tmp_path: Path, monkeypatch:
     (tmp_path / "json.py").write_text("raise SystemExit('somebody else wrote this')")
     monkeypatch.chdir(tmp_path)
     cloud(tmp_path / "a.laz.pcd")
-    monkeypatch.setattr(single_pcd, "MAX_SINGLE_PCD_BYTES", 500)
+    monkeypatch.setattr(map_directory, "MAX_SINGLE_PCD_BYTES", 500)
     catalogue = find_origin("a.laz.pcd", cache_dir="cache").load()
     assert catalogue.id_prefix.startswith(f"{tmp_path}/cache/divided/")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.dividing.progress import NoProgress
+from shmmap.dividing.settings import NoProgress
 from shmmap.errors import BadRequest, InstanceBusy, MapMissing, ShmmapError
 from shmmap.origin.map_directory import open_map
 from tests.process.conftest import Meanwhile

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shmmap.dividing.progress import NoProgress
+from shmmap.dividing.settings import NoProgress
 from shmmap.errors import InstanceBusy, MapDataError, ShmmapError
 from tests.process.conftest import Meanwhile
 from tests.support.command_line import Verbs

@@ -14,9 +14,9 @@ import yaml
 from numpy.typing import NDArray
 
 from shmmap.dividing.divide import divide
-from shmmap.dividing.report import DividedMap
 from shmmap.dividing.settings import DivideSettings
 from shmmap.formats.pcd.writer import write_pcd
+from shmmap.origin.map_report import DividedMap
 from tests.support.divided_map import read_pcd
 
 Columns = dict[str, NDArray[Any]]

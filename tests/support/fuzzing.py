@@ -27,8 +27,8 @@ from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent
 from shmmap.chunks.marks import decode_marks, encode_marks
 from shmmap.daemon.transport.zmtp import Incoming
 from shmmap.errors import BadRequest, MapDataError, ProtocolMismatch, SegmentError
-from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.source_file import CAUSES
 from shmmap.protocol.codec import decode_reply, decode_request, encode, request_number, unpack_versions
 from shmmap.segment.attach import attach
 from shmmap.segment.layout import PAGE_BYTES, TAIL_BYTES

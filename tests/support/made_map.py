@@ -35,16 +35,8 @@ from shmmap.formats.pcd.writer import write_pcd
 from shmmap.layers.points import build_points
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.map_versions import CURRENT, Current, pack_json
-from shmmap.origin.remote.published_index import (
-    EXACT,
-    POINTS,
-    LayerObjects,
-    Root,
-    Shard,
-    pack_root,
-    pack_shard,
-)
-from shmmap.origin.remote.published_object import bare_object, blob_path
+from shmmap.origin.remote.published_index import EXACT, LayerObjects, Root, Shard, pack_root, pack_shard
+from shmmap.origin.remote.published_object import POINTS, bare_object, blob_path
 from shmmap.origin.remote.zstd_frame import LEVEL, pack_frame
 from tests.support.slow_link import LineProcess, line_process
 from tests.support.web_servers import faulty_web

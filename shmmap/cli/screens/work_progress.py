@@ -17,7 +17,7 @@ _SETTLE_S: Final = 1.0  # before that, no rate is worth showing
 
 
 class StageProgress:
-    """Shows stage, part done, rate and time left; a `shmmap.dividing.progress.Progress`.
+    """Shows stage, part done, rate and time left; a `shmmap.dividing.settings.Progress`.
 
     Parameters
     ----------

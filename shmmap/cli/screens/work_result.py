@@ -10,7 +10,7 @@ from shmmap.cli.screens.output import format_bytes, format_duration, print_json,
 
 if TYPE_CHECKING:
     from shmmap.dividing.merge import MergedCloud
-    from shmmap.dividing.report import DividedMap
+    from shmmap.origin.map_report import DividedMap
 
 __all__ = ["fields_text", "print_result"]
 
@@ -26,7 +26,7 @@ def print_result(
     """Print all of ``made`` as JSON, or ``lines`` about it; with the time and the memory it took."""
     from dataclasses import asdict
 
-    from shmmap.dividing.memory import peak_memory_bytes
+    from shmmap.dividing.settings import peak_memory_bytes
 
     peak = peak_memory_bytes()
     if as_json:

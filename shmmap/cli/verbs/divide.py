@@ -12,7 +12,7 @@ from shmmap.cli.screens.work_result import fields_text, print_result
 
 if TYPE_CHECKING:
     from shmmap.dividing.frame import Translation
-    from shmmap.dividing.report import DividedMap
+    from shmmap.origin.map_report import DividedMap
 
 __all__ = ["add_parser", "metres", "run", "translation"]
 

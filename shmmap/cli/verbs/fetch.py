@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
-    from shmmap.origin.sidecar import default_cache_directory
+    from shmmap.origin.catalogue_bytes import default_cache_directory
 
     if args.trust is not None and args.at is not None:
         raise BadRequest("--at does not go with --trust: only the current version is signed")

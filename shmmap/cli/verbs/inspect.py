@@ -180,9 +180,9 @@ def _as_map(path: str, found: list[CloudDescription]) -> dict[str, Any] | None:
     import numpy as np
 
     from shmmap.layers.points import OutsideBox
-    from shmmap.origin.far_cells import far_cells_notes
     from shmmap.origin.map_directory import open_map
     from shmmap.origin.map_layout import absolute_path, find_layout
+    from shmmap.origin.map_report import far_cells_notes
 
     try:
         if find_layout(absolute_path(path), None, ()).metadata is None:
@@ -328,7 +328,7 @@ def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
     """Name and units of a file's system; of its warnings nothing is said twice."""
     if crs is None:
         return []
-    from shmmap.formats.degrees import units_text
+    from shmmap.formats.coordinate_system import units_text
 
     said = "x and y are in degrees" if crs.geographic else units_text(*crs.units)
     unsaid = "" if crs.geographic or crs.plane is not None else " (taken so: the file does not say)"

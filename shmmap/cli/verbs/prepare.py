@@ -126,7 +126,7 @@ def _prepare_map(args: argparse.Namespace) -> int:
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
     from shmmap.layers.spec import canonical_layers
-    from shmmap.origin.sidecar import default_cache_directory
+    from shmmap.origin.catalogue_bytes import default_cache_directory
     from shmmap.prepare.run import prepare_map
 
     if not args.cache_size:
@@ -185,7 +185,7 @@ def _prepare_slice(args: argparse.Namespace) -> int:
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
-    from shmmap.origin.sidecar import default_cache_directory
+    from shmmap.origin.catalogue_bytes import default_cache_directory
 
     store = store_at(args.map_path, args)
     from shmmap.publishing.messages import SliceSettings

@@ -189,7 +189,7 @@ def _publish(args: argparse.Namespace) -> int:
 
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.layers.spec import canonical_layers
-    from shmmap.origin.sidecar import default_cache_directory
+    from shmmap.origin.catalogue_bytes import default_cache_directory
 
     store = store_at(args.url, args)
     from shmmap.publishing.messages import PublishSettings

@@ -127,7 +127,7 @@ def main(arguments: list[str]) -> int:
 
     The first packet has the settings, with zero bytes between them: the directory of segments, the memory
     that a loader may take, bytes; directory and size of the disk cache, empty and 0 where there is none; of
-    a published map what `shmmap.origin.remote.serving_store.ServedFrom` says.
+    a published map what `shmmap.origin.remote.opened_store.ServedFrom` says.
     """
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle

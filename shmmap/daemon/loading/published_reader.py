@@ -19,16 +19,18 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.points import LAYER
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
-from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, kept_objects
+from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
 from shmmap.origin.remote.published_object import (
     CellIdentity,
+    LayerSource,
     ObjectName,
     read_bare_header,
     rows_of,
+    stamp_of,
+    unpack_source,
     write_segment,
 )
-from shmmap.origin.remote.published_source import LayerSource, stamp_of, unpack_source
-from shmmap.origin.remote.serving_store import ServedFrom, kept_objects, open_for_serving
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.source import Source

@@ -34,7 +34,7 @@ from shmmap.layers.source_reader import FILES, Files, SourceReader
 from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
-from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.origin.map_layout import OpenedDirectories
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
@@ -59,7 +59,7 @@ class _Refused(Exception):
 class WorkerSettings:
     """Where segments are made; where finished layers are kept, and how much of them (empty: nowhere).
 
-    ``origin`` are the words of `shmmap.origin.remote.serving_store.ServedFrom`; none: cells are files.
+    ``origin`` are the words of `shmmap.origin.remote.opened_store.ServedFrom`; none: cells are files.
     """
 
     shm_dir: str
@@ -286,7 +286,7 @@ def work(channel: socket.socket, settings: WorkerSettings) -> int:
     reader: SourceReader = FILES
     if settings.origin:
         from shmmap.daemon.loading.published_reader import PublishedReader
-        from shmmap.origin.remote.serving_store import ServedFrom
+        from shmmap.origin.remote.opened_store import ServedFrom
 
         served = ServedFrom.from_words(*settings.origin)
         reader = PublishedReader(served, settings.cache_dir, settings.cache_bytes)

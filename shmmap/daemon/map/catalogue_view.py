@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from shmmap.geometry import Area
 from shmmap.origin.catalogue_change import CatalogueChange
-from shmmap.origin.map_frame import MapFrame
-from shmmap.origin.opened_directories import OpenedDirectories
+from shmmap.origin.map_layout import OpenedDirectories
+from shmmap.origin.map_report import MapFrame
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp
 
@@ -215,7 +215,7 @@ class CatalogueView(Protocol):
 
 
 class ViewOrigin(Protocol):
-    """What views come from (`shmmap.origin.map_origin.MapOrigin` is one)."""
+    """What views come from (`shmmap.origin.catalogue.MapOrigin` is one)."""
 
     @property
     def path(self) -> str:

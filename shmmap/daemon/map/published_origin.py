@@ -39,9 +39,9 @@ from shmmap.origin.remote.map_versions import (
     read_shard_object,
     root_path,
 )
-from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
+from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier, kept_objects
+from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
 from shmmap.origin.remote.published_index import Root, Shard, unpack_root, unpack_shard
-from shmmap.origin.remote.serving_store import ServedFrom, kept_objects, open_for_serving
 from shmmap.origin.remote.store import PROBE, ObjectReader, Store
 from shmmap.origin.remote.taken_version import TakenVersion, TakenVersionFile, judge_offer
 from shmmap.origin.remote.verify_apart import VerifySettings, read_trusted_root, verify_apart

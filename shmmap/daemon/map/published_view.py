@@ -18,15 +18,9 @@ from shmmap.errors import BadRequest
 from shmmap.geometry import Area
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.catalogue_change import CatalogueChange
-from shmmap.origin.map_frame import MapFrame
-from shmmap.origin.remote.published_index import (
-    MILLIMETRES,
-    POINTS,
-    Root,
-    Shard,
-    published_layer_version,
-)
-from shmmap.origin.remote.published_source import LayerSource, pack_source
+from shmmap.origin.map_report import MapFrame
+from shmmap.origin.remote.published_index import MILLIMETRES, Root, Shard, published_layer_version
+from shmmap.origin.remote.published_object import POINTS, LayerSource, pack_source
 from shmmap.origin.spatial_index import touches
 from shmmap.segment.source import Source
 from shmmap.segment.version import Stamp

@@ -10,11 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.formats.causes import refusal
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.header import PcdHeader
 from shmmap.formats.pcd.table import FieldTable, RawBlock
-from shmmap.formats.source_file import SourceFile
+from shmmap.formats.source_file import SourceFile, refusal
 from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
 __all__ = [

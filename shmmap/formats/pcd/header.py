@@ -14,8 +14,8 @@ import re
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
-from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.fields import FieldProblem, PcdField, parse_fields
+from shmmap.formats.source_file import refusal
 
 __all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
 
@@ -85,7 +85,7 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
     Raises
     ------
     MapDataError
-        With a cause from `shmmap.formats.causes`.
+        With a cause from `shmmap.formats.source_file`.
     """
     plain = _PLAIN.match(head)
     if plain is None:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
-from shmmap.formats.causes import refusal
 from shmmap.formats.pcd.fields import AXES, PcdField
+from shmmap.formats.source_file import refusal
 
 __all__ = ["FieldTable", "RawBlock", "coordinate_dtype", "field_table"]
 

@@ -33,7 +33,7 @@ from shmmap.origin.remote.store import ObjectReader
 from shmmap.origin.remote.zstd_frame import DAMAGED
 from shmmap.segment.writer import write_all
 
-__all__ = ["KeptObjects", "ObjectCounts", "ObjectTier"]
+__all__ = ["KeptObjects", "ObjectCounts", "ObjectTier", "kept_objects"]
 
 _BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
 _ABSENT: Final = (errno.ENOENT, errno.ESTALE)
@@ -369,3 +369,19 @@ class KeptObjects:
     def _count(self, more: ObjectCounts) -> None:
         with self._lock:
             self._counts = ObjectCounts(*map(sum, zip(self._counts, more, strict=True)))
+
+
+def kept_objects(
+    store: ObjectReader, cache_dir: str, cache_bytes: int, *, is_index: bool = False, quiet: bool = False
+) -> KeptObjects:
+    """Return what reads objects: from the disk where they are there, else from the store.
+
+    Parameters
+    ----------
+    cache_dir, cache_bytes
+        Where objects are kept, and how much of them, computed layers included; 0: none.
+    is_index, quiet
+        As `KeptObjects` and `ObjectTier` have them.
+    """
+    tier = ObjectTier(cache_dir, limit_bytes=cache_bytes, quiet=quiet) if cache_dir and cache_bytes else None
+    return KeptObjects(store, tier, is_index=is_index)

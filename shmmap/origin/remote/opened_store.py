@@ -1,12 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens the store at a URL."""
+"""Opens the store at a URL: a directory of this machine (`DirectoryStore`), a bucket or a web server."""
 
 from __future__ import annotations
 
-from shmmap.origin.remote.directory_store import DirectoryStore
-from shmmap.origin.remote.store import LONG_RUN, Store, Timeouts, read_url
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from hashlib import sha256
+from typing import Final, NamedTuple
 
-__all__ = ["open_store"]
+from shmmap.errors import MapDataError, MapMissing, Offline
+from shmmap.formats.durable_file import appearing_file, writing_errors
+from shmmap.origin.remote.store import LONG_RUN, SERVING, Listed, Store, Tag, Timeouts, read_url
+from shmmap.origin.remote.zstd_frame import DAMAGED
+
+__all__ = [
+    "DirectoryStore",
+    "ServedFrom",
+    "open_for_serving",
+    "open_store",
+]
 
 
 def open_store(
@@ -42,3 +57,155 @@ def open_store(
     return BucketStore(
         where, timeouts=timeouts, insecure_http=insecure_http, instance_credentials=instance_credentials
     )
+
+
+class ServedFrom(NamedTuple):
+    """Where a published map is served from, as the daemon says it to its loaders; see `open_store`."""
+
+    url: str
+    insecure_http: bool = False
+    instance_credentials: bool = False
+
+    def words(self) -> tuple[str, ...]:
+        """Return it as texts."""
+        return self.url, *("yes" if one else "" for one in self[1:])
+
+    @classmethod
+    def from_words(cls, url: str, *flags: str) -> ServedFrom:
+        """Read what `words` has written."""
+        return cls(url, *map(bool, flags))
+
+
+def open_for_serving(served: ServedFrom, timeouts: Timeouts = SERVING) -> Store:
+    """Return the store, opened for requests that wait.  Errors are those of `open_store`."""
+    return open_store(
+        served.url,
+        timeouts=timeouts,
+        insecure_http=served.insecure_http,
+        instance_credentials=served.instance_credentials,
+    )
+
+
+_LOCK: Final = ".lock"
+_ABSENT: Final = (errno.ENOENT, errno.ENOTDIR)
+
+
+class DirectoryStore:
+    """A `shmmap.origin.remote.store.Store` of files below ``root``, an absolute path.
+
+    A file appears whole and flushed to the disk.  What is replaced on a condition is so under a lock.
+    """
+
+    read_only = ""
+
+    def __init__(self, root: str) -> None:
+        self._root = root
+        self.url = root
+
+    def _path(self, path: str) -> str:
+        return os.path.join(self._root, path)
+
+    def _read(self, path: str, max_bytes: int, *, exact: bool = False) -> memoryview:
+        full = self._path(path)
+        try:
+            # never waits, as opening a FIFO would
+            fd = os.open(full, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+            with open(fd, "rb") as file:
+                size = os.fstat(fd).st_size
+                data = file.read(max_bytes + 1) if size <= max_bytes else b""
+        except OSError as error:
+            if error.errno in _ABSENT:
+                raise MapMissing(f"{full} is not there") from None
+            if error.errno == errno.EISDIR:
+                raise MapDataError("it is a directory", path=full, cause=DAMAGED) from None
+            raise Offline(f"{full}: {error.strerror}", hint="may this user read it?") from None
+        size = max(size, len(data))
+        if size > max_bytes or (exact and size != max_bytes):
+            limit = f"not {max_bytes:,}" if exact else f"at most {max_bytes:,} are read"
+            raise MapDataError(f"it has {size:,} bytes, {limit}", path=full, cause=DAMAGED)
+        return memoryview(data)
+
+    def get(self, path: str, max_bytes: int) -> memoryview:
+        """Return a whole file."""
+        return self._read(path, max_bytes)
+
+    def get_exactly(self, path: str, nbytes: int) -> memoryview:
+        """Return a file of exactly ``nbytes`` bytes."""
+        return self._read(path, nbytes, exact=True)
+
+    def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
+        """Return a whole file, and the hash of it."""
+        data = self._read(path, max_bytes)
+        return data, {"sha256": sha256(data).digest(), "size": len(data)}
+
+    def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
+        """Return a whole file and its hash, unless that is the one of ``tag``."""
+        found = self.get_tagged(path, max_bytes)
+        return None if found[1] == tag else found
+
+    def head(self, path: str) -> Listed | None:
+        """Return a file's size and age."""
+        try:
+            status = os.stat(self._path(path))
+        except OSError as error:
+            if error.errno in _ABSENT:
+                return None
+            raise Offline(f"{self._path(path)}: {error.strerror}") from None
+        return Listed(path, status.st_size, status.st_mtime)
+
+    def list(self, prefix: str) -> Iterator[Listed]:
+        """All files below a folder, those half written too: their names begin with a dot."""
+        for folder, _, names in os.walk(self._path(prefix)):
+            below = os.path.relpath(folder, self._root)
+            for name in names:
+                path = f"{below}/{name}"
+                with suppress(Offline):
+                    if (found := self.head(path)) is not None:
+                        yield found
+
+    def put(self, path: str, data: bytes) -> None:
+        """Write a file."""
+        self._write(path, data, replace=True)
+
+    def put_new(self, path: str, data: bytes) -> bool:
+        """Write a file that is not there yet."""
+        return self._write(path, data, replace=False)
+
+    def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
+        """Replace a file whose hash is still that of ``tag``."""
+        with self._locked():
+            try:
+                _, now = self.get_tagged(path, tag["size"])
+            except (MapMissing, MapDataError):
+                return False
+            if now != tag:
+                return False
+            self._write(path, data, replace=True)
+        return True
+
+    def delete(self, path: str) -> None:
+        """Remove a file."""
+        with writing_errors(self._path(path)), suppress(FileNotFoundError):
+            os.unlink(self._path(path))
+
+    def _write(self, path: str, data: bytes, *, replace: bool) -> bool:
+        full = self._path(path)
+        with writing_errors(full):
+            os.makedirs(os.path.dirname(full), exist_ok=True)
+            try:
+                with appearing_file(full, replace=replace) as file:
+                    file.write(data)
+            except FileExistsError:
+                return False
+        return True
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        path = self._path(_LOCK)
+        with writing_errors(path):
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(fd)

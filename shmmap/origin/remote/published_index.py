@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from xxhash import xxh3_64_intdigest
 
 from shmmap.errors import MapDataError
-from shmmap.origin.remote.published_object import MAX_OBJECT_BYTES, STAMP_BYTES, CellIdentity, ObjectName
+from shmmap.origin.remote.published_object import (
+    MAX_OBJECT_BYTES,
+    POINTS,
+    STAMP_BYTES,
+    CellIdentity,
+    ObjectName,
+)
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.version import cell_version
 
@@ -32,7 +38,6 @@ __all__ = [
     "MAX_ROOT_BYTES",
     "MAX_SHARD_BYTES",
     "MILLIMETRES",
-    "POINTS",
     "Damage",
     "LayerObjects",
     "Root",
@@ -55,7 +60,6 @@ __all__ = [
 
 MAX_ROOT_BYTES: Final = 16 << 20
 MAX_SHARD_BYTES: Final = 4 << 20
-POINTS: Final = "points"
 FORMAT: Final = "shmmap published map"
 READER: Final = 1
 """The version of this reader: a root that needs a greater one is refused."""
@@ -142,7 +146,7 @@ class Root:
     id_prefix
         What all ids begin with; begins and ends with ``/``.
     crs, origin, unit_m
-        Where the frame lies, see `shmmap.origin.map_frame.MapFrame`.
+        Where the frame lies, see `shmmap.origin.map_report.MapFrame`.
     encoding
         One of `ENCODINGS`.
     bounds

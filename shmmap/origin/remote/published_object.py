@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from hashlib import sha256
 from typing import Any, Final, NamedTuple
 
@@ -21,7 +22,6 @@ import xxhash
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError, SegmentCorrupt
-from shmmap.origin.remote.millimetres import MillimetrePoints, from_millimetres, to_millimetres
 from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
 from shmmap.segment.header import pack_header, unpack_header
 from shmmap.segment.layout import (
@@ -33,22 +33,34 @@ from shmmap.segment.layout import (
     SourceStamp,
     header_size,
 )
+from shmmap.segment.source import Source
+from shmmap.segment.version import Stamp
 from shmmap.segment.writer import write_all
 
 __all__ = [
     "MAX_OBJECT_BYTES",
+    "POINTS",
     "STAMP_BYTES",
     "CellIdentity",
+    "LayerSource",
+    "MillimetrePoints",
     "ObjectName",
     "bare_object",
     "blob_path",
+    "from_millimetres",
     "pack_object",
+    "pack_source",
     "read_bare_header",
     "rows_of",
+    "stamp_of",
+    "to_millimetres",
     "unpack_object",
+    "unpack_source",
     "write_segment",
 ]
 
+POINTS: Final = "points"
+"""Spec of the layer that each published map has."""
 MAX_OBJECT_BYTES: Final = 1 << 30
 """Most bytes of an unpacked object: both forms of it are in a loader's memory."""
 STAMP_BYTES: Final = 24
@@ -120,7 +132,7 @@ def bare_object(segment: memoryview, *, millimetres: bool = False) -> bytearray:
     Parameters
     ----------
     millimetres
-        Points are rounded, see `shmmap.origin.remote.millimetres`; those that cannot be stay exact.
+        Points are rounded, see `shmmap.origin.remote.published_object`; those that cannot be stay exact.
 
     Raises
     ------
@@ -404,3 +416,115 @@ def _row_blocks(unpacked: bytes | bytearray | memoryview, column: Column) -> Ite
         for plane in range(count):
             rows[:, plane] = block[plane]
         yield rows
+
+
+STEP_M: Final = 0.001
+MAX_COUNT: Final = 0xFFFF
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MillimetrePoints:
+    """Points of one cell.
+
+    Attributes
+    ----------
+    origin
+        (3,) float64, metres, in the frame of the points.
+    counts
+        (N, 3) uint16, in Morton order.
+    order
+        (N,) int64: the row that each of these was.
+    """
+
+    origin: NDArray[np.float64]
+    counts: NDArray[np.uint16]
+    order: NDArray[np.int64]
+
+    @property
+    def xyz(self) -> NDArray[np.float32]:
+        """(N, 3) float32, metres: what a reader makes of them."""
+        return from_millimetres(self.counts, self.origin)
+
+
+def to_millimetres(xyz: NDArray[Any]) -> MillimetrePoints | None:
+    """Round points to millimetres.
+
+    Parameters
+    ----------
+    xyz
+        (N, 3) metres.
+
+    Returns
+    -------
+    None where they have to stay as they are: they are no float32, none, not all finite, or more than 65.535 m
+    apart along an axis.
+    """
+    if xyz.dtype != np.float32 or xyz.ndim != 2 or xyz.shape[1] != 3 or not len(xyz):
+        return None
+    axes = np.ascontiguousarray(xyz.T).astype(np.float64)
+    low, high = axes.min(axis=1), axes.max(axis=1)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    origin = np.floor(low * 1000.0) / 1000.0
+    axes -= origin[:, None]
+    axes *= 1000.0
+    np.rint(axes, out=axes)
+    if axes.max() > MAX_COUNT:
+        return None
+    numbers = np.maximum(axes, 0.0, out=axes).astype(np.uint16)
+    key = np.zeros(len(xyz), np.uint64)
+    for axis, spread in zip(numbers, _spread(), strict=True):
+        key |= spread[axis]
+    order = np.argsort(key, kind="stable")
+    return MillimetrePoints(origin, np.ascontiguousarray(numbers[:, order].T), order)
+
+
+def from_millimetres(counts: NDArray[np.uint16], origin: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return (N, 3) float32 metres of (N, 3) counts of millimetres from an origin (3,)."""
+    xyz = np.empty(counts.shape, np.float32)
+    for axis in range(3):
+        xyz[:, axis] = counts[:, axis] * STEP_M + origin[axis]
+    return xyz
+
+
+@cache
+def _spread() -> tuple[NDArray[np.uint64], ...]:
+    """For each axis, the bits of each number of 16 bits where the key has them: every third bit."""
+    spread = np.arange(MAX_COUNT + 1, dtype=np.uint64)
+    for shift, mask in ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249)):
+        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
+    return tuple(spread << np.uint64(axis) for axis in range(3))
+
+
+class LayerSource(NamedTuple):
+    """The object of a layer, as `ObjectName` has it, and the version of what has built it."""
+
+    sha256: bytes
+    size: int
+    raw: int
+    content: bytes
+    builder_version: int
+
+    @property
+    def name(self) -> ObjectName:
+        """The object."""
+        return ObjectName(*self[:4])
+
+
+_DECODER = msgspec.msgpack.Decoder(dict[str, LayerSource])
+
+
+def pack_source(cell_id: str, layers: Mapping[str, LayerSource]) -> Source:
+    """Return the source of a cell: its published layers by spec."""
+    return Source(cell_id, msgspec.msgpack.encode(layers))
+
+
+@lru_cache(maxsize=256)
+def unpack_source(source: Source) -> Mapping[str, LayerSource]:
+    """Return the published layers of a cell."""
+    return _DECODER.decode(source.words)
+
+
+def stamp_of(source: Source) -> Stamp:
+    """Return the stamp of a cell, which its points' content says."""
+    return unpack_source(source)[POINTS].content[:STAMP_BYTES]

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.origin.remote.published_index import (
-    POINTS,
     Damage,
     Root,
     check_layers,
@@ -31,6 +30,7 @@ from shmmap.origin.remote.published_index import (
     pack_column,
     unpack_column,
 )
+from shmmap.origin.remote.published_object import POINTS
 from shmmap.origin.remote.zstd_frame import pack_frame, unpack_frame
 
 __all__ = [

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats import cloud
 from shmmap.origin.map_directory import open_map
-from shmmap.origin.map_frame import read_report
+from shmmap.origin.map_report import read_report
 from tests.support.clouds import cloud_file, divide_quickly, expected_rows, map_rows, rows_of, xyzircaedt
 from tests.support.divided_map import read_pcd
 from tests.support.skips import open3d_or_skip

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from shmmap.dividing.divide import divide
-from shmmap.dividing.report import DividedMap
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError
 from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.las_reader import LasReader
+from shmmap.origin.map_report import DividedMap
 from tests.support.cloud_bytes import write_las
 from tests.support.clouds import map_rows, xyzircaedt
 from tests.support.skips import open3d_or_skip

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.origin.map_frame import read_report
+from shmmap.origin.map_report import read_report
 from tests.support.clouds import cloud_file, divide_quickly, expected_rows, map_rows, rows_of, xyzircaedt
 
 

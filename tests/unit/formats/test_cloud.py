@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from shmmap.errors import MapDataError, ShmmapError
-from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_cloud, read_pcd
+from shmmap.formats.source_file import CAUSES
 from shmmap.layers.selections import SYSTEM_PACKAGES, load_open3d
 from tests.support.cloud_bytes import Field, column, pcd
 

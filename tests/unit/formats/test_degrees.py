@@ -13,9 +13,9 @@ import pytest
 from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.formats.cloud import describe
-from shmmap.formats.degrees import GEOGRAPHIC_SYSTEM, degrees_warning
+from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.origin.single_pcd import load_single_pcd
+from shmmap.origin.map_directory import load_single_pcd
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_pcd
+from shmmap.formats.source_file import CAUSES
 
 WORDS = {
     "13_duplicate_field_names": "intensity",

@@ -18,7 +18,7 @@ from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.coordinate_system import FEET, METRE, geokey_system, wkt_system
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_directory import open_map
-from shmmap.origin.map_frame import MapFrame, read_map_frame
+from shmmap.origin.map_report import MapFrame, read_map_frame
 
 FT, US_FT = FEET["ft"].metres, FEET["us-ft"].metres
 GEOGCS = 'GEOGCS["NAD83",DATUM["D",SPHEROID["GRS 1980",6378137,298.257]],UNIT["degree",0.0174532925199433]]'

@@ -17,9 +17,9 @@ import pytest
 from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import CAUSES
 from shmmap.formats.cloud import describe, read_cloud
 from shmmap.formats.ply_reader import PlyReader
+from shmmap.formats.source_file import CAUSES
 from tests.support.cloud_bytes import random_ply
 
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")

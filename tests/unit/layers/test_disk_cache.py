@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.formats.causes import refusal
+from shmmap.formats.source_file import refusal
 from shmmap.layers import source_reader, sources
 from shmmap.layers.contract import Box
 from shmmap.layers.derive import CellJob, Neighbour

@@ -11,7 +11,7 @@ import pytest
 from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.origin.far_cells import far_cells_notes
+from shmmap.origin.map_report import far_cells_notes
 
 
 def notes(corners: list[tuple[float, float]], size: float = 20.0, points: int = 100) -> list[str]:

@@ -13,7 +13,7 @@ from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_directory import open_map
-from shmmap.origin.map_frame import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame, read_map_frame
+from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame, read_map_frame
 
 
 @pytest.fixture

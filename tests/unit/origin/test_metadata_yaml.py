@@ -13,9 +13,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError, MapMissing
-from shmmap.origin import metadata_yaml
-from shmmap.origin.metadata_entries import EntryCollector, MapMetadata
-from shmmap.origin.metadata_yaml import collect_lines, metadata_bytes, parse_metadata
+from shmmap.origin import metadata as metadata_module
+from shmmap.origin.metadata import EntryCollector, MapMetadata, collect_lines, metadata_bytes, parse_metadata
 
 HEAD = "x_resolution: 20.0\ny_resolution: 20.0\n"
 
@@ -212,14 +211,14 @@ def test_a_problem_is_short_however_long_the_key() -> None:
 def test_a_long_line_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """To look for a line that can be read at each of its places takes time by the square of its length."""
     looked: list[int] = []
-    pattern = metadata_yaml._LINE
+    pattern = metadata_module._LINE
 
     class Counted:
         def match(self, block: bytes, position: int) -> re.Match[bytes] | None:
             looked.append(position)
             return pattern.match(block, position)
 
-    monkeypatch.setattr(metadata_yaml, "_LINE", Counted())
+    monkeypatch.setattr(metadata_module, "_LINE", Counted())
     assert not is_quick(HEAD + "n" * 10_000)
     assert looked == [0, 19, 38]
 

@@ -16,9 +16,9 @@ import pytest
 
 from shmmap.origin import map_directory
 from shmmap.origin.catalogue import Catalogue
+from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.catalogue_change import compare
 from shmmap.origin.map_directory import MapDirectory, open_map
-from shmmap.origin.sidecar import default_cache_directory
 
 CELLS = 40
 
@@ -185,7 +185,7 @@ def test_nothing_half_written_stays_behind(origin: MapDirectory, monkeypatch: py
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("shmmap.origin.sidecar.os.replace", refuse)
+    monkeypatch.setattr("shmmap.origin.catalogue_bytes.os.replace", refuse)
     assert len(origin.load()) == CELLS
     assert os.listdir(origin.cache_dir) == []
 

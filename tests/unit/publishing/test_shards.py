@@ -15,8 +15,7 @@ from shmmap.origin.catalogue import Catalogue
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.origin.remote.published_index import LayerObjects, pack_shard, shard_keys  # noqa: E402
-from shmmap.publishing.known_objects import KnownObjects, write_known_objects  # noqa: E402
-from shmmap.publishing.messages import CellSent, LayerSent  # noqa: E402
+from shmmap.publishing.messages import CellSent, KnownObjects, LayerSent, write_known_objects  # noqa: E402
 from shmmap.publishing.shards import (  # noqa: E402
     CellObjects,
     check_names,

@@ -15,13 +15,13 @@ from tests.support.divided_map import DividedMap, make_map
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
-from shmmap.dividing.progress import NoProgress
+from shmmap.dividing.settings import NoProgress
 from shmmap.layers.source_reader import FILES
 from shmmap.origin.map_directory import open_map
 from shmmap.origin.remote.map_versions import read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects
 from shmmap.origin.remote.opened_store import open_store
-from shmmap.origin.remote.published_source import LayerSource, pack_source
+from shmmap.origin.remote.published_object import LayerSource, pack_source
 from shmmap.origin.remote.store import Store
 from shmmap.publishing.joining import numbers_text
 from shmmap.publishing.messages import PublishSettings
@@ -116,7 +116,7 @@ def test_what_is_held_is_bounded_and_what_was_used_last_stays(store: Store) -> N
 
 def test_points_that_are_damaged_or_gone_are_no_points(store: Store, tmp_path: Path) -> None:
     (source, box, _), (other, other_box, _), *_ = cells_of(store).values()
-    from shmmap.origin.remote.published_source import unpack_source
+    from shmmap.origin.remote.published_object import unpack_source
 
     path = tmp_path / "store" / unpack_source(source)["points"].name.path
     whole = path.read_bytes()

@@ -20,7 +20,7 @@ from tests.support.divided_map import DividedMap, make_map
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.publishing import worker
-from shmmap.publishing.known_objects import KnownObjects
+from shmmap.publishing.messages import KnownObjects
 from shmmap.publishing.worker import CellMaker, LayerRefused
 from shmmap.segment.source import Source
 

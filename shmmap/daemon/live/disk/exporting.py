@@ -29,7 +29,7 @@ from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import BadRequest
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header
-from shmmap.formats.ply_writer import ply_header
+from shmmap.formats.ply_header import ply_header
 
 __all__ = ["ExportedVoxels", "Format", "Voxels", "export"]
 

@@ -18,8 +18,7 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.object_keeper import KeptCell, ObjectKeeper
 from shmmap.daemon.records import Key
 from shmmap.layers.points import LAYER
-from shmmap.origin.remote.published_object import ObjectName
-from shmmap.origin.remote.published_source import unpack_source
+from shmmap.origin.remote.published_object import ObjectName, unpack_source
 
 __all__ = ["DiskAhead"]
 

@@ -36,8 +36,7 @@ from shmmap.origin.remote.published_index import (
     published_layer_version,
     unpack_root,
 )
-from shmmap.origin.remote.published_object import blob_path
-from shmmap.origin.remote.published_source import stamp_of, unpack_source
+from shmmap.origin.remote.published_object import blob_path, stamp_of, unpack_source
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.publishing.messages import CellSent, LayerSent

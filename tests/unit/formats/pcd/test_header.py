@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import CAUSES, refusal
 from shmmap.formats.pcd import header as pcd_header
 from shmmap.formats.pcd.header import PcdHeader, parse_header
+from shmmap.formats.source_file import CAUSES, refusal
 from tests.support.cloud_bytes import Field, column, header, pcd
 
 XYZ = [column(name, "F4", [1.0, 2.0]) for name in "xyz"]

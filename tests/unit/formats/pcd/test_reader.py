@@ -18,8 +18,8 @@ import xxhash
 from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
-from shmmap.formats.causes import CAUSES
 from shmmap.formats.pcd.reader import PcdReader
+from shmmap.formats.source_file import CAUSES
 from tests.support.cloud_bytes import CODES, Field, Number, body, column, header, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")

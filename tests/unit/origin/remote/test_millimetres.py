@@ -24,13 +24,13 @@ from tests.support.segments import write_segment as segment_of
 
 zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
 
-from shmmap.origin.remote.millimetres import to_millimetres  # noqa: E402
 from shmmap.origin.remote.published_object import (  # noqa: E402
     CellIdentity,
     bare_object,
     pack_object,
     read_bare_header,
     rows_of,
+    to_millimetres,
     unpack_object,
     write_segment,
 )

@@ -20,8 +20,8 @@ import pytest
 
 from shmmap.disk_budget import DiskBudget
 from shmmap.errors import MapDataError, MapMissing, Offline
-from shmmap.origin.remote.directory_store import DirectoryStore
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
+from shmmap.origin.remote.opened_store import DirectoryStore
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.statistics.counters import OBJECTS_READ
 from tests.support.map_stores import wait_for_trimming

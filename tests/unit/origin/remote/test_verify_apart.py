@@ -85,8 +85,8 @@ def test_an_offer_is_judged_by_the_latest_time_seen(tmp_path: Path) -> None:
     from tuf.api.metadata import Metadata, Timestamp
 
     import shmmap.publishing.signing as signing
-    from shmmap.origin.remote.directory_store import DirectoryStore
     from shmmap.origin.remote.map_versions import Current
+    from shmmap.origin.remote.opened_store import DirectoryStore
     from shmmap.origin.remote.verify_version import verify_version
 
     store = DirectoryStore(str(tmp_path / "store"))

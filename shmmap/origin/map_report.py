@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report beside a divided map, ``shmmap_divide.json``: its frame, what it was made of, notes.
+
+`shmmap.dividing` writes it; other tools' maps have none, and their frame is what it is.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shmmap.errors import MapDataError
+
+__all__ = [
+    "LINK_NAME",
+    "REPORT_HEAD",
+    "REPORT_NAME",
+    "UNKNOWN_FRAME",
+    "DividedMap",
+    "MapFrame",
+    "_frame_of",
+    "far_cells_notes",
+    "read_map_frame",
+    "read_report",
+    "write_report",
+]
+
+REPORT_NAME: Final = "shmmap_divide.json"
+REPORT_HEAD: Final = {"format": "shmmap divided map", "version": 1}
+_MAX_BYTES: Final = 64 << 20  # it names each input file
+
+
+class MapFrame(msgspec.Struct, frozen=True):
+    """How to come back from the map frame to the coordinates of the files that the map was made of.
+
+    ``(point + origin) / unit_m`` is the point in the coordinate system ``crs``.
+
+    Attributes
+    ----------
+    origin
+        x, y, z of the map frame's origin in the frame of the inputs, metres, float64: what `divide`
+        subtracted from each point.
+    crs
+        Name of the inputs' coordinate system with its EPSG code where they say, such as
+        ``WGS 84 / UTM zone 32N (EPSG:32632)``; empty where they do not.
+    unit_m
+        Metres per unit of that system, in the plane and in height: (1, 1) unless `divide` converted feet.
+    """
+
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    crs: str = ""
+    unit_m: tuple[float, float] = (1.0, 1.0)
+
+
+UNKNOWN_FRAME: Final = MapFrame()
+"""Of a map beside which nothing is written: the frame is the files' own."""
+
+
+def _frame_of(report: dict[str, Any]) -> MapFrame:
+    """Return the frame that a report speaks of; what it lacks or garbles counts as not said."""
+    try:
+        frame = msgspec.convert(
+            {key: report[key] for key in ("origin", "crs", "unit_m") if key in report}, MapFrame
+        )
+    except msgspec.ValidationError:
+        return UNKNOWN_FRAME
+    if not all(map(math.isfinite, (*frame.origin, *frame.unit_m))) or min(frame.unit_m) <= 0:
+        return UNKNOWN_FRAME
+    return frame
+
+
+def read_map_frame(directory: str | os.PathLike[str]) -> MapFrame:
+    """Return where the frame of the map whose metadata is in ``directory`` lies.
+
+    Never raises: a map without a report, or with one that cannot be read, is a map.
+    """
+    try:
+        report = read_report(directory)
+    except MapDataError:
+        report = None
+    return UNKNOWN_FRAME if report is None else _frame_of(report)
+
+
+def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Return what `divide` left about a map, or None for a map made by others.
+
+    Raises
+    ------
+    MapDataError
+        It cannot be read, or another version of shmmap has written it.
+    """
+    path = os.path.join(map_dir, REPORT_NAME)
+    try:
+        with open(path, "rb") as file:
+            data = file.read(_MAX_BYTES + 1)
+        report = json.loads(data) if len(data) <= _MAX_BYTES else None
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise MapDataError(f"cannot be read: {error.strerror}", path=path) from error
+    except (ValueError, RecursionError) as error:
+        raise MapDataError(f"cannot be read: {error}", path=path) from error
+    if not isinstance(report, dict) or any(report.get(key) != value for key, value in REPORT_HEAD.items()):
+        raise MapDataError("written by another version of shmmap", path=path)
+    return report
+
+
+LINK_NAME: Final = "map"
+"""Beside the divisions of a served cloud, this leads to the one in service."""
+
+
+@dataclass(frozen=True, slots=True)
+class DividedMap:
+    """What was made; also kept in the map as ``shmmap_divide.json``.
+
+    Attributes
+    ----------
+    path
+        The map directory.
+    cells, points
+        Files, and points in them.
+    points_read, dropped
+        Points in the inputs, and how many were not finite.
+    origin
+        Where the map's frame lies in that of the inputs: add it to a point to come back, metres.
+    crs, unit_m
+        The inputs' coordinate system and unit, as in `shmmap.origin.map_report.MapFrame`.
+    cell_size, leaf, encoding
+        As in `DivideSettings`.
+    fields
+        Names and dtypes of what each point has.
+    bounds
+        Least and greatest coordinates of the points that were divided, in the frame of the map.
+    sources
+        The inputs: path, bytes, mtime_ns, points.
+    notes
+        What a person should know.
+    resumed_points
+        Points that an earlier, killed run had divided.
+    """
+
+    path: str
+    cells: int
+    points: int
+    points_read: int
+    dropped: int
+    origin: tuple[float, float, float]
+    cell_size: float
+    leaf: float
+    encoding: str
+    fields: list[tuple[str, str]]
+    bounds: list[list[float]] | None
+    sources: list[dict[str, Any]]
+    notes: list[str] = field(default_factory=list)
+    resumed_points: int = 0
+    crs: str = ""
+    unit_m: tuple[float, float] = (1.0, 1.0)
+
+
+def write_report(directory: str | os.PathLike[str], report: DividedMap) -> None:
+    """Write ``report`` into a map's directory."""
+    content = {**REPORT_HEAD, **asdict(report)}
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"  # ASCII: a path may be no Unicode
+    Path(directory, REPORT_NAME).write_text(text, encoding="ascii")
+
+
+_APART_M: Final = 200.0  # cells this far apart, and ten times their size, are not one map's
+_APART_CELLS: Final = 10
+_FEW: Final = 3  # cells, or one in a hundred of all: more are another part of the map
+_NAMED: Final = 3
+
+
+def far_cells_notes(
+    corners: NDArray[np.float64], size: float, names: Sequence[str], points: Sequence[int]
+) -> list[str]:
+    """Name the few cells that lie far from all others, one note for each group of them.
+
+    Parameters
+    ----------
+    corners
+        (N, 2) lower left corners, metres.
+    size
+        Side of a cell, metres.
+    names, points
+        Of each cell.
+    """
+    if len(corners) < 2 or not np.isfinite(corners).all():
+        return []
+    apart = max(_APART_M, _APART_CELLS * size)
+    squares: dict[tuple[int, int], list[int]] = {}
+    for index, (x, y) in enumerate(np.floor(corners / apart).astype(np.int64).tolist()):
+        squares.setdefault((x, y), []).append(index)
+    groups = sorted(_groups(squares), key=lambda group: (len(group), sum(points[i] for i in group)))
+    main = corners[groups.pop()]
+    notes = []
+    for group in groups:
+        if len(group) > max(_FEW, len(corners) // 100):
+            continue
+        own = corners[group]
+        gaps = np.maximum(own.min(axis=0) - main.max(axis=0), main.min(axis=0) - own.max(axis=0))
+        gap = float(np.hypot(*np.maximum(gaps - size, 0.0)))
+        if gap >= apart:
+            shown = ", ".join(names[i] for i in group[:_NAMED]) + (", ..." if len(group) > _NAMED else "")
+            cells = "1 cell lies" if len(group) == 1 else f"{len(group)} cells lie"
+            count = sum(points[i] for i in group)
+            notes.append(
+                f"{cells} {gap / 1000:.3g} km from all others, with {count} point{'' if count == 1 else 's'}"
+                f" (stray ones?): {shown}"
+            )
+    return notes
+
+
+def _groups(squares: dict[tuple[int, int], list[int]]) -> list[list[int]]:
+    """Cells by whether their squares touch."""
+    groups: list[list[int]] = []
+    left = dict(squares)
+    while left:
+        group: list[int] = []
+        waiting = [next(iter(left))]
+        while waiting:
+            x, y = waiting.pop()
+            found = left.pop((x, y), None)
+            if found is not None:
+                group += found
+                waiting += [(x + i, y + j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (x + i, y + j) in left]
+        groups.append(group)
+    return groups

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What publishing, joining and restoring share: objects are sent or looked for, a version becomes current.
+
+The objects of the version are sent or checked between `begin_version` and `switch_version`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterable
+from concurrent.futures import Executor
+from typing import TYPE_CHECKING, Final
+
+from shmmap.errors import CannotWrite
+from shmmap.failpoints import step
+from shmmap.origin.remote.map_versions import CurrentState, Entry, add_version, read_current, refuse_if_signed
+from shmmap.origin.remote.published_object import blob_path
+from shmmap.origin.remote.store import Store
+
+if TYPE_CHECKING:
+    from shmmap.publishing.signing import MapSigner
+
+__all__ = [
+    "ASKED_AT_ONCE",
+    "absent_objects",
+    "begin_version",
+    "refuse_if_late",
+    "send_object",
+    "switch_version",
+]
+
+ASKED_AT_ONCE: Final = 32
+_YOUNG_S: Final = 86_400.0
+"""An object that no version has is used again if it is younger: pruning spares it for much longer."""
+
+
+def send_object(store: Store, path: str, frame: bytes, *, look: bool = True) -> bool:
+    """Have an object in the store; returns whether it was sent.
+
+    Parameters
+    ----------
+    look
+        False: it cannot be there.
+    """
+    if look:
+        found = store.head(path)
+        if found is not None and found.size == len(frame) and abs(time.time() - found.modified_s) < _YOUNG_S:
+            return False
+    step("publish.send")
+    store.put(path, frame)
+    return True
+
+
+def absent_objects(
+    store: Store, objects: Iterable[tuple[bytes, int]], threads: Executor, *, since_s: float = 0.0
+) -> list[bytes]:
+    """Return which objects, by hash and size, are not in the store.
+
+    Parameters
+    ----------
+    since_s
+        Unix time: objects written before it count as absent, too.
+    """
+
+    def is_absent(named: tuple[bytes, int]) -> bool:
+        found = store.head(blob_path(named[0]))
+        return found is None or found.size != named[1] or found.modified_s < since_s
+
+    asked = list(objects)
+    absent = threads.map(is_absent, asked)
+    return [digest for digest, _ in itertools.compress(asked, absent)]
+
+
+_LONGEST_S: Final = 86_400.0  # objects that a run reuses must not become as old as those that pruning removes
+
+
+def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentState:
+    """Return the current version, which the new one replaces.
+
+    Parameters
+    ----------
+    signer
+        Signs the new version; None for a map that is not signed.
+    verb
+        What to do with the keys, for the hint: ``"publish it"``.
+
+    Raises
+    ------
+    BadRequest
+        The map is signed and there is no signer.
+    """
+    if signer is not None:
+        return signer.begin()
+    refuse_if_signed(store, f"{verb} with the keys that signed it: --sign KEYDIR")
+    return read_current(store)
+
+
+def refuse_if_late(began_s: float, what: str, hint: str) -> None:
+    """Raise `CannotWrite` if a run that began then, by `time.monotonic`, took longer than a day."""
+    if time.monotonic() - began_s > _LONGEST_S:
+        raise CannotWrite(f"{what} took longer than a day: the version is not made current", hint=hint)
+
+
+def switch_version(store: Store, entry: Entry, seen: CurrentState, signer: MapSigner | None) -> None:
+    """Make the version of an entry current, unless another one than ``seen`` is: `InstanceBusy`."""
+    if signer is None:
+        add_version(store, entry, seen)
+    else:
+        signer.switch(entry)
