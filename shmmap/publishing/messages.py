@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to and from publishing workers; their tasks are `shmmap.prepare.work.CellTask`."""
+"""Messages to and from publishing workers; their tasks are `shmmap.prepare.task_pool.CellTask`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from shmmap.prepare.work import Ready
+from shmmap.prepare.task_pool import Ready
 
 __all__ = [
     "CellSent",

@@ -41,8 +41,7 @@ from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
-from shmmap.prepare.task_pool import TaskPool
-from shmmap.prepare.work import CellTask
+from shmmap.prepare.task_pool import CellTask, TaskPool
 from shmmap.publishing.known_objects import write_known_objects
 from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent
 from shmmap.publishing.sending import send_object

@@ -8,10 +8,9 @@ from dataclasses import replace
 from typing import Final
 
 from shmmap.layers.contract import Box
-from shmmap.layers.source_reader import Files
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import CellSource, Files
 from shmmap.origin.remote.millimetres import to_millimetres
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 
 __all__ = ["RoundedFiles"]
 
@@ -19,7 +18,7 @@ _XYZ: Final = "xyz"
 
 
 class RoundedFiles(Files):
-    """A `shmmap.layers.source_reader.SourceReader`: rows and coordinates as a reader of the map has them."""
+    """A `shmmap.layers.sources.SourceReader`: rows and coordinates as a reader of the map has them."""
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
         """Read the file, its points rounded and in their new order."""

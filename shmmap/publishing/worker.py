@@ -21,11 +21,10 @@ from typing import Final
 import msgspec
 
 from shmmap.errors import InternalError, MapDataError, ShmmapError
-from shmmap.layers.derive import CellJob
+from shmmap.layers.build import make_layer
 from shmmap.layers.disk_cache import LayerCache
-from shmmap.layers.making import make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES, SourceReader
+from shmmap.layers.sources import FILES, CellJob, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import MILLIMETRES
@@ -37,7 +36,7 @@ from shmmap.origin.remote.published_object import (
     read_bare_header,
 )
 from shmmap.origin.remote.store import Store
-from shmmap.prepare.work import CellTask, Ready, decode_task, encode
+from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES

@@ -19,11 +19,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shmmap.daemon.loading.adoption import Adoption
-from shmmap.daemon.loading.misplaced import MisplacedCells
+from shmmap.daemon.loading.scheduler import MisplacedCells
 from shmmap.layers.points import build_points
+from shmmap.segment.header import PublishBlock, verify_file
 from shmmap.segment.names import new_segment_name
-from shmmap.segment.publish_block import PublishBlock
-from shmmap.segment.verify import verify_file
 from tests.support.divided_map import make_map
 from tests.unit.daemon.inner_daemon import InnerDaemon
 

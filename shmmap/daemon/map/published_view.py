@@ -28,8 +28,7 @@ from shmmap.origin.remote.published_index import (
 )
 from shmmap.origin.remote.published_source import LayerSource, pack_source
 from shmmap.origin.spatial_index import touches
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["PublishedView"]
 

@@ -11,8 +11,7 @@ import msgspec
 
 from shmmap.origin.remote.published_index import POINTS
 from shmmap.origin.remote.published_object import STAMP_BYTES, ObjectName
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["LayerSource", "pack_source", "stamp_of", "unpack_source"]
 

@@ -14,7 +14,7 @@ import pytest
 import shmmap.layers
 from shmmap.layers.__main__ import main
 from shmmap.layers.build import build_layer
-from shmmap.layers.registry import kinds
+from shmmap.layers.spec import kinds
 from tests.support.divided_map import random_points
 from tests.support.pcd_files import write_pcd
 
