@@ -86,8 +86,8 @@ if TYPE_CHECKING:
     from shmmap.layers.build import build_layer
     from shmmap.layers.contract import LayerKind, LayerTable
     from shmmap.layers.ground import ground_height
-    from shmmap.layers.ndt import voxel_covariances
     from shmmap.layers.spec import canonical_layer
+    from shmmap.layers.voxels import voxel_covariances
     from shmmap.protocol.live import LiveMapRow
     from shmmap.protocol.messages import HeldCell, Holder, Intent
 

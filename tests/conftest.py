@@ -100,9 +100,9 @@ def layer_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Have the kernels of layers compiled before a daemon needs them: there a load has a deadline."""
 
     def compile_them(_folder: Path) -> None:
-        from shmmap.layers import height_kernels, lattice_kernels, ndt_kernels
+        from shmmap.layers import kernels
 
-        del height_kernels, lattice_kernels, ndt_kernels  # they are compiled as they are imported
+        del kernels  # they are compiled as they are imported
 
     built_once(tmp_path_factory, "layer_kernels", compile_them)
 

@@ -20,8 +20,7 @@ from queue import Empty, SimpleQueue
 from shmmap.client.cell import Access, Cell
 from shmmap.errors import SegmentError, ShmmapWarning
 from shmmap.protocol.messages import Handle
-from shmmap.segment.attach import attach
-from shmmap.segment.owned import Owned
+from shmmap.segment.attach import Owned, attach
 
 __all__ = ["Attacher", "check_visible", "owner_of_segments"]
 

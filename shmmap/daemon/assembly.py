@@ -155,14 +155,14 @@ class Service:
         origin_watch: Chore | None = None
         disk_ahead: Chore | None = None
         if elsewhere is not None:
-            from shmmap.daemon.loading.origin_watch import OriginWatch
+            from shmmap.daemon.loading.outages import OriginWatch
 
             origin_watch = one = OriginWatch(
                 elsewhere.link, scheduler, elsewhere.try_again, self._take_another
             )
             watched.watch(elsewhere.link.fd, one.collect, "map")
             if elsewhere.keeper is not None:
-                from shmmap.daemon.loading.prefetch.disk_ahead import DiskAhead
+                from shmmap.daemon.loading.outages import DiskAhead
 
                 disk_ahead = ahead = DiskAhead(cache, scheduler, elsewhere.keeper)
                 watched.watch(elsewhere.keeper.fd, ahead.collect, "memory")

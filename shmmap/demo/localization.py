@@ -138,7 +138,7 @@ def main(argv: list[str]) -> int:
     """Simulate, write, compile."""
     import numpy as np
 
-    from shmmap.layers.compiling import compile_kernels
+    from shmmap.layers.build import compile_kernels
     from shmmap.simulation.lidar import Lidar
     from shmmap.simulation.lidar_drive import LidarDrive
     from shmmap.simulation.town import Town

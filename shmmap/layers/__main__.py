@@ -17,7 +17,7 @@ from shmmap.errors import ShmmapError
 from shmmap.formats.cloud import read_cloud
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.layers.build import build_layer
-from shmmap.layers.registry import kinds
+from shmmap.layers.spec import kinds
 
 __all__ = ["main"]
 

@@ -1,27 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers of plain arrays: the same builders that the daemon's workers run, without a daemon.
+"""Building layers: of plain arrays, or of one cell into a segment file.
 
-::
+`build_layer` runs the same builders as the daemon's loaders, without a daemon::
 
     from shmmap import build_layer
 
     ndt = build_layer("ndt(leaf=2.0)", xyz)
     ndt["mean"], ndt["inverse_covariance"], ndt.lattice
+
+`make_layer` fills a segment file: out of the disk cache where the layer is there, else built and kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import fcntl
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import xxhash
 from numpy.typing import NDArray
 
-from shmmap.errors import BadRequest, InternalError
+from shmmap.errors import BadRequest, InternalError, MapDataError
+from shmmap.formats.source_file import refusal
+from shmmap.kernel_cache import all_kept, compiled_mark
 from shmmap.layers.contract import BUILT_ANYWHERE, Box, Columns, LayerTable, PointTable
+from shmmap.layers.disk_cache import CacheKey, LayerCache
+from shmmap.layers.sources import SMALLER, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, parse_layer
+from shmmap.logfmt import log
 from shmmap.optional_packages import needed_packages
+from shmmap.segment.layout import NO_SOURCE, SegmentHeader, SourceStamp
+from shmmap.segment.version import Source
+from shmmap.segment.writer import SegmentOrigin, write_table
 
-__all__ = ["build_layer", "build_spec"]
+__all__ = [
+    "Derived",
+    "Halo",
+    "Made",
+    "build_layer",
+    "build_spec",
+    "cache_key",
+    "combined_digest",
+    "compile_kernels",
+    "derive",
+    "make_layer",
+    "read_halo",
+]
 
 
 def build_layer(
@@ -98,3 +125,268 @@ def _checked(columns: Mapping[str, NDArray[np.generic]]) -> Columns:
                 f"column {name!r} must be numeric with {len(xyz)} rows, not {column.shape} of {column.dtype}"
             )
     return checked
+
+
+@dataclass(frozen=True, slots=True)
+class Derived:
+    """A finished segment's header, and what was read for it.
+
+    ``neighbours`` are the stamps of the neighbours' files, in the job's order.
+    """
+
+    header: SegmentHeader
+    neighbours: tuple[SourceStamp, ...]
+    warnings: tuple[str, ...]
+
+
+def combined_digest(own: bytes, neighbours: Sequence[bytes]) -> bytes:
+    """Digest of everything that a layer was computed from: the source's own where there is no more."""
+    return xxhash.xxh3_128_digest(b"".join([own, *neighbours])) if neighbours else own
+
+
+def derive(
+    spec: LayerSpec,
+    job: CellJob,
+    fd: int,
+    *,
+    source: CellSource | None = None,
+    reserve: Callable[[int], None] | None = None,
+) -> Derived:
+    """Build a layer of a cell into an empty segment file.
+
+    Parameters
+    ----------
+    fd
+        Empty file, open for writing; after an error its contents mean nothing.
+    source
+        The cell's points, where they are at hand; else its file is read.
+    reserve
+        Called with the segment's size in bytes before anything is written; it refuses by raising.
+
+    Raises
+    ------
+    MapDataError
+        If a file cannot be read, or its points cannot become this layer.
+    OSError
+        ENOSPC if the file system is full.
+    """
+    if source is None:
+        source = job.reader.read(job.source, job.box, spec.source_columns)
+    points, warnings = source.points, source.warnings
+    around: tuple[tuple[SourceStamp, bytes], ...] = ()
+    if job.neighbours:
+        around_it = [near.source for near in job.neighbours]
+        halo = read_halo(job.reader, around_it, job.box, spec.halo_m, points.xyz.dtype)
+        points.halo, around, warnings = halo.xyz, halo.seen, (*warnings, *halo.warnings)
+    table = build_spec(spec, points)
+    header = write_table(
+        fd,
+        {name: np.ascontiguousarray(column) for name, column in table.columns.items()},
+        layer=str(spec),
+        rows=table.rows,
+        origin=SegmentOrigin(
+            cell_id=job.cell_id,
+            box=job.box,
+            frame_id=job.frame_id,
+            source=source.stamp,
+            source_digest=combined_digest(source.digest, [digest for _, digest in around]),
+            source_points=source.source_points,
+            dropped_points=source.dropped_points,
+            outside_points=source.outside_points,
+        ),
+        builder_version=spec.builder_version,
+        units=table.units,
+        lattice=table.lattice,
+        z_min=source.z_min,
+        z_max=source.z_max,
+        reserve=reserve,
+    )
+    return Derived(header, tuple(stamp for stamp, _ in around), warnings)
+
+
+@dataclass(slots=True)
+class Halo:
+    """Points around a cell.
+
+    Attributes
+    ----------
+    xyz
+        (M, 3), of the cell's dtype.
+    seen
+        Each neighbour's stamp and digest.
+    warnings
+        Which neighbours have no points here, and why.
+    """
+
+    xyz: NDArray[Any]
+    seen: tuple[tuple[SourceStamp, bytes], ...]
+    warnings: tuple[str, ...]
+
+
+def read_halo(
+    reader: SourceReader, sources: Sequence[Source], box: Box, halo_m: float, dtype: np.dtype[Any]
+) -> Halo:
+    """Read the neighbours' points within ``halo_m`` of a cell's box, as ``dtype``.
+
+    One that cannot be read has no points, the stamp of before the attempt and a digest of zeros: it must
+    not cost its neighbours their layers.
+
+    Raises
+    ------
+    MapDataError
+        If there is not enough memory for a neighbour: another time there may be, so that no layer is
+        made without it.
+    """
+    found: list[NDArray[Any]] = [np.empty((0, 3), dtype)]
+    seen: list[tuple[SourceStamp, bytes]] = []
+    warnings: list[str] = []
+    for neighbour in sources:
+        stamp = reader.stamp(neighbour)  # afterwards it may be that of a file that was never read
+        before = SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
+        try:
+            source = reader.read(neighbour, box, ("xyz",))
+        except MapDataError as error:
+            seen.append((before, bytes(16)))
+            warnings.append(f"made without a neighbour: {error.message}")
+            continue
+        except MemoryError as error:
+            raise refusal(
+                "too_large",
+                "this neighbour takes more memory than there is",
+                path=neighbour.name,
+                hint=SMALLER,
+            ) from error
+        xyz = source.points.xyz
+        x, y = xyz[:, 0], xyz[:, 1]
+        inside = (
+            (x >= box[0] - halo_m) & (x <= box[2] + halo_m) & (y >= box[1] - halo_m) & (y <= box[3] + halo_m)
+        )
+        found.append(xyz[inside].astype(dtype))
+        seen.append((source.stamp, source.digest))
+    return Halo(np.concatenate(found), tuple(seen), tuple(warnings))
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A finished segment.
+
+    Attributes
+    ----------
+    version
+        Of the layer, for the states of the sources that it was made from.
+    neighbours
+        States of the neighbours' sources that it stands for.
+    cached
+        It came out of the cache.
+    """
+
+    header: SegmentHeader
+    version: int
+    neighbours: tuple[SourceStamp, ...] = ()
+    warnings: tuple[str, ...] = ()
+    cached: bool = False
+
+
+def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
+    """Key of a layer for the sources as they are now; None where the cell's own cannot be looked at."""
+    source = _state(job, job.source)
+    if source is NO_SOURCE:
+        return None
+    return CacheKey(spec, job, source, tuple(_state(job, near.source) for near in job.neighbours))
+
+
+def _state(job: CellJob, source: Source) -> SourceStamp:
+    """State of a source as it is now; zeros where it cannot be looked at."""
+    stamp = job.reader.stamp(source)
+    return SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
+
+
+def make_layer(
+    spec: LayerSpec,
+    job: CellJob,
+    fd: int,
+    *,
+    cache: LayerCache | None = None,
+    keep: bool = False,
+    source: Callable[[], CellSource | None] | None = None,
+    reserve: Callable[[int], None] | None = None,
+) -> Made:
+    """Fill an empty segment file with a layer.
+
+    Parameters
+    ----------
+    fd
+        Empty file, open for reading and writing; after an error its contents mean nothing.
+    cache, keep
+        Where to look first, and whether to store what was built.
+    source
+        Returns the cell's points where they are at hand, else None; asked only for computed layers.
+    reserve
+        Called with the segment's size in bytes before anything is written; it refuses by raising.
+
+    Raises
+    ------
+    MapDataError
+        If a file cannot be read, or its points cannot become this layer.
+    OSError
+        ENOSPC if the file system is full.
+    """
+    if job.ready:
+        cache = None  # its origin keeps it
+    key = cache_key(spec, job) if cache is not None else None
+    if cache is not None and key is not None:
+        header = cache.load(key, fd, reserve=reserve)
+        if header is not None:
+            return Made(header, key.version, key.neighbours, cached=True)
+    warnings: list[str] = []
+    header = job.reader.fill(spec, job, fd, reserve=reserve, warn=warnings.append)
+    if header is not None:
+        version = job.ready or job.version(spec, header.source, ())
+        made = Made(header, version, warnings=tuple(warnings))
+    else:
+        derived = derive(spec, job, fd, source=source() if source is not None else None, reserve=reserve)
+        version = job.version(spec, derived.header.source, derived.neighbours)
+        made = Made(derived.header, version, derived.neighbours, derived.warnings)
+    if keep and cache is not None and key is not None:
+        _keep(cache, CacheKey(spec, job, made.header.source, made.neighbours), made.header, fd)
+    return made
+
+
+def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> None:
+    if not cache.writable:
+        return
+    try:
+        cache.store(key, header, fd)
+    except OSError as error:  # the cache is a convenience: a full disk costs nobody a layer
+        cache.writable = False
+        log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
+
+
+def compile_kernels(*, wait: bool = True) -> None:
+    """Compile what is not compiled yet, if it can be kept.
+
+    Parameters
+    ----------
+    wait
+        For another process that is at it; else it is left to that.
+
+    Raises
+    ------
+    MemoryError
+        There is not enough memory for the compiler.
+    """
+    mark = compiled_mark()
+    if mark is None or mark.is_file():
+        return
+    with contextlib.ExitStack() as stack:
+        try:
+            lock = stack.enter_context(mark.with_suffix(".lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except OSError:  # another process is at it, or nothing can be kept: each process compiles its own
+            return
+        from shmmap.layers import kernels  # compiled as they are imported
+
+        del kernels
+        if all_kept():
+            with contextlib.suppress(OSError):
+                mark.touch()

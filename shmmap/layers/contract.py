@@ -2,7 +2,7 @@
 """What a layer kind is: parameters, columns, and a builder from points to a table.
 
 A new kind is one module that makes a `LayerKind`, and one registration: a line in
-`shmmap.layers.registry` for a kind of shmmap's own, an entry point of the group ``shmmap.layers``
+`shmmap.layers.spec` for a kind of shmmap's own, an entry point of the group ``shmmap.layers``
 (its object a `LayerKind`) for anybody else's.  `shmmap.testing.layer_conformance` checks any kind.
 """
 

@@ -30,10 +30,10 @@ import xxhash
 
 from shmmap.disk_budget import INTERIM, LAYERS, DiskBudget, mark_used
 from shmmap.errors import CannotWrite, SegmentCorrupt
-from shmmap.layers.derive import CellJob
+from shmmap.layers.sources import CellJob
 from shmmap.layers.spec import LayerSpec
-from shmmap.segment.header import pack_header, unpack_header
-from shmmap.segment.layout import LAYOUT_VERSION, PAGE_BYTES, SegmentHeader, SourceStamp, header_size
+from shmmap.segment.header import checked_blocks, pack_header, read_page, unpack_header
+from shmmap.segment.layout import LAYOUT_VERSION, SegmentHeader, SourceStamp, header_size
 from shmmap.segment.writer import write_all
 
 __all__ = ["CacheKey", "LayerCache"]
@@ -68,7 +68,7 @@ class CacheKey:
         return f"{self.version:016x}-{major}.{minor}"
 
     def content_name(self, digest: bytes) -> str:
-        """Name of the entry for what was computed from, by `shmmap.layers.derive.combined_digest`."""
+        """Name of the entry for what was computed from, by `shmmap.layers.build.combined_digest`."""
         made = struct.pack("<IHH4d", self.spec.builder_version, *LAYOUT_VERSION, *self.job.box)
         name: str = digest.hex() + xxhash.xxh3_64_hexdigest(str(self.spec).encode() + b"\0" + made)
         return name
@@ -124,7 +124,7 @@ class LayerCache:
         try:
             status = os.fstat(fd)
             if status.st_uid in (0, os.geteuid()) and not status.st_mode & 0o022:
-                header = _read_header(fd, status.st_size)
+                header = unpack_header(memoryview(read_page(fd, status.st_size)), status.st_size)
                 if _is_of(header, key):
                     mark_used(fd, status)
                     return fd, header
@@ -169,7 +169,10 @@ class LayerCache:
             if reserve is not None:
                 reserve(header.total_bytes)
             os.ftruncate(fd, header.total_bytes)
-            if not _copy_columns(entry, fd, header):
+            try:
+                for at, block in checked_blocks(entry, header, _BLOCK_BYTES):
+                    write_all(fd, block, at)
+            except SegmentCorrupt:
                 self._remove(self._version_path(key.version_name()))
                 self._remove(self._content_path(key.content_name(header.source_digest)))
                 os.ftruncate(fd, 0)
@@ -259,33 +262,6 @@ def _is_of(header: SegmentHeader, key: CacheKey) -> bool:
     """Whether an entry is what its name says; a cell's id may differ: a copied map's entries are used."""
     same_layer = header.layer == str(key.spec) and header.builder_version == key.spec.builder_version
     return same_layer and header.box == key.job.box
-
-
-def _read_header(fd: int, available: int) -> SegmentHeader:
-    page = os.pread(fd, PAGE_BYTES, 0)
-    header_bytes = int.from_bytes(page[16:24], "little")
-    if PAGE_BYTES < header_bytes <= available:
-        page = os.pread(fd, header_bytes, 0)
-    return unpack_header(memoryview(page), available)
-
-
-def _copy_columns(entry: int, fd: int, header: SegmentHeader) -> bool:
-    """Copy every column, hashing it on the way; False where one does not match its checksum."""
-    buffer = memoryview(bytearray(_BLOCK_BYTES))
-    for column in header.columns:
-        digest = xxhash.xxh3_64()
-        at, end = column.offset, column.offset + column.nbytes
-        while at < end:
-            got = os.preadv(entry, [buffer[: min(_BLOCK_BYTES, end - at)]], at)
-            if not got:
-                return False
-            block = buffer[:got]
-            digest.update(block)
-            write_all(fd, block, at)
-            at += got
-        if digest.intdigest() != column.checksum:
-            return False
-    return True
 
 
 def _copy_all(source: int, target: int, nbytes: int) -> None:

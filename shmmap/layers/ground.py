@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers of a grid over the ground: ``elevation`` and ``ground``; and the height of the ground at a place.
+"""Layers of columns over the ground, ``elevation``, ``ground`` and ``search``; the ground's height.
 
-Each table is (ny, nx): the column of a point (x, y) is ``[j - j0, i - i0]`` with ``i = floor(x * (1 /
-resolution))``, ``j`` likewise (in the points' own precision, see `shmmap.layers.lattice_kernels`), and
-``(i0, j0)`` the header's ``lattice_first``.  ``elevation`` has several numbers of each column, ``ground`` its
-lowest point alone.
+Each table of ``elevation`` and ``ground`` is (ny, nx): the column of a point (x, y) is ``[j - j0, i - i0]``
+with ``i = floor(x * (1 / resolution))``, ``j`` likewise (in the points' own precision, see
+`shmmap.layers.kernels`), and ``(i0, j0)`` the header's ``lattice_first``.  ``elevation`` has several
+numbers of each column, ``ground`` its lowest point alone.
 
 Maps have points far below the street: reflections in wet asphalt and glass, gullies, pits.  `ground_height`
 takes the median of the columns' lowest points within 4 m, which half of those columns would have to mislead.
@@ -18,6 +18,17 @@ columns instead of points, each standing at its middle.  A point is at most half
 the middle of its column, so the answer is that of the exact rule with its radius d + 1 m changed by at
 most ``resolution * sqrt(2)``: never lower than the lowest point within that much more, never higher
 than the lowest within that much less.  The exact rule stays available from ``points``.
+
+``search`` has points sorted so that the neighbours of any place are found without building a tree.
+The ground is divided into columns of ``leaf`` x ``leaf``, at multiples of ``leaf`` from the map's origin
+(index ``floor(coordinate * (1 / leaf))`` in float64), and 8 x 8 columns make a tile.  ``tile[ty, tx]``
+numbers the tiles that have points; the rows of column (cx, cy) are ``start[n] : start[n + 1]`` with
+``n = tile[cy // 8, cx // 8] * 64 + (cy % 8) * 8 + cx % 8``, cx and cy counted from the lattice's first
+column, and within a column z ascends.  All points within r of a place are then found in the columns
+that its square of half-side r touches, by bisection of z.
+
+Two levels keep the table small where a map is mostly empty: 4 bytes per 64 columns, and 256 bytes
+more for each tile that has points.
 """
 
 from __future__ import annotations
@@ -27,21 +38,30 @@ from collections.abc import Iterable
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.contract import (
     Lattice,
     LayerColumn,
     LayerKind,
     LayerTable,
-    Parameter,
     Parameters,
     PointTable,
-)  # fmt: skip
-from shmmap.layers.lattice import dense_table, group_points
+)
+from shmmap.layers.voxels import edge, group_points
 
-__all__ = ["ELEVATION", "GROUND", "GroundRule", "build_elevation", "build_ground", "ground_height"]
+__all__ = [
+    "ELEVATION",
+    "GROUND",
+    "SEARCH",
+    "TILE_COLUMNS",
+    "GroundRule",
+    "build_elevation",
+    "build_ground",
+    "build_search",
+    "ground_height",
+]
 
 
 GroundRule = Literal["median", "min"]
@@ -58,24 +78,25 @@ def build_elevation(points: PointTable, parameters: Parameters) -> LayerTable:
     MapDataError
         If the grid cannot hold the coordinates.
     """
-    from shmmap.layers.height_kernels import heights
+    from shmmap.layers.kernels import heights
 
-    edge = float(parameters["resolution"])
-    grouping = group_points(points.xyz, (edge, edge, math.inf))
-    table = dense_table(grouping)[0] if len(grouping.counts) else np.empty((0, 0), np.int32)
+    resolution = float(parameters["resolution"])
+    grouping = group_points(points.xyz, (resolution, resolution, math.inf))
     rows = len(grouping.counts)
     low, high, mean = np.empty(rows), np.empty(rows), np.empty(rows)
     heights(points.xyz, grouping.rows, grouping.counts, low, high, mean)
 
-    def spread(values: NDArray[np.float64]) -> NDArray[np.float32]:
-        grid = np.full(table.shape, np.nan, np.float32)
-        grid[table >= 0] = values[table[table >= 0]]
-        return grid
+    def spread(values: NDArray[np.generic], dtype: DTypeLike, empty: float) -> NDArray[np.generic]:
+        grid = grouping.spread(values.astype(dtype), empty)
+        return grid.reshape(grid.shape[1:])
 
-    count = np.zeros(table.shape, np.uint32)
-    count[table >= 0] = grouping.counts[table[table >= 0]]
     return LayerTable(
-        columns={"min": spread(low), "max": spread(high), "mean": spread(mean), "count": count},
+        columns={
+            "min": spread(low, np.float32, math.nan),
+            "max": spread(high, np.float32, math.nan),
+            "mean": spread(mean, np.float32, math.nan),
+            "count": spread(grouping.counts, np.uint32, 0),
+        },
         rows=rows,
         units={column.name: column.unit for column in ELEVATION.columns},
         lattice=grouping.lattice,
@@ -90,9 +111,7 @@ ELEVATION: Final = LayerKind(
         "a column that a border of the cell cuts is in each cell, with that cell's points alone; extremes"
         " and count-weighted means of both give those of the whole"
     ),
-    parameters=(
-        Parameter("resolution", float, "edge of a column", "m", required=True, above=0.0, maximum=1e6),
-    ),
+    parameters=(edge("resolution", "edge of a column", required=True),),
     columns=(
         LayerColumn("min", np.dtype("<f4"), "(ny, nx)", "m", "lowest z, map frame; NaN: no points"),
         LayerColumn("max", np.dtype("<f4"), "(ny, nx)", "m", "highest z"),
@@ -192,10 +211,88 @@ GROUND: Final = LayerKind(
     builder_version=1,
     summary="lowest height of each column of a ground grid, for fitting a pose's height",
     borders="as elevation: the lower of both cells' columns is that of the whole",
-    parameters=(
-        Parameter("resolution", float, "edge of a column", "m", default=0.5, above=0.0, maximum=1e6),
-    ),
+    parameters=(edge("resolution", "edge of a column", default=0.5),),
     columns=(LayerColumn("min", np.dtype("<f4"), "(ny, nx)", "m", "lowest z, map frame; NaN: no points"),),
     build=build_ground,
     bytes_ratio=0.05,
+)
+
+
+TILE_COLUMNS: Final = 8
+"""Columns of a tile along x and along y."""
+
+_MAX_TILES: Final = 1 << 24  # 64 MiB of table: 16 km x 16 km in tiles of 4 m
+
+
+def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
+    """Sort points by tile, then column, then z; equal ones stay in the source's order.
+
+    Raises
+    ------
+    MapDataError
+        If the points lie too far apart for the table (cause ``coordinate_range``).
+    """
+    leaf = float(parameters["leaf"])
+    units = {"xyz": "m", "tile": "", "start": ""}
+    # in float64 also where the points are float32
+    grouping = group_points(np.ascontiguousarray(points.xyz, np.float64), (leaf, leaf, math.inf))
+    finite = grouping.rows >= 0
+    xyz, rows = np.ascontiguousarray(points.xyz[finite]), grouping.rows[finite]
+    if not len(xyz):
+        empty: dict[str, NDArray[np.generic]] = {
+            "xyz": xyz,
+            "tile": np.empty((0, 0), np.int32),
+            "start": np.zeros(1, np.int32),
+        }
+        return LayerTable(empty, 0, units, Lattice((leaf, leaf, math.inf), (0, 0, 0), (0, 0, 0)))
+    column = grouping.indices[:, :2]
+    first = column.min(axis=0) // TILE_COLUMNS * TILE_COLUMNS  # whole tiles of one lattice for all cells
+    column_x, column_y = (column - first).T
+    tiles_x, tiles_y = int(column_x.max()) // TILE_COLUMNS + 1, int(column_y.max()) // TILE_COLUMNS + 1
+    if tiles_x * tiles_y > _MAX_TILES:
+        raise MapDataError(
+            f"the points lie too far apart for a search table of {leaf:g} m",
+            cause="coordinate_range",
+            hint="divide the map into cells, remove stray points, or use a larger leaf",
+        )
+    used, number = np.unique(
+        column_y // TILE_COLUMNS * tiles_x + column_x // TILE_COLUMNS, return_inverse=True
+    )
+    key = number * TILE_COLUMNS**2 + column_y % TILE_COLUMNS * TILE_COLUMNS + column_x % TILE_COLUMNS
+    key = key[rows]
+    order = np.argsort(xyz[:, 2], kind="stable")
+    # numpy sorts 16 bits by their digits, in no time
+    narrow = key if len(used) * TILE_COLUMNS**2 > 1 << 16 else key.astype(np.uint16)
+    order = order[np.argsort(narrow[order], kind="stable")]
+    start = np.zeros(len(used) * TILE_COLUMNS * TILE_COLUMNS + 1, np.int32)
+    np.cumsum(np.bincount(key, minlength=len(start) - 1), out=start[1:], dtype=np.int32)
+    table = np.full(tiles_x * tiles_y, -1, np.int32)
+    table[used] = np.arange(len(used), dtype=np.int32)
+    columns: dict[str, NDArray[np.generic]] = {
+        "xyz": np.ascontiguousarray(xyz[order]),
+        "tile": table.reshape(tiles_y, tiles_x),
+        "start": start,
+    }
+    lattice = Lattice(
+        (leaf, leaf, math.inf),
+        (int(first[0]), int(first[1]), 0),
+        (tiles_x * TILE_COLUMNS, tiles_y * TILE_COLUMNS, 1),
+    )
+    return LayerTable(columns, len(xyz), units, lattice)
+
+
+SEARCH: Final = LayerKind(
+    name="search",
+    builder_version=1,
+    summary="points sorted by column and height, with a table of columns, for finding neighbours",
+    borders="holds the cell's own points alone; who looks near a border looks into both cells",
+    parameters=(edge("leaf", "edge of a column, best the distance searched", required=True),),
+    columns=(
+        LayerColumn("xyz", None, "(rows, 3)", "m", "the points, map frame: by tile, column, then z"),
+        LayerColumn("tile", np.dtype("<i4"), "(tiles_y, tiles_x)", "", "number of a tile; -1: no points"),
+        LayerColumn("start", np.dtype("<i4"), "(tiles * 64 + 1,)", "", "first row of each column of a tile"),
+    ),
+    build=build_search,
+    needs=("xyz",),
+    bytes_ratio=1.0,
 )

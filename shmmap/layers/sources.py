@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell's points as builders want them: from its file, or from its ``points`` segment in memory."""
+"""A cell's points as builders need them, and what reads them in loaders and preparing processes.
+
+Points come from the cell's file, from its ``points`` segment in memory, or from whatever another
+`SourceReader` reads; files are one kind.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +19,26 @@ from shmmap.errors import SegmentCorrupt
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.source_file import refusal
 from shmmap.layers.contract import Box, PointTable
-from shmmap.layers.points import OutsideBox
+from shmmap.layers.points import LAYER, OutsideBox, build_points
+from shmmap.layers.spec import LayerSpec
 from shmmap.quantities import format_bytes
+from shmmap.segment.header import read_header
 from shmmap.segment.layout import SegmentHeader, SourceStamp
-from shmmap.segment.verify import read_header
+from shmmap.segment.version import Source, Stamp, cell_version, layer_version
 
-__all__ = ["MOST_SOURCE_BYTES", "CellSource", "read_segment", "read_source"]
+__all__ = [
+    "FILES",
+    "MOST_SOURCE_BYTES",
+    "CellJob",
+    "CellSource",
+    "Fetcher",
+    "Files",
+    "Neighbour",
+    "SourceReader",
+    "read_segment",
+    "read_source",
+]
+
 
 MOST_SOURCE_BYTES: Final = 1 << 30
 """Points of one cell, uncompressed, that a layer is computed of: all of them are in a process's memory then.
@@ -145,3 +163,179 @@ def _check_size(nbytes: int, name: str) -> None:
             path=name,
             hint=SMALLER,
         )
+
+
+REPLACED: Final = "another directory has the map's name now: `shmmap reload` reads it"
+
+
+class Fetcher(Protocol):
+    """Fetches what several jobs need at once, before they are worked on one after the other.
+
+    What cannot be fetched is an error of whatever reads it then.
+    """
+
+    @property
+    def fd(self) -> int:
+        """Readable when `done` may have an answer."""
+
+    def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
+        """Begin to fetch what a layer of a cell is made from; returns at once."""
+
+    def done(self) -> int | None:
+        """Return the number of a job for which all is fetched, or will not come; None: there is none."""
+
+
+class SourceReader(Protocol):
+    """Reads sources by the words of the origin that named them.
+
+    What cannot be reached at present raises `shmmap.errors.Offline`.
+    """
+
+    @property
+    def fetcher(self) -> Fetcher | None:
+        """Fetches for several jobs at once; None: each is read when it is worked on."""
+
+    def stamp(self, source: Source) -> Stamp | None:
+        """Return the state that a source is in; None where that cannot be found out."""
+
+    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
+        """Read the columns that a layer needs (None: all) of a cell's points.
+
+        Raises
+        ------
+        MapDataError
+            It cannot be read, or is too large.
+        """
+
+    def fill(
+        self,
+        spec: LayerSpec,
+        job: CellJob,
+        fd: int,
+        *,
+        reserve: Callable[[int], None] | None,
+        warn: Callable[[str], None],
+    ) -> SegmentHeader | None:
+        """Fill an empty segment file with a layer that is there as it is; None: it has to be computed.
+
+        ``points`` always are.  Parameters and errors are those of `shmmap.layers.build.make_layer`.
+        """
+
+    def named(self, message: str) -> str:
+        """Name sources in a message as a person knows them."""
+
+    def explain(self, source: Source, message: str) -> str:
+        """Say why a source could not be read, in such words."""
+
+    def take_counts(self) -> tuple[int, ...]:
+        """Return counts of objects read since the last call, in the order of `OBJECTS_READ`; empty: none."""
+
+
+class Files:
+    """Sources that are PCD files.
+
+    Parameters
+    ----------
+    at
+        Says where to find what a path names.
+    named
+        Names paths in a message as they were given.
+    """
+
+    fetcher = None
+
+    def __init__(self, at: Callable[[str], str] = str, named: Callable[[str], str] = str) -> None:
+        self._at, self._named = at, named
+
+    def stamp(self, source: Source) -> Stamp | None:
+        """State of the file, as ``stat`` gives it; None where it cannot be looked at."""
+        try:
+            return SourceStamp.of(os.stat(self._at(source.name))).token
+        except OSError:
+            return None
+
+    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
+        """Read the file, see `shmmap.layers.sources.read_source`."""
+        return read_source(self._at(source.name), box, needs)
+
+    def fill(
+        self,
+        spec: LayerSpec,
+        job: CellJob,
+        fd: int,
+        *,
+        reserve: Callable[[int], None] | None,
+        warn: Callable[[str], None],
+    ) -> SegmentHeader | None:
+        """Stream the file into the segment, for ``points`` alone."""
+        if spec.kind.name != LAYER:
+            return None
+        return build_points(
+            self._at(job.source.name),
+            fd,
+            cell_id=job.cell_id,
+            box=job.box,
+            frame_id=job.frame_id,
+            reserve=reserve,
+            warn=warn,
+        )
+
+    def named(self, message: str) -> str:
+        """Name files by their paths."""
+        return self._named(message)
+
+    def explain(self, source: Source, message: str) -> str:
+        """Name files by their paths, and say whether another directory has the map's name now."""
+        place = self._at(source.name)
+        if place != source.name and self.stamp(source) is None and os.path.exists(source.name):
+            return f"{source.name}: {REPLACED}"
+        return self._named(message)
+
+    def take_counts(self) -> tuple[int, ...]:
+        """Return nothing: files are not objects."""
+        return ()
+
+
+FILES: Final = Files()
+"""Files by their paths."""
+
+
+class Neighbour(NamedTuple):
+    """A cell that a layer of another one looks into: source, box in metres, id (empty: the source's name)."""
+
+    source: Source
+    box: Box
+    cell_id: str = ""
+
+    @classmethod
+    def of(cls, cell_id: str, source: Source, box: Box) -> Neighbour:
+        """Return the cell of this id."""
+        return cls(source, box, "" if cell_id == source.name else cell_id)
+
+
+@dataclass(frozen=True, slots=True)
+class CellJob:
+    """Which cell: id, source, box (metres), frame, and for a layer with a halo the cells around it.
+
+    ``reader`` reads the sources; ``ready`` is the version of a layer that the origin has ready made, 0 of
+    one that is computed.
+    """
+
+    cell_id: str
+    source: Source
+    box: Box
+    frame_id: str = "map"
+    neighbours: tuple[Neighbour, ...] = ()
+    reader: SourceReader = FILES
+    ready: int = 0
+
+    def version(self, spec: LayerSpec, source: SourceStamp, around: Sequence[SourceStamp]) -> int:
+        """Version of a layer of the cell for these states of its file and of its neighbours'."""
+        cell = cell_version(self.cell_id, source.token, self.box)
+        if spec.kind.name == LAYER:
+            return cell
+        near = [
+            cell_version(one.cell_id or one.source.name, stamp.token, one.box)
+            for one, stamp in zip(self.neighbours, around, strict=True)
+        ]
+        return layer_version(cell, str(spec), spec.builder_version, near)

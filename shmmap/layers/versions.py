@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, Box
+from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.segment.version import layer_version
-from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 

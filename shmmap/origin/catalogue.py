@@ -13,15 +13,14 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 
 from shmmap.errors import MapDataError
 from shmmap.geometry import Area
+from shmmap.large_tables import sparse_zeros
 from shmmap.origin.catalogue_change import CatalogueChange, compare
 from shmmap.origin.cell_names import CellNames, common_directory
 from shmmap.origin.map_layout import OpenedDirectories
 from shmmap.origin.map_report import UNKNOWN_FRAME, MapFrame
 from shmmap.origin.spatial_index import MadeOfBoxes, SpatialIndex
 from shmmap.segment.layout import SourceStamp
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp, cell_version
-from shmmap.sparse_table import sparse_zeros
+from shmmap.segment.version import Source, Stamp, cell_version
 
 __all__ = [
     "Catalogue",

@@ -11,13 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from shmmap.layers.derive import Neighbour
 from shmmap.layers.disk_cache import LayerCache
+from shmmap.layers.sources import Neighbour
 from shmmap.layers.spec import canonical_layers
 from shmmap.layers.versions import MAX_NEIGHBOURS, LayerVersions
 from shmmap.origin.catalogue import Catalogue
-from shmmap.prepare import work
-from shmmap.prepare.task_pool import TaskPool
+from shmmap.prepare.task_pool import CellDone, CellTask, TaskPool, decode_done
 
 __all__ = ["Failure", "PrepareProgress", "Prepared", "prepare_map", "task_of"]
 
@@ -64,7 +63,7 @@ class _Count:
         self._progress = progress
         self.result = Prepared(total)
 
-    def finished(self, task: work.CellTask, done: work.CellDone) -> None:
+    def finished(self, task: CellTask, done: CellDone) -> None:
         result = self.result
         for layer in done.layers:
             result.kept += layer.how == "kept"
@@ -75,7 +74,7 @@ class _Count:
                 result.failures.append(Failure(task.cell_id, layer.layer, layer.message))
         self._progress.advance(1)
 
-    def died(self, task: work.CellTask, how: str) -> None:
+    def died(self, task: CellTask, how: str) -> None:
         message = f"{task.source.name}: the worker died of it ({how})"
         self.result.failures += [Failure(task.cell_id, layer, message) for layer in task.layers]
         self._progress.advance(1)
@@ -115,7 +114,7 @@ def prepare_map(
     recognise = int(not cache.is_empty)
     crowded: list[Failure] = []
 
-    def tasks() -> Iterator[work.CellTask]:
+    def tasks() -> Iterator[CellTask]:
         for index in range(len(catalogue)):
             task, refused = task_of(catalogue, versions, index, names)
             crowded.extend(refused)
@@ -127,7 +126,7 @@ def prepare_map(
         "shmmap.prepare.worker",
         [cache_dir, str(cache_bytes), str(recognise)],
         workers=max(1, workers),
-        decode=work.decode_done,
+        decode=decode_done,
         finished=count.finished,
         died=count.died,
     ).run(tasks())
@@ -139,7 +138,7 @@ def prepare_map(
 
 def task_of(
     catalogue: Catalogue, versions: LayerVersions, index: int, layers: Sequence[str]
-) -> tuple[work.CellTask, list[Failure]]:
+) -> tuple[CellTask, list[Failure]]:
     """Return the task of making layers of a cell, without those that would look into too many cells."""
     around: dict[str, tuple[Neighbour, ...]] = {}
     crowded: list[Failure] = []
@@ -152,7 +151,7 @@ def task_of(
             around[layer] = tuple(
                 Neighbour.of(catalogue.id(i), catalogue.source(i), catalogue.box(i)) for i in near
             )
-    task = work.CellTask(
+    task = CellTask(
         index,
         catalogue.id(index),
         catalogue.source(index),

@@ -2,7 +2,7 @@
 """Tasks about cells, worked off by processes: a hostile file costs its cell, not the run.
 
 Workers are processes that the kernel ends with this one.  One that dies costs the task it worked on; another
-takes its place.
+takes its place.  One packet is one message.  Publishing gives its workers the same tasks.
 """
 
 from __future__ import annotations
@@ -13,16 +13,77 @@ import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeAlias, TypeVar
 
 import msgspec
 
 from shmmap.errors import InternalError
-from shmmap.prepare.work import Ready, encode
+from shmmap.layers.sources import Neighbour
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.processes.start_child import how_ended, start_child
+from shmmap.segment.version import Source
 
-__all__ = ["TaskPool"]
+__all__ = [
+    "CellDone",
+    "CellTask",
+    "FromWorker",
+    "LayerDone",
+    "Ready",
+    "TaskPool",
+    "decode_done",
+    "decode_task",
+    "encode",
+]
+
+
+class CellTask(msgspec.Struct, array_like=True, tag="cell"):
+    """Make these layers of a cell; ``around`` are, for each layer, the cells it looks into."""
+
+    number: int
+    cell_id: str
+    source: Source
+    box: tuple[float, float, float, float]
+    frame_id: str
+    layers: tuple[str, ...]
+    around: tuple[tuple[Neighbour, ...], ...]
+
+
+class LayerDone(msgspec.Struct, array_like=True):
+    """One layer: ``how`` is kept (it was there), recognised, built or failed."""
+
+    layer: str
+    how: str
+    bytes: int = 0
+    message: str = ""
+
+
+class CellDone(msgspec.Struct, array_like=True, tag="done"):
+    """A cell is done, layer by layer."""
+
+    number: int
+    layers: tuple[LayerDone, ...]
+
+
+class Ready(msgspec.Struct, array_like=True, tag="ready"):
+    """The worker has started."""
+
+
+FromWorker: TypeAlias = CellDone | Ready
+
+encode: Final = msgspec.msgpack.Encoder().encode
+_task: Final[msgspec.msgpack.Decoder[CellTask]] = msgspec.msgpack.Decoder(CellTask)
+_done: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
+
+
+def decode_task(data: bytes) -> CellTask:
+    """Return the message for a worker."""
+    return _task.decode(data)
+
+
+def decode_done(data: bytes) -> FromWorker:
+    """Return a worker's message."""
+    return _done.decode(data)
+
 
 _FAILED_STARTS: Final = 3
 

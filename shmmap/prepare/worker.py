@@ -16,18 +16,16 @@ from typing import Final
 import xxhash
 
 from shmmap.errors import ShmmapError
+from shmmap.layers.build import cache_key, combined_digest, make_layer
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob, combined_digest
 from shmmap.layers.disk_cache import CacheKey, LayerCache
-from shmmap.layers.making import cache_key, make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES, SourceReader
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import FILES, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
-from shmmap.prepare import work
+from shmmap.prepare.task_pool import CellDone, CellTask, LayerDone, Ready, decode_task, encode
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 
 __all__ = ["CellPoints", "main"]
 
@@ -35,21 +33,21 @@ _NICENESS: Final = 5
 _BLOCK_BYTES: Final = 1 << 20
 
 
-def _prepare_cell(task: work.CellTask, cache: LayerCache, *, recognise: bool) -> work.CellDone:
+def _prepare_cell(task: CellTask, cache: LayerCache, *, recognise: bool) -> CellDone:
     """Have every layer of a cell in the cache; the file is read once for all computed layers.
 
     ``recognise``: look in the cache for layers of other states of the same files.
     """
-    done: dict[str, work.LayerDone] = {}
+    done: dict[str, LayerDone] = {}
     missing: list[tuple[LayerSpec, CellJob, CacheKey]] = []
     for name, around in zip(task.layers, task.around, strict=True):
         spec = layer_spec(name)
         job = CellJob(task.cell_id, task.source, task.box, task.frame_id, around)
         key = cache_key(spec, job)
         if key is None:
-            done[name] = work.LayerDone(name, "failed", 0, f"{task.source.name}: it cannot be looked at")
+            done[name] = LayerDone(name, "failed", 0, f"{task.source.name}: it cannot be looked at")
         elif cache.has(key):
-            done[name] = work.LayerDone(name, "kept", cache.size_of(key))
+            done[name] = LayerDone(name, "kept", cache.size_of(key))
         else:
             missing.append((spec, job, key))
     if missing and recognise:
@@ -57,12 +55,12 @@ def _prepare_cell(task: work.CellTask, cache: LayerCache, *, recognise: bool) ->
         for entry in list(missing):
             spec, job, key = entry
             if cache.recognise(key, _content(job, digests)):
-                done[str(spec)] = work.LayerDone(str(spec), "recognised", cache.size_of(key))
+                done[str(spec)] = LayerDone(str(spec), "recognised", cache.size_of(key))
                 missing.remove(entry)
     source = CellPoints(task.source, task.box, [spec for spec, _, _ in missing])
     for spec, job, _ in missing:
         done[str(spec)] = _build(spec, job, cache, source)
-    return work.CellDone(task.number, tuple(done[name] for name in task.layers))
+    return CellDone(task.number, tuple(done[name] for name in task.layers))
 
 
 class CellPoints:
@@ -91,7 +89,7 @@ class CellPoints:
         return replace(self._read, points=replace(table, columns=columns, units=units))
 
 
-def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints) -> work.LayerDone:
+def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints) -> LayerDone:
     name = str(spec)
     try:
         fd = os.memfd_create("layer", os.MFD_CLOEXEC)
@@ -99,8 +97,8 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints)
             made = make_layer(spec, job, fd, source=lambda: source.points(spec))
             key = CacheKey(spec, job, made.header.source, made.neighbours)
             if not cache.store(key, made.header, fd):
-                return work.LayerDone(name, "failed", 0, f"{cache.directory}: there is no room for it")
-            return work.LayerDone(name, "built", made.header.total_bytes)
+                return LayerDone(name, "failed", 0, f"{cache.directory}: there is no room for it")
+            return LayerDone(name, "built", made.header.total_bytes)
         finally:
             os.close(fd)
     except ShmmapError as error:
@@ -111,7 +109,7 @@ def _build(spec: LayerSpec, job: CellJob, cache: LayerCache, source: CellPoints)
         message = f"{job.source.name}: building {name} ran out of memory"
     except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one layer
         message = f"{job.source.name}: building {name} failed: {error!r}"
-    return work.LayerDone(name, "failed", 0, message[:2000])
+    return LayerDone(name, "failed", 0, message[:2000])
 
 
 def _content(job: CellJob, known: dict[str, bytes]) -> bytes:
@@ -143,10 +141,10 @@ def main(arguments: list[str]) -> int:
     cache = LayerCache(arguments[2], limit_bytes=int(arguments[3]))
     recognise = bool(int(arguments[4]))
     try:
-        channel.send(work.encode(work.Ready()))
+        channel.send(encode(Ready()))
         while data := channel.recv(MAX_PACKET_BYTES):
-            task = work.decode_task(data)
-            channel.send(work.encode(_prepare_cell(task, cache, recognise=recognise)))
+            task = decode_task(data)
+            channel.send(encode(_prepare_cell(task, cache, recognise=recognise)))
     except (BrokenPipeError, ConnectionResetError):
         pass
     return 0

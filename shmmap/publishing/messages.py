@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a run and its publishing workers exchange: settings, messages, and a table of known objects.
 
-Their tasks are `shmmap.prepare.work.CellTask`.
+Their tasks are `shmmap.prepare.task_pool.CellTask`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shmmap.origin.remote.published_index import LayerObjects
 from shmmap.origin.remote.published_object import ObjectName
-from shmmap.prepare.work import Ready
+from shmmap.prepare.task_pool import Ready
 
 __all__ = [
     "CellSent",

@@ -41,8 +41,7 @@ from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
-from shmmap.prepare.task_pool import TaskPool
-from shmmap.prepare.work import CellTask
+from shmmap.prepare.task_pool import CellTask, TaskPool
 from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent, write_known_objects
 from shmmap.publishing.new_version import begin_version, refuse_if_late, send_object, switch_version
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side

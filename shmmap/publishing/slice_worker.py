@@ -17,12 +17,11 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Final
 
 from shmmap.errors import LoadFailed, MapDataError, MapMissing, Offline, ShmmapError
+from shmmap.layers.build import cache_key
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob
 from shmmap.layers.disk_cache import LayerCache
-from shmmap.layers.making import cache_key
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellSource, read_segment
+from shmmap.layers.sources import CellJob, CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectTier
 from shmmap.origin.remote.opened_store import open_store
@@ -34,12 +33,11 @@ from shmmap.origin.remote.published_object import (
     write_segment,
 )
 from shmmap.origin.remote.zstd_frame import unpack_frame
-from shmmap.prepare.work import CellTask, Ready, decode_task, encode
+from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.publishing.messages import CellSent, KnownObjects, NotSent, decode_slice_settings
 from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, Sender, make_and_send, run_worker
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["HELD_BYTES", "PublishedPoints", "main"]
 
@@ -50,7 +48,7 @@ _OF_THE_STORE: Final = (Offline.code, MapMissing.code)
 
 
 class PublishedPoints:
-    """Reads the points of a published map's cells; see `shmmap.layers.source_reader.SourceReader`.
+    """Reads the points of a published map's cells; see `shmmap.layers.sources.SourceReader`.
 
     Parameters
     ----------

@@ -54,14 +54,13 @@ from shmmap.origin.remote.slice_part import (
 from shmmap.origin.remote.store import Store, Tag, put_over
 from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
-from shmmap.prepare.task_pool import TaskPool
-from shmmap.prepare.work import CellTask
+from shmmap.prepare.task_pool import CellTask, TaskPool
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings, decode_sent
 from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, send_object
 from shmmap.publishing.restore import object_sizes
 from shmmap.publishing.shards import CellObjects
 from shmmap.publishing.worker import TASKS_AHEAD
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 
 __all__ = ["BaseVersion", "Sliced", "changed_layers", "new_objects", "prepare_slice", "read_base"]
 

@@ -21,13 +21,12 @@ from typing import Final
 import msgspec
 
 from shmmap.errors import InternalError, MapDataError, ShmmapError
+from shmmap.layers.build import make_layer
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob
+from shmmap.layers.sources import CellJob
 from shmmap.layers.disk_cache import LayerCache
-from shmmap.layers.making import make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES, Files, SourceReader
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import FILES, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import MILLIMETRES
@@ -40,7 +39,7 @@ from shmmap.origin.remote.published_object import (
     to_millimetres,
 )
 from shmmap.origin.remote.store import Store
-from shmmap.prepare.work import CellTask, Ready, decode_task, encode
+from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import MAX_PACKET_BYTES
@@ -54,7 +53,7 @@ from shmmap.publishing.messages import (
 from shmmap.publishing.new_version import send_object
 from shmmap.quantities import format_bytes
 from shmmap.segment.layout import SegmentHeader, SourceStamp
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 
 __all__ = [
     "TASKS_AHEAD",
@@ -310,7 +309,7 @@ _XYZ: Final = "xyz"
 
 
 class RoundedFiles(Files):
-    """A `shmmap.layers.source_reader.SourceReader`: rows and coordinates as a reader of the map has them."""
+    """A `shmmap.layers.sources.SourceReader`: rows and coordinates as a reader of the map has them."""
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
         """Read the file, its points rounded and in their new order."""

@@ -5,8 +5,7 @@ A mapping lives exactly as long as any array over it: every view's ``base`` chai
 mapping object, whose end unmaps.  Nothing is ever unmapped under a live view.  No file descriptor
 is kept (Python's own ``mmap`` keeps one each, which ends at RLIMIT_NOFILE), so the mapping is made
 with the C library's ``mmap``; the kernel keeps the open file, and the session's lock on it, for as
-long as the mapping lives.  Neither is lost to an exception that comes at the wrong moment
-(`shmmap.segment.owned`).
+long as the mapping lives.  Neither is lost to an exception that comes at the wrong moment (`Owned`).
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import stat
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import starmap
 from operator import attrgetter
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
@@ -29,18 +29,80 @@ from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
 from shmmap.optional_packages import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.header import OUTSIDE, OUTSIDE_AT, read_columns, unpack_header
+from shmmap.segment.header import (
+    OUTSIDE,
+    OUTSIDE_AT,
+    PublishBlock,
+    read_columns,
+    read_page,
+    unpack_header,
+    unpack_publish_block,
+)
 from shmmap.segment.layout import PAGE_BYTES, ColumnRow, SegmentHeader
 from shmmap.segment.names import retired_name
-from shmmap.segment.owned import Owned
 from shmmap.segment.pins import lock_slot
 from shmmap.segment.process_limits import no_files_left, no_memory_left
-from shmmap.segment.publish_block import PublishBlock, unpack_publish_block
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["AttachedSegment", "attach", "attach_writable", "map_file"]
+
+__all__ = [
+    "AttachedSegment",
+    "Owned",
+    "attach",
+    "attach_writable",
+    "map_file",
+]
+
+
+class Owned:
+    """One thing that a built-in function gives and another one takes back when this object ends.
+
+    It is given back whatever exception a signal handler raises wherever.  Python runs signal handlers between
+    the steps of its interpreter, as a rule after a call.  So a handler's exception may come when a function
+    has returned a descriptor that no variable holds yet; or at the first step of a ``__del__`` written in
+    Python, which then does nothing.  Between functions that are built in and call each other no handler runs:
+    taking, keeping and giving back are made of those alone.
+
+    Parameters
+    ----------
+    given
+        Yields one tuple, whose first is the thing: a `zip` of a `map` of the built-in function that gives it.
+    take_back
+        Built in, too; is called with what is in the tuple, once, and then returns None or 0.
+
+    Raises
+    ------
+    Exception
+        What the giving function raises.
+    """
+
+    __slots__ = ("__del__", "__weakref__", "value")
+
+    __del__: Callable[[], object]  # in a slot: what Python calls is built in, and no function of ours
+
+    def __init__(self, given: Iterable[tuple[Any, ...]], take_back: Callable[..., Any]) -> None:
+        kept: list[tuple[Any, ...]] = []
+        # each in the list is taken back once, since an iterator is at an end after that
+        self.__del__ = partial(any, starmap(take_back, kept))
+        kept.extend(given)
+        self.value = kept[0][0]
+        """What was given."""
+
+    def keep(self, take_back: Callable[[], object]) -> None:
+        """Need less memory from now on: ``take_back``, built in, does all when this object ends."""
+        self.__del__ = take_back
+
+    def give_back(self) -> None:
+        """Give it back now, not only when this object ends; not after `keep`."""
+        self.__del__()
+
+    def end(self) -> None:
+        """Give it back now although this object is still referred to; in a thread without signal handlers."""
+        take_back, self.__del__ = self.__del__, bool  # which does nothing
+        take_back()
+
 
 LEASE_S: Final = 0.2
 """How long a lease may keep an open waiting; the daemon holds one for microseconds."""
@@ -153,14 +215,7 @@ def _bytes_of(
 class AttachedSegment:
     """A verified view of one segment, read-only as a rule.
 
-    Attributes
-    ----------
-    columns : list of tuple
-        The column table (`shmmap.segment.layout.ColumnRow`).
-    raw : (total_bytes,) uint8
-        All of its bytes.
-    outside_points : int
-        Points outside the cell's box.
+    ``raw`` (total_bytes,) uint8 is all of its bytes; ``outside_points`` lie outside the cell's box.
     """
 
     __slots__ = ("_header", "columns", "outside_points", "raw")
@@ -225,13 +280,13 @@ class AttachedSegment:
 
 
 _open_shared: Final = partial(posix_ipc.SharedMemory, flags=os.O_NONBLOCK, read_only=True)
-"""No size=: passing one would resize the segment under everybody's feet."""
+"""No size=: passing one would resize the segment."""
 _fd_of: Final = attrgetter("fd")
 _FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 def _open(name: str, shm_dir: str) -> Owned:
-    """Open a segment, never waiting: a pipe that has its name by now would make the opener wait for ever."""
+    """Open a segment, never waiting: a pipe that has its name by now would block the opener."""
     fds: Iterable[Any]
     if shm_dir == DEFAULT_SHM_DIR:
         fds = map(_fd_of, map(_open_shared, (name,)))
@@ -241,7 +296,7 @@ def _open(name: str, shm_dir: str) -> Owned:
 
 
 def _open_soon(name: str, shm_dir: str) -> Owned:
-    """Open a segment on which the daemon has a lease, held for a moment to see whether anybody uses it."""
+    """Open a segment on which the daemon has a lease, held for a moment to see whether it is in use."""
     end_s = time.monotonic() + LEASE_S
     while True:
         try:
@@ -275,10 +330,10 @@ def attach(
     shm_dir
         Directory of the segments, as the daemon's ``hello`` names it.
     slot
-        The session's slot: tells the daemon who uses the segment.
+        The session's slot, by which the daemon knows the segment's user.
     owner
-        User that the segment must belong to: where everybody may make files, a name that the daemon
-        gave up may be anybody's by now.
+        User that the segment must belong to: where any account may make files, a name that the daemon
+        gave up may be another one's by now.
     populate
         Let the kernel map every page now (``MAP_POPULATE``) instead of at first touch.
     sinks
@@ -290,7 +345,7 @@ def attach(
     Raises
     ------
     StaleHandle
-        The segment is gone, or what has its name is something else or somebody else's.
+        The segment is gone, or its name is another file's by now.
     SegmentCorrupt
         Its bytes are not a segment of a layout this program reads.
     SegmentError
@@ -334,11 +389,8 @@ def attach(
         if end > available or end == 0:
             raise SegmentCorrupt(f"segment {name} has {available} bytes, the daemon's handle says {end}")
         size = end - offset
-        # Reading the header is cheaper than the page fault that looking at it would cost
-        page = os.pread(fd, min(size, PAGE_BYTES), offset)
-        header_bytes = int.from_bytes(page[16:24], "little")
-        if PAGE_BYTES < header_bytes <= size:
-            page = os.pread(fd, header_bytes, offset)
+        # reading the header is cheaper than the page fault that looking at it would cost
+        page = read_page(fd, size, offset)
         _, columns = read_columns(memoryview(page), size)
         (outside,) = OUTSIDE.unpack_from(page, OUTSIDE_AT)
         memory = map_file(fd, end, populate=populate)

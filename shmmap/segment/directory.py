@@ -15,8 +15,8 @@ from collections.abc import Iterator
 
 from shmmap.errors import CannotStart
 from shmmap.failpoints import step
+from shmmap.segment.header import PublishBlock, pack_publish_block
 from shmmap.segment.names import DEFAULT_SHM_DIR
-from shmmap.segment.publish_block import PublishBlock, pack_publish_block
 
 __all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
 

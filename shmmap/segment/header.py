@@ -1,13 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A segment's header to bytes and back; ``LAYOUT.md`` is the byte-exact document."""
+"""A segment's header to bytes and back, and checks of a segment's bytes against its own checksums.
+
+``LAYOUT.md`` is the byte-exact document.  The header's last 64 bytes are the *publish block*: which run of
+the daemon published the segment, and as which version.
+
+Files are read, not mapped: no page of them stays in the checking process, and one that is shorter than it
+claims is an error instead of SIGBUS.
+"""
 
 from __future__ import annotations
 
 import math
+import os
 import struct
 import zlib
+from collections.abc import Iterator
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -27,7 +36,60 @@ from shmmap.segment.layout import (
     SourceStamp,
 )
 
-__all__ = ["OUTSIDE", "OUTSIDE_AT", "check_start", "pack_header", "read_columns", "unpack_header"]
+__all__ = [
+    "OUTSIDE",
+    "OUTSIDE_AT",
+    "PUBLISH_BYTES",
+    "PublishBlock",
+    "check_start",
+    "checked_blocks",
+    "pack_header",
+    "pack_publish_block",
+    "read_columns",
+    "read_header",
+    "read_page",
+    "unpack_header",
+    "unpack_publish_block",
+    "verify_file",
+]
+
+
+_BLOCK_BYTES: Final = 1 << 20
+PUBLISH_BYTES: Final = 64
+PUBLISH: Final = struct.Struct("<8sQQ32xI4x")
+PUBLISH_MAGIC: Final = b"PUBLISH\x00"
+CRC: Final = struct.Struct("<II")
+
+
+class PublishBlock(NamedTuple):
+    """Which run of the daemon published the segment, and as which version of its cell."""
+
+    epoch: int
+    version: int
+
+
+def pack_publish_block(block: PublishBlock) -> bytes:
+    """Return the 64 bytes the daemon writes when it publishes a segment."""
+    packed = PUBLISH.pack(PUBLISH_MAGIC, block.epoch, block.version, 0)
+    return packed[:56] + CRC.pack(zlib.crc32(packed[:56]), 0)
+
+
+def unpack_publish_block(header_page: memoryview, header_bytes: int) -> PublishBlock | None:
+    """Read the publish block; None while the segment was never published.
+
+    Raises
+    ------
+    SegmentCorrupt
+        If it is neither empty nor whole.
+    """
+    raw = bytes(header_page[header_bytes - PUBLISH_BYTES : header_bytes])
+    magic, epoch, version, crc = PUBLISH.unpack(raw)
+    if magic == bytes(8):
+        return None
+    if magic != PUBLISH_MAGIC or crc != zlib.crc32(raw[:56]):
+        raise SegmentCorrupt("the publish block is damaged")
+    return PublishBlock(epoch, version)
+
 
 MAGIC: Final = b"SHMMAP\x00\x01"
 BYTE_ORDER: Final = 0x01020304
@@ -38,7 +100,6 @@ OUTSIDE: Final = struct.Struct("<Q")  # after the lattice; since 1.3, before 0
 OUTSIDE_AT: Final = FIXED.size + LATTICE.size
 TABLE: Final = struct.Struct("<III")  # column count, offset of the table, bytes of a row
 TABLE_AT: Final = FIXED.size - 11 * 4
-CRC: Final = struct.Struct("<II")
 
 
 @lru_cache(maxsize=64)  # numpy computes ``dtype.str`` in Python
@@ -240,3 +301,63 @@ def _unpack_lattice(page: memoryview) -> Lattice | None:
     if leaf_x == 0.0:
         return None
     return Lattice((leaf_x, leaf_y, leaf_z), (i, j, k), (columns, rows, levels))
+
+
+def read_page(fd: int, available_bytes: int, offset: int = 0) -> bytes:
+    """Read a segment's header out of a file: its first page, all of it where it claims to be longer."""
+    page = os.pread(fd, min(available_bytes, PAGE_BYTES), offset)
+    header_bytes = int.from_bytes(page[16:24], "little")
+    return os.pread(fd, header_bytes, offset) if PAGE_BYTES < header_bytes <= available_bytes else page
+
+
+def read_header(fd: int) -> tuple[SegmentHeader, PublishBlock]:
+    """Read and verify the header and publish block of an open segment.
+
+    Raises
+    ------
+    SegmentCorrupt
+        As `unpack_header`; or it was never published.
+    """
+    available = os.fstat(fd).st_size
+    page = memoryview(read_page(fd, available))
+    header = unpack_header(page, available)
+    block = unpack_publish_block(page, header.header_bytes)
+    if block is None:
+        raise SegmentCorrupt("the segment was never published")
+    return header, block
+
+
+def checked_blocks(fd: int, header: SegmentHeader, block_bytes: int) -> Iterator[tuple[int, memoryview]]:
+    """Read every column of a segment file; yields each block's place and bytes, valid until the next one.
+
+    Raises
+    ------
+    SegmentCorrupt
+        After its last block, naming a column whose bytes do not match its checksum.
+    """
+    import xxhash  # clients have none
+
+    buffer = memoryview(bytearray(block_bytes))
+    for column in header.columns:
+        digest = xxhash.xxh3_64()
+        at, end = column.offset, column.offset + column.nbytes
+        while at < end and (got := os.preadv(fd, [buffer[: min(block_bytes, end - at)]], at)):
+            digest.update(buffer[:got])
+            yield at, buffer[:got]
+            at += got
+        if digest.intdigest() != column.checksum:
+            raise SegmentCorrupt(f"column {column.name!r} of {header.cell_id} does not match its checksum")
+
+
+def verify_file(fd: int) -> SegmentHeader:
+    """Compare every column of an open segment with its checksum (about 25 ms per 100 MB).
+
+    Raises
+    ------
+    SegmentCorrupt
+        As `read_header`, or naming the first column whose bytes changed.
+    """
+    header, _ = read_header(fd)
+    for _at, _block in checked_blocks(fd, header, _BLOCK_BYTES):
+        pass
+    return header

@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names in the shared-memory directory.
+"""Names in the shared-memory directory, and what is said where another file has one.
 
 ``/shmmap.<instance>.<unique>`` is a published segment; ``<unique>`` is 64 random bits, handed out
 by the daemon and never used again.  ``/shmmap.<instance>.<unique>.zombie`` is the same segment once
 retired: new readers cannot find it, old ones keep it.  ``/shmmap.<instance>.statistics`` is the one
 name that can be derived.
+
+In /dev/shm and /tmp any account may make files, and only its owner (or root) can remove one.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import stat
 from typing import Final
 
-from shmmap.errors import ConfigError
+from shmmap.errors import CannotStart, ConfigError
 
 __all__ = [
     "DEFAULT_SHM_DIR",
@@ -21,12 +24,14 @@ __all__ = [
     "another_name",
     "check_instance",
     "is_retired",
+    "name_taken",
     "new_segment_name",
     "retired_name",
     "segment_prefix",
     "statistics_name",
     "usual_directory",
 ]
+
 
 DEFAULT_SHM_DIR: Final = "/dev/shm"  # noqa: S108
 """Where ``shm_open`` puts segments on Linux."""
@@ -59,7 +64,7 @@ def statistics_name(instance: str) -> str:
 
 
 def usual_directory(instance: str, places: tuple[str, str] = (DEFAULT_SHM_DIR, HUGE_PAGES_DIR)) -> str:
-    """Return where the instance's names are, for those who were not told: /dev/shm, or on huge pages."""
+    """Return where the instance's names are, by default: /dev/shm, or on huge pages."""
     plain, huge = places
     if os.path.exists(plain + statistics_name(instance)) or not os.path.ismount(huge):
         return plain
@@ -84,3 +89,52 @@ def retired_name(name: str) -> str:
 def is_retired(name: str) -> bool:
     """Whether ``name`` is that of a retired segment."""
     return name.endswith(_RETIRED)
+
+
+_KINDS: Final = {
+    stat.S_IFREG: "file",
+    stat.S_IFDIR: "directory",
+    stat.S_IFLNK: "symbolic link",
+    stat.S_IFIFO: "pipe",
+    stat.S_IFSOCK: "socket",
+}
+
+
+def name_taken(what: str, path: str, error: OSError | None, *, otherwise: str) -> CannotStart:
+    """Return the error that says why ``path`` cannot be ours.
+
+    Parameters
+    ----------
+    what
+        What should have been there: "the lock file".
+    error
+        The kernel's refusal; None where it gave none, but what lies there is not ours.
+    otherwise
+        What else can be done than removing it: "choose another --instance".
+    """
+    import shlex  # clients take no names
+
+    try:
+        status = os.lstat(path)
+    except OSError:  # nothing is there: it is the place itself
+        return CannotStart(f"{what} cannot be {path}: {_reason(error)}", hint=otherwise)
+    kind = _KINDS.get(stat.S_IFMT(status.st_mode), "device")
+    why = f" ({_reason(error)})" if error is not None else ""
+    remove = "rm -r" if kind == "directory" else "rm"
+    return CannotStart(
+        f"{what} cannot be {path}: there is a {kind} of {_account(status.st_uid)}{why}",
+        hint=f"see whose it is and remove it: `sudo {remove} {shlex.quote(path)}`; or {otherwise}",
+    )
+
+
+def _reason(error: OSError | None) -> str:
+    return (error.strerror or str(error)) if error is not None else "unknown"
+
+
+def _account(uid: int) -> str:
+    import pwd
+
+    try:
+        return f"user {pwd.getpwuid(uid).pw_name} (uid {uid})"
+    except KeyError:
+        return f"uid {uid}"

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Versions: 64-bit numbers that name the bytes of one layer of one cell; ``LAYOUT.md`` has the recipe.
+"""A cell's source, and versions: 64-bit numbers that name the bytes of one layer of one cell.
 
-A cell's version is that of its ``points``.  It follows from the cell's id, its source's *stamp* and its
-box; a computed layer's from that, from how the layer is computed, and from the cells that it looks into.
-So it is the same across restarts, and another one as soon as anything has changed that the bytes depend on.
+``LAYOUT.md`` has the recipe.  A cell's version is that of its ``points``.  It follows from the cell's id, its
+source's *stamp* and its box; a computed layer's from that, from how the layer is computed, and from the cells
+that it looks into.  So it is the same across restarts, and another one as soon as anything has changed that
+the bytes depend on.
 """
 
 from __future__ import annotations
@@ -13,9 +14,31 @@ import struct
 from collections.abc import Sequence
 from typing import Final, TypeAlias
 
+import msgspec
 from xxhash import xxh3_64_intdigest
 
-__all__ = ["Stamp", "cell_version", "layer_version"]
+__all__ = [
+    "Source",
+    "Stamp",
+    "cell_version",
+    "layer_version",
+]
+
+
+class Source(msgspec.Struct, frozen=True, array_like=True):
+    """Where a cell's points come from.
+
+    Attributes
+    ----------
+    name
+        What messages call it; of a file its path, which is all there is to know.
+    words
+        What the origin that named it says beside, for its own reader (`shmmap.layers.sources`) alone.
+    """
+
+    name: str
+    words: bytes = b""
+
 
 Stamp: TypeAlias = bytes
 """Names one state of a cell's source.  Only the origin that made it knows what it says: of a file, what

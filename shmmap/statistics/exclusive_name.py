@@ -17,8 +17,7 @@ from typing import Final
 
 from shmmap.errors import CannotStart, InstanceBusy, ShmmapError
 from shmmap.segment.directory import ShmDirectory, is_full
-from shmmap.segment.names import new_segment_name, statistics_name
-from shmmap.segment.taken_name import name_taken
+from shmmap.segment.names import name_taken, new_segment_name, statistics_name
 from shmmap.statistics.reader import read_statistics
 
 __all__ = ["has_writer", "hold", "refuse_second", "take_name"]

@@ -18,10 +18,10 @@ from itertools import chain, islice
 from typing import Final, Generic, TypeVar
 
 from shmmap.errors import ShmmapError
+from shmmap.large_tables import ShardedDict
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
-from shmmap.sharded_dict import ShardedDict
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
 from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, OBJECTS_READ, TURN_KINDS

@@ -26,7 +26,7 @@ from shmmap.layers.contract import LayerTable
 from shmmap.layers.spec import LayerSpec, parse_layer
 from shmmap.segment.header import unpack_header
 from shmmap.segment.layout import NO_SOURCE
-from shmmap.segment.table_writer import SegmentOrigin, write_table
+from shmmap.segment.writer import SegmentOrigin, write_table
 
 __all__ = ["CORNERS", "check_layer", "corner", "surface"]
 

@@ -21,7 +21,7 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
-from shmmap.segment.publish_block import PublishBlock
+from shmmap.segment.header import PublishBlock
 from tests.support.segments import publish_segment
 
 __all__ = ["main"]

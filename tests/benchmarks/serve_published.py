@@ -32,8 +32,8 @@ from obstore.store import HTTPStore
 
 import shmmap
 from shmmap.daemon.loading.published_reader import AT_ONCE, PublishedReader
-from shmmap.layers.derive import CellJob
-from shmmap.layers.making import make_layer
+from shmmap.layers.build import make_layer
+from shmmap.layers.sources import CellJob
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.map_versions import read_current, read_root, read_shards
 from shmmap.origin.remote.opened_store import ServedFrom, open_store

@@ -10,9 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.loading.prefetch.origin_health import OriginHealth
-from shmmap.daemon.loading.prefetch.prefetch import Prefetch, Wish
-from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
+from shmmap.daemon.loading.look_ahead import OriginHealth, Prefetch, WayAhead, Wish
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle

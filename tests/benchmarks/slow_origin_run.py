@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.loading.loads import FIRST_RETRY_S, LAST_RETRY_S
-from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
+from shmmap.daemon.loading.look_ahead import URGENT_S
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import places_of, until_needed
 from shmmap.geometry import Circle

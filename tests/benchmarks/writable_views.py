@@ -18,7 +18,7 @@ import numpy as np
 
 from shmmap.segment.attach import attach
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.publish_block import PublishBlock
+from shmmap.segment.header import PublishBlock
 from tests.support.segments import publish_segment
 
 WRITES = {

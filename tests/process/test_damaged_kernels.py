@@ -15,7 +15,7 @@ import pytest
 
 import shmmap
 from shmmap import kernel_cache
-from shmmap.layers.compiling import compile_kernels
+from shmmap.layers.build import compile_kernels
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, until
 from tests.support.divided_map import DividedMap

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from shmmap.columns import ColumnSpec
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.header import PublishBlock
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.names import new_segment_name
-from shmmap.segment.publish_block import PublishBlock
 from shmmap.segment.writer import SegmentWriter
 
 Box = tuple[float, float, float, float]

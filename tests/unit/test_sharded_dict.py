@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from shmmap import sharded_dict
-from shmmap.sharded_dict import ShardedDict
+from shmmap import large_tables
+from shmmap.large_tables import ShardedDict
 
 KEYS = st.integers(0, 40)
 DONE = st.sampled_from(["set", "delete", "pop", "popitem", "get", "default"])
@@ -16,7 +16,7 @@ DONE = st.sampled_from(["set", "delete", "pop", "popitem", "get", "default"])
 
 @pytest.fixture(params=[5, 1000], ids=["shared out", "few"])
 def few(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sharded_dict, "FEW", request.param)
+    monkeypatch.setattr(large_tables, "FEW", request.param)
 
 
 @pytest.mark.usefixtures("few")

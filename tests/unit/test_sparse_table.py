@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.sparse_table import sparse_zeros
+from shmmap.large_tables import sparse_zeros
 
 ROWS = 1 << 23
 WRITTEN = 64

@@ -81,7 +81,7 @@ class CompareRule:
 
     @property
     def layer(self) -> str:
-        """Layer that answers this rule; see `shmmap.layers.search`."""
+        """Layer that answers this rule; see `shmmap.layers.ground`."""
         d = self.distance
         if self.mode == "voxel":
             return f"search(leaf={d!r},of=voxel(leaf_x={d!r},leaf_y={d!r},leaf_z={self.distance_z!r}))"

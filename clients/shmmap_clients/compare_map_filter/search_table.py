@@ -26,7 +26,7 @@ __all__ = [
     "SearchTable",
 ]
 
-TILE_COLUMNS = 8  # as `shmmap.layers.search` has them: 8 x 8 columns in a tile
+TILE_COLUMNS = 8  # as `shmmap.layers.ground` has them: 8 x 8 columns in a tile
 _MAX_BINS: Final = 1 << 16
 _REACH_COLUMNS: Final = 2  # a place's neighbours within one leaf, and what rounding adds
 # what lies where in a row of the table

@@ -24,7 +24,7 @@ from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.state import EMPTY, WindowState, moved
 from shmmap.errors import BadRequest, InternalError, ShmmapError
 from shmmap.protocol.messages import Intent
-from shmmap.segment.owned import Owned
+from shmmap.segment.attach import Owned
 from shmmap.segment.process_limits import no_files_left
 
 __all__ = ["BlockingFollower", "WindowFollower"]

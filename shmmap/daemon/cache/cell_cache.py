@@ -28,13 +28,13 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Key, Resident
 from shmmap.failpoints import step
 from shmmap.geometry import ZRange
+from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
+from shmmap.segment.header import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
-from shmmap.segment.publish_block import PublishBlock
-from shmmap.sharded_dict import ShardedDict
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellCache"]

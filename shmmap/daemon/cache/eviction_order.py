@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple
 
 from shmmap.daemon.records import Resident
-from shmmap.sharded_dict import ShardedDict
+from shmmap.large_tables import ShardedDict
 
 __all__ = ["BATCH", "FRONT", "Deferred", "EvictionOrder", "Score"]
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 
 from shmmap.daemon.cache.eviction_order import EvictionOrder
 from shmmap.daemon.records import Key, Resident, Retired
-from shmmap.sharded_dict import ShardedDict
+from shmmap.large_tables import ShardedDict
 
 __all__ = ["Ledger", "Segments"]
 

@@ -14,9 +14,9 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Resident
+from shmmap.large_tables import ShardedDict
 from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.segment.version import Stamp
-from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["MapSwitch"]
 

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.records import Key, Resident
 from shmmap.geometry import ZRange
+from shmmap.large_tables import ShardedDict, sparse_zeros
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
-from shmmap.sharded_dict import ShardedDict
-from shmmap.sparse_table import sparse_zeros
 
 __all__ = ["Heights", "WarmIndex"]
 

@@ -19,8 +19,7 @@ from shmmap.errors import CannotStart, InstanceBusy, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.names import segment_prefix, statistics_name
-from shmmap.segment.taken_name import name_taken
+from shmmap.segment.names import name_taken, segment_prefix, statistics_name
 from shmmap.statistics.exclusive_name import has_writer
 
 __all__ = ["InstanceLock", "lock_path", "make_runtime_dir", "stopped_early", "take_away"]

@@ -25,7 +25,7 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import BACKGROUND, Loads
-from shmmap.daemon.loading.misplaced import MisplacedCells
+from shmmap.daemon.loading.scheduler import MisplacedCells
 from shmmap.daemon.records import Key, Resident
 from shmmap.errors import BadRequest, SegmentCorrupt
 from shmmap.failpoints import step
@@ -33,9 +33,9 @@ from shmmap.geometry import Box
 from shmmap.layers.spec import layer_spec
 from shmmap.logfmt import log
 from shmmap.segment.directory import measured_bytes
+from shmmap.segment.header import read_header
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.names import another_name, is_retired, retired_name, segment_prefix, statistics_name
-from shmmap.segment.verify import read_header
 
 __all__ = ["Adoption"]
 

@@ -4,6 +4,10 @@
 It has a single thread, opens no file of the map and no segment, and only forks: a packet with one end of a
 channel makes a loader, and when that has ended the same end says how (`worker_messages.Ended`), after
 everything that the loader itself has said.  It dies with the daemon, and the loaders die with it.
+
+Another child compiles the kernels of layers before a layer is asked for: once on a machine, for some seconds,
+behind everything else that the machine has to do.  If it dies, or lacks memory, each loader compiles what it
+needs.
 """
 
 from __future__ import annotations
@@ -22,12 +26,59 @@ from typing import Final, NoReturn
 from shmmap import __version__
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
-from shmmap.daemon.loading.first_compile import compile_in_child, is_compiled
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
+from shmmap.kernel_cache import compiled_mark
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import receive_packet
 
-__all__ = ["main"]
+__all__ = [
+    "compile_in_child",
+    "is_compiled",
+    "main",
+]
+
+
+_LEAST: Final = 19  # niceness
+
+
+def is_compiled() -> bool:
+    """Whether there is nothing to do: all is compiled, or cannot be kept."""
+    mark = compiled_mark()
+    return mark is None or mark.is_file()
+
+
+def compile_in_child(channel: socket.socket) -> int:
+    """Begin to compile; returns the child's pid.
+
+    Parameters
+    ----------
+    channel
+        This process's, which the child closes.
+    """
+    ours = os.getpid()
+    pid = os.fork()
+    if not pid:
+        channel.close()
+        _compile(ours)
+    return pid
+
+
+def _compile(parent: int) -> NoReturn:
+    code = 1
+    try:
+        die_with(parent)
+        os.setsid()
+        os.nice(_LEAST)
+        from shmmap.layers.build import compile_kernels
+
+        with contextlib.suppress(MemoryError):
+            compile_kernels(wait=False)  # else another daemon is at it
+        code = 0
+    except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
 
 MOST_SETTINGS_BYTES: Final = 1 << 14
 _OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from shmmap.errors import LoadFailed, MapDataError, Offline, ShmmapError
 from shmmap.layers.contract import Box, PointTable
-from shmmap.layers.derive import CellJob
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import CellJob, CellSource
 from shmmap.layers.spec import LayerSpec
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, kept_objects
 from shmmap.origin.remote.opened_store import ServedFrom, open_for_serving
@@ -33,8 +32,7 @@ from shmmap.origin.remote.published_object import (
 )
 from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.layout import SegmentHeader, SourceStamp
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["AT_ONCE", "PublishedReader"]
 
@@ -71,7 +69,7 @@ def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
 
 
 class ObjectFetcher:
-    """Fetches what jobs need, in threads; see `shmmap.layers.source_reader.Fetcher`.
+    """Fetches what jobs need, in threads; see `shmmap.layers.sources.Fetcher`.
 
     What two jobs need is fetched once.  As soon as one object is out of reach, so are those that have not
     been begun: else the jobs would fail one after the other, each in its time.
@@ -201,7 +199,7 @@ def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
 
 
 class PublishedReader:
-    """Reads sources that are objects of a published map; see `shmmap.layers.source_reader.SourceReader`."""
+    """Reads sources that are objects of a published map; see `shmmap.layers.sources.SourceReader`."""
 
     def __init__(self, served: ServedFrom, cache_dir: str, cache_bytes: int) -> None:
         store = open_for_serving(served)

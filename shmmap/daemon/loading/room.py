@@ -9,7 +9,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
+from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load, Resident

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads from the queue to their end: room is made, a worker is given the job, its word is heard.
+"""Loads from the queue to their end: room is made, a worker is given the job, its messages are handled.
 
 Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is replaced,
 and the jobs behind the one it died of go back into the queue.  Only workers look at files: it may take long.
@@ -16,21 +16,67 @@ from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.lost_workers import LostWorkers
-from shmmap.daemon.loading.misplaced import MisplacedCells
-from shmmap.daemon.loading.prefetch.prefetcher import Prefetcher
+from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.room import Room
 from shmmap.daemon.loading.worker_messages import Begun, Check, Checked, Done, Ended, Failed, Job, Need, Ready
 from shmmap.daemon.loading.worker_pool import NOT_OPENED, Opened, Worker, WorkerPool
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Load, Resident, failure_code
 from shmmap.failpoints import step
-from shmmap.layers.derive import Neighbour
 from shmmap.layers.points import LAYER
+from shmmap.layers.sources import Neighbour
 from shmmap.logfmt import log
 from shmmap.processes.start_child import how_ended
 from shmmap.segment.process_limits import limit_behind
 from shmmap.segment.version import Stamp
 
-__all__ = ["Scheduler"]
+__all__ = [
+    "MisplacedCells",
+    "Scheduler",
+]
+
+
+COUNTER: Final = "cells_outside_box"
+
+
+class MisplacedCells:
+    """Logs each such cell once a state, and counts them."""
+
+    def __init__(self, cache: CellCache) -> None:
+        self._cache = cache
+        self._versions: dict[str, int] = {}  # of the cell, when it was loaded
+        self._to_check: deque[str] = deque()
+
+    def note(self, cell_id: str, index: int, outside: int) -> None:
+        """Note what a loaded or adopted segment says of its cell's points."""
+        if not outside:
+            if self._versions.pop(cell_id, 0):
+                self._count()
+            return
+        version = self._cache.catalogue.version(index)
+        if self._versions.get(cell_id) != version:
+            self._versions[cell_id] = version
+            self._count()
+            log.warning(
+                "points outside the cell's box", cell=cell_id, points=outside,
+                box=self._cache.catalogue.box(index), hint="was the cell moved, and its metadata not?",
+            )  # fmt: skip
+
+    def map_changed(self) -> None:
+        """Have cells looked at again by `check_some`: they may have changed, or left the map."""
+        self._to_check = deque(self._versions)
+
+    def check_some(self, most: int) -> None:
+        """Forget those of some cells that are not what they were."""
+        for _ in range(min(most, len(self._to_check))):
+            cell_id = self._to_check.popleft()
+            index = self._cache.catalogue.find(cell_id)
+            if index is None or self._cache.catalogue.version(index) != self._versions.get(cell_id):
+                self._versions.pop(cell_id, None)
+                self._count()
+
+    def _count(self) -> None:
+        self._cache.statistics.set(COUNTER, len(self._versions))
+
 
 LOOKS_A_PUMP: Final = 16
 """Loads that one `pump` finds to be of cells that left the map."""

@@ -26,21 +26,19 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.records import failure_code
 from shmmap.errors import MapDataError, Offline, SegmentCorrupt, ShmmapError
 from shmmap.failpoints import step
-from shmmap.layers.derive import CellJob
+from shmmap.layers.build import Made, make_layer
 from shmmap.layers.disk_cache import LayerCache
-from shmmap.layers.making import Made, make_layer
 from shmmap.layers.points import LAYER
-from shmmap.layers.source_reader import FILES, Files, SourceReader
-from shmmap.layers.sources import CellSource, read_segment
+from shmmap.layers.sources import FILES, CellJob, CellSource, Files, SourceReader, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.origin.map_layout import OpenedDirectories
 from shmmap.processes.packets import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.header import verify_file
 from shmmap.segment.pins import LOADER_SLOT, lock_slot
 from shmmap.segment.process_limits import limit_behind
-from shmmap.segment.verify import verify_file
 
 __all__ = ["WorkerSettings", "limit_memory", "work"]
 

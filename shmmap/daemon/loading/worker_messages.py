@@ -12,9 +12,8 @@ from typing import Final, TypeAlias
 
 import msgspec
 
-from shmmap.layers.derive import Neighbour
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.layers.sources import Neighbour
+from shmmap.segment.version import Source, Stamp
 
 __all__ = [
     "Begun",

@@ -34,8 +34,7 @@ from shmmap.geometry import Area
 from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.origin.map_layout import OpenedDirectories
 from shmmap.origin.map_report import MapFrame
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["CatalogueView", "PageNews", "Pages", "Ready", "ViewOrigin"]
 

@@ -22,8 +22,7 @@ from shmmap.origin.map_report import MapFrame
 from shmmap.origin.remote.published_index import MILLIMETRES, Root, Shard, published_layer_version
 from shmmap.origin.remote.published_object import POINTS, LayerSource, pack_source
 from shmmap.origin.spatial_index import touches
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["PublishedView"]
 

@@ -18,8 +18,8 @@ from shmmap.daemon.map.catalogue_view import PageNews, Pages
 from shmmap.daemon.map.shard_fetcher import ShardFetcher
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area, distance_to_boxes
+from shmmap.large_tables import ShardedDict
 from shmmap.origin.remote.published_index import Root, Shard
-from shmmap.sharded_dict import ShardedDict
 
 __all__ = ["FEW_SHARDS", "Page", "ShardPages"]
 

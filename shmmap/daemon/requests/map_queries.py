@@ -28,7 +28,7 @@ from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
-from shmmap.layers.registry import kinds
+from shmmap.layers.spec import kinds
 from shmmap.origin.spatial_index import touches
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode

@@ -14,7 +14,7 @@ from typing import Final
 
 from shmmap.errors import InstanceBusy
 from shmmap.logfmt import escaped
-from shmmap.segment.taken_name import name_taken
+from shmmap.segment.names import name_taken
 
 __all__ = ["SocketFile", "refuse_taken"]
 

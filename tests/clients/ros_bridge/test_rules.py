@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge import names
+from shmmap_clients.shared_options import names
 from shmmap_clients.ros_bridge.catalogue import Requesters
 from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters

@@ -16,8 +16,8 @@ from shmmap.client.attaching import Attacher
 from shmmap.client.cell import Access, Cell
 from shmmap.protocol.messages import Handle
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.header import PublishBlock
 from shmmap.segment.layout import SourceStamp
-from shmmap.segment.publish_block import PublishBlock
 from tests.support.segments import Box, publish_segment
 
 

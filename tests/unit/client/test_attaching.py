@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from shmmap.client.cell import Cell
-from shmmap.segment.owned import Owned
+from shmmap.segment.attach import Owned
 from tests.support.process_costs import mappings_under
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from shmmap.errors import Offline
 from shmmap.geometry import Area
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_change import CatalogueChange
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 
 __all__ = ["MemoryPages", "PagedOrigin", "PagedView"]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shmmap.errors import InternalError, ShmmapError
-from shmmap.layers import registry
+from shmmap.layers import spec
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameters, PointTable
 from shmmap.testing.layer_conformance import CORNERS, check_layer
 from tests.support.skips import open3d_or_skip
@@ -31,15 +31,15 @@ SPECS = {
 
 
 def test_every_kind_is_tried() -> None:
-    assert set(SPECS) >= {kind.name for kind in registry.kinds()}
+    assert set(SPECS) >= {kind.name for kind in spec.kinds()}
 
 
 @pytest.mark.parametrize("cloud", CORNERS)
-@pytest.mark.parametrize("spec", [spec for specs in SPECS.values() for spec in specs])
-def test_contract(spec: str, cloud: str) -> None:
-    if spec.startswith(("denoise", "normals")):
+@pytest.mark.parametrize("name", [name for names in SPECS.values() for name in names])
+def test_contract(name: str, cloud: str) -> None:
+    if name.startswith(("denoise", "normals")):
         open3d_or_skip()
-    check_layer(spec, cloud)
+    check_layer(name, cloud)
 
 
 def build(points: PointTable, parameters: Parameters) -> LayerTable:
@@ -83,7 +83,7 @@ def changed(**changes: Any) -> Callable[[PointTable, Parameters], LayerTable]:
 @pytest.fixture
 def tried(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[LayerKind], None]]:
     def offer(kind: LayerKind) -> None:
-        monkeypatch.setitem(registry._registered, kind.name, kind)
+        monkeypatch.setitem(spec._registered, kind.name, kind)
 
     return offer  # type: ignore[return-value]
 
@@ -120,9 +120,9 @@ def test_what_breaks_the_contract_is_noticed(
 
 def test_a_kind_needs_a_name_and_a_version() -> None:
     with pytest.raises(ValueError, match="called"):
-        registry.register(replace(GOOD, name="ndt"))
+        spec.register(replace(GOOD, name="ndt"))
     with pytest.raises(ValueError, match="called"):
-        registry.register(replace(GOOD, name="two words"))
+        spec.register(replace(GOOD, name="two words"))
     with pytest.raises(ValueError, match="builder_version"):
-        registry.register(replace(GOOD, builder_version=256))
+        spec.register(replace(GOOD, builder_version=256))
     assert InternalError is not None

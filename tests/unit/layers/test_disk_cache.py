@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 
 from shmmap.formats.source_file import refusal
-from shmmap.layers import source_reader, sources
+from shmmap.layers import sources
+from shmmap.layers.build import Made, cache_key, make_layer
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob, Neighbour
 from shmmap.layers.disk_cache import CacheKey, LayerCache
-from shmmap.layers.making import Made, cache_key, make_layer
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import CellJob, CellSource, Neighbour
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.layout import SourceStamp
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 from tests.support.divided_map import random_points, write_pcd
 from tests.support.skips import open3d_or_skip
 
@@ -214,10 +213,10 @@ def test_a_neighbour_that_changes_while_it_is_read_is_built_with_later(
         write_pcd(near, random_points(np.random.default_rng(2), (20, 0), 201))
         raise refusal("changed", "the file changed while it was being read", path=path)
 
-    monkeypatch.setattr(source_reader, "read_source", rewritten_meanwhile)
+    monkeypatch.setattr(sources, "read_source", rewritten_meanwhile)
     made, without = one.make(layer, job)
     assert made.neighbours == (before,)  # what it knows nothing of is not the neighbour's new state
-    monkeypatch.setattr(source_reader, "read_source", read_source)
+    monkeypatch.setattr(sources, "read_source", read_source)
     made, data = one.make(layer, job)
     assert not made.cached
     assert made.neighbours == (SourceStamp.of(os.stat(near)),)

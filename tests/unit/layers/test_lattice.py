@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shmmap import build_layer
-from shmmap.layers import lattice
-from shmmap.layers.lattice import group_points
-from shmmap.layers.ndt import CONVENTIONS, voxel_covariances
+from shmmap.layers import voxels
+from shmmap.layers.voxels import CONVENTIONS, group_points, voxel_covariances
 from tests.support.layer_oracles import covariance_of, voxels_of
 
 ORIGINS = st.sampled_from([0.0, 89_570.0, -42_300.5, 1e6, -3e5])
@@ -39,18 +38,18 @@ def clouds(draw: st.DrawFn) -> tuple[NDArray[Any], float]:
 @settings(max_examples=150, deadline=None)
 def test_every_point_is_in_its_voxel(given_cloud: tuple[NDArray[Any], float]) -> None:
     cloud, leaf = given_cloud
-    voxels = voxels_of(cloud, (leaf, leaf, leaf))
-    order = sorted(voxels, key=lambda index: index[::-1])  # x fastest
+    members = voxels_of(cloud, (leaf, leaf, leaf))
+    order = sorted(members, key=lambda index: index[::-1])  # x fastest
     by_table = group_points(cloud, (leaf, leaf, leaf))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lattice, "_SMALL_TABLE", -1)  # no table is small enough
-        patch.setattr(lattice, "_DENSE_POINTS", -1)
+        patch.setattr(voxels, "_SMALL_TABLE", -1)  # no table is small enough
+        patch.setattr(voxels, "_DENSE_POINTS", -1)
         by_sorting = group_points(cloud, (leaf, leaf, leaf))
     for grouping in (by_table, by_sorting):
         assert [tuple(index) for index in grouping.indices.tolist()] == order
-        assert grouping.counts.tolist() == [len(voxels[index]) for index in order]
+        assert grouping.counts.tolist() == [len(members[index]) for index in order]
         found = {index: np.flatnonzero(grouping.rows == row).tolist() for row, index in enumerate(order)}
-        assert found == voxels
+        assert found == members
 
 
 @given(clouds())
@@ -60,12 +59,12 @@ def test_moments_and_covariances_of_any_voxel(given_cloud: tuple[NDArray[Any], f
     finite = cloud[np.isfinite(cloud).all(axis=1)]
     near = finite[(np.abs(finite - finite[:1]) < 40 * leaf).all(axis=1)]  # the table covers their box
     table = build_layer(f"ndt(leaf={leaf},min_points=2)", near)
-    voxels = {index: rows for index, rows in voxels_of(near, (leaf,) * 3).items() if len(rows) > 1}
-    assert table.rows == len(voxels)
+    members = {index: rows for index, rows in voxels_of(near, (leaf,) * 3).items() if len(rows) > 1}
+    assert table.rows == len(members)
     assert table.lattice is not None
     for convention in CONVENTIONS:
         covariances, inverses = voxel_covariances(table["count"], table["scatter"], convention)
-        for index, rows in voxels.items():
+        for index, rows in members.items():
             i, j, k = np.subtract(index, table.lattice.first)
             row = table["table"][k, j, i]
             points = near[rows].astype(np.float64)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.build import build_layer
 from shmmap.layers.contract import LayerTable
-from shmmap.layers.ndt import CONVENTIONS, Convention, voxel_covariances
+from shmmap.layers.voxels import CONVENTIONS, Convention, voxel_covariances
 from shmmap.testing.layer_conformance import CORNERS, corner, surface
 from tests.support.layer_oracles import covariance_of, voxels_of
 

@@ -14,12 +14,12 @@ import xxhash
 
 from shmmap.errors import MapDataError
 from shmmap.formats.pcd.writer import write_pcd
-from shmmap.layers.derive import CellJob
-from shmmap.layers.making import make_layer
+from shmmap.layers.build import make_layer
 from shmmap.layers.points import BUILDER_VERSION, build_points
+from shmmap.layers.sources import CellJob
 from shmmap.layers.spec import layer_spec
 from shmmap.segment.header import unpack_header
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 from tests.support.cloud_bytes import Field, column, pcd
 
 ENCODINGS = ("ascii", "binary", "binary_compressed")

@@ -14,7 +14,7 @@ import pytest
 import shmmap.layers
 from shmmap.layers.__main__ import main
 from shmmap.layers.build import build_layer
-from shmmap.layers.registry import kinds
+from shmmap.layers.spec import kinds
 from tests.support.divided_map import random_points, write_pcd
 
 DOCUMENT = (Path(shmmap.layers.__file__).parent / "LAYERS.md").read_text(encoding="utf-8")

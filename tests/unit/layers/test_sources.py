@@ -13,15 +13,14 @@ import pytest
 
 from shmmap.errors import MapDataError
 from shmmap.formats.pcd.reader import PcdReader
-from shmmap.layers import source_reader, sources
+from shmmap.layers import sources
+from shmmap.layers.build import derive, read_halo
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob, derive, read_halo
-from shmmap.layers.source_reader import FILES
-from shmmap.layers.sources import CellSource, read_segment, read_source
+from shmmap.layers.sources import FILES, CellJob, CellSource, read_segment, read_source
 from shmmap.layers.spec import parse_layer
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.publish_block import PublishBlock, pack_publish_block
-from shmmap.segment.source import Source
+from shmmap.segment.header import PublishBlock, pack_publish_block
+from shmmap.segment.version import Source
 from tests.support.divided_map import random_points, write_pcd
 
 BOX: Box = (0.0, 0.0, 20.0, 20.0)
@@ -94,7 +93,7 @@ def test_without_memory_for_a_neighbour_the_neighbour_is_named(
     def full(*_: Any) -> CellSource:
         raise MemoryError
 
-    monkeypatch.setattr(source_reader, "read_source", full)
+    monkeypatch.setattr(sources, "read_source", full)
     with pytest.raises(MapDataError, match=r"neighbour\.pcd: this neighbour takes more memory") as caught:
         read_halo(FILES, [Source(str(tmp_path / "neighbour.pcd"))], BOX, 5.0, XYZ)
     assert "smaller cells" in caught.value.hint

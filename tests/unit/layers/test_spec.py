@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest
-from shmmap.layers.registry import find_kind, kinds
-from shmmap.layers.spec import canonical_layer, canonical_layers, parse_layer
+from shmmap.layers.spec import canonical_layer, canonical_layers, find_kind, kinds, parse_layer
 
 
 @pytest.mark.parametrize(

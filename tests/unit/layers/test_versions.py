@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from shmmap.errors import BadRequest
-from shmmap.layers import registry
+from shmmap.layers import spec
 from shmmap.layers import versions as layer_versions
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
@@ -59,9 +59,9 @@ def one(tmp_path: Path) -> Map:
 
 @pytest.fixture
 def kinds_as_before() -> Iterator[None]:
-    before = dict(registry._own)
+    before = dict(spec._own)
     yield
-    registry._own.update(before)
+    spec._own.update(before)
     forget_kinds()
 
 
@@ -116,8 +116,8 @@ def test_a_file_that_changes_changes_its_layers_and_those_that_look_into_it(one:
 def test_another_builder_changes_its_own_layer_alone(one: Map) -> None:
     layers = ["points", NDT, "voxel(leaf=1.0)", "ndt(leaf=2.0,of=voxel(leaf=1.0))", "denoise"]
     before = one.all(layers)
-    voxel = registry._own["voxel"]
-    registry._own["voxel"] = replace(voxel, builder_version=voxel.builder_version + 1)
+    voxel = spec._own["voxel"]
+    spec._own["voxel"] = replace(voxel, builder_version=voxel.builder_version + 1)
     forget_kinds()
     changed = others(before, one.all(layers))
     assert {layer for _, layer in changed} == {"voxel(leaf=1.0)", "ndt(leaf=2.0,of=voxel(leaf=1.0))"}

@@ -13,7 +13,7 @@ import pytest
 from shmmap import errors
 from shmmap.protocol import events, live
 from shmmap.protocol import messages as m
-from shmmap.segment import header, layout, publish_block
+from shmmap.segment import header, layout
 from shmmap.statistics import layout as statistics_layout
 from shmmap.statistics.cell_rows import CELL_ROW_BYTES
 from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
@@ -150,7 +150,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
 @pytest.mark.parametrize(
     ("document", "ends"),
     [
-        (LAYOUT, [header.OUTSIDE_AT + 8, layout.COLUMN.size, publish_block.PUBLISH.size]),
+        (LAYOUT, [header.OUTSIDE_AT + 8, layout.COLUMN.size, header.PUBLISH.size]),
         (
             STATISTICS,
             [

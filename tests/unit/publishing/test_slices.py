@@ -16,7 +16,7 @@ from tests.support.divided_map import DividedMap, make_map
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.dividing.settings import NoProgress
-from shmmap.layers.source_reader import FILES
+from shmmap.layers.sources import FILES
 from shmmap.origin.map_directory import open_map
 from shmmap.origin.remote.map_versions import read_shards, require_current
 from shmmap.origin.remote.object_tier import KeptObjects
@@ -28,7 +28,7 @@ from shmmap.publishing.messages import PublishSettings
 from shmmap.publishing.publish import publish_map
 from shmmap.publishing.slice_worker import PublishedPoints
 from shmmap.publishing.slicing import read_base
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 
 
 @pytest.fixture

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.layers import making
-from shmmap.layers.derive import CellJob
+from shmmap.layers import build
+from shmmap.layers.build import make_layer
 from shmmap.layers.disk_cache import LayerCache
-from shmmap.layers.making import make_layer
-from shmmap.layers.source_reader import Files
+from shmmap.layers.sources import CellJob, Files
 from shmmap.layers.spec import layer_spec
-from shmmap.prepare.work import CellTask
+from shmmap.prepare.task_pool import CellTask
 from tests.support.divided_map import DividedMap, make_map
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -22,7 +21,7 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 from shmmap.publishing import worker
 from shmmap.publishing.messages import KnownObjects
 from shmmap.publishing.worker import CellMaker, LayerRefused
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 
 LAYERS = ("points", "sample(every=2)", "sample(count=50)")
 
@@ -56,7 +55,7 @@ def test_layers_prepared_before_come_out_of_the_cache(
     def built(*arguments: object, **options: object) -> None:
         raise AssertionError("it is there already")
 
-    monkeypatch.setattr(making, "derive", built)
+    monkeypatch.setattr(build, "derive", built)
     monkeypatch.setattr(Files, "fill", built)
     again = CellMaker(KnownObjects(""), cache).make(task)
     assert [layer.name for layer in again.layers] == [layer.name for layer in made.layers]
@@ -76,7 +75,7 @@ def test_a_layer_that_is_too_large_is_refused(town: DividedMap, monkeypatch: pyt
 
 def test_a_file_that_changes_meanwhile_is_refused(town: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     task = task_of(town)
-    make = making.make_layer
+    make = build.make_layer
 
     def slowly(*arguments: object, **options: object) -> object:
         made = make(*arguments, **options)  # type: ignore[arg-type]

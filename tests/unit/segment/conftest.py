@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.publish_block import PublishBlock
+from shmmap.segment.header import PublishBlock
 from tests.support.segments import publish_segment
 
 Publish = Callable[..., str]

@@ -18,11 +18,10 @@ import pytest
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.segment import attach as attach_module
-from shmmap.segment.attach import attach
+from shmmap.segment.attach import Owned, attach
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory
-from shmmap.segment.owned import Owned
+from shmmap.segment.header import PublishBlock
 from shmmap.segment.pins import prepare_process
-from shmmap.segment.publish_block import PublishBlock
 from tests.support.process_costs import mappings_under
 from tests.support.segment_reader import read_segment
 from tests.support.segments import write_segment

@@ -14,9 +14,14 @@ from xxhash import xxh3_64_intdigest
 
 from shmmap.columns import ColumnSpec
 from shmmap.errors import SegmentCorrupt
-from shmmap.segment.header import pack_header, unpack_header
+from shmmap.segment.header import (
+    PublishBlock,
+    pack_header,
+    pack_publish_block,
+    unpack_header,
+    unpack_publish_block,
+)
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp, header_size, plan_columns
-from shmmap.segment.publish_block import PublishBlock, pack_publish_block, unpack_publish_block
 from shmmap.segment.version import cell_version, layer_version
 from tests.support.segment_reader import parse
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from shmmap.segment.owned import Owned
+from shmmap.segment.attach import Owned
 
 
 def owned(gone: list[int]) -> Owned:

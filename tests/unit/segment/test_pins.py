@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from shmmap.segment import pins
 from shmmap.segment.attach import AttachedSegment, attach
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.header import PublishBlock
 from shmmap.segment.pins import MAX_SLOT, holders, in_use, lock_slot, prepare_process
-from shmmap.segment.publish_block import PublishBlock
 from tests.support.mapping_process import MappingProcess
 from tests.support.segments import publish_segment
 from tests.unit.segment.conftest import Publish

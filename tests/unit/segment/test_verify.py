@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from shmmap.errors import SegmentCorrupt
+from shmmap.segment.header import PublishBlock, pack_publish_block, read_header, verify_file
 from shmmap.segment.layout import SegmentHeader
-from shmmap.segment.publish_block import PublishBlock, pack_publish_block
-from shmmap.segment.verify import read_header, verify_file
 from tests.support.segments import write_segment
 
 ROWS = 40_000

@@ -17,14 +17,14 @@ from shmmap.daemon.loading import lost_workers, worker_messages
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.worker_pool import Worker
 from shmmap.daemon.records import Failure, Key
-from shmmap.layers.derive import CellJob, Neighbour
+from shmmap.layers.sources import CellJob, Neighbour
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.processes.start_child import channel
 from shmmap.protocol.messages import Area, CircleMessage, Selected
 from shmmap.segment.layout import SourceStamp
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 from tests.support.daemon_process import wait_readable
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon

@@ -24,15 +24,12 @@ from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, WorkerPool
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import Offline
 from shmmap.layers.contract import Box
-from shmmap.layers.derive import CellJob
-from shmmap.layers.source_reader import FILES
-from shmmap.layers.sources import CellSource
+from shmmap.layers.sources import FILES, CellJob, CellSource
 from shmmap.layers.spec import LayerSpec
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SegmentHeader
-from shmmap.segment.source import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 from tests.support.divided_map import random_points, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)

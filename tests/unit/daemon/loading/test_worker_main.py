@@ -23,10 +23,9 @@ import shmmap
 from shmmap.daemon.loading import worker_messages
 from shmmap.processes.packets import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
+from shmmap.segment.header import PublishBlock
 from shmmap.segment.pins import in_use, prepare_process
-from shmmap.segment.publish_block import PublishBlock
-from shmmap.segment.source import Source
-from shmmap.segment.version import cell_version
+from shmmap.segment.version import Source, cell_version
 from tests.support.daemon_process import until, wait_ended, wait_readable
 from tests.support.divided_map import random_points, write_ascii, write_pcd
 

@@ -18,7 +18,7 @@ from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Wo
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.protocol.messages import Selected
 from shmmap.segment.directory import ShmDirectory
-from shmmap.segment.source import Source
+from shmmap.segment.version import Source
 from tests.support.daemon_process import stop, wait_ended
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, names

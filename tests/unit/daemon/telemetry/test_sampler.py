@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
+from shmmap.daemon.loading.look_ahead import IN_A_ROW
 from shmmap.daemon.telemetry.sampler import (
     BEAT_S,
     CHANGE_BEAT_S,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from shmmap.errors import MapDataError
 from shmmap.segment.header import unpack_header
 from shmmap.segment.layout import Lattice, SourceStamp
-from shmmap.segment.table_writer import SegmentOrigin, write_table
+from shmmap.segment.writer import SegmentOrigin, write_table
 from tests.support.fuzzing import mutate_bytes
 from tests.support.segments import write_segment as segment_of
 

@@ -8,7 +8,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW, PROBE_S, OriginHealth
+from shmmap.daemon.loading.look_ahead import IN_A_ROW, PROBE_S, OriginHealth
 
 
 def test_before_the_first_load() -> None:

@@ -10,9 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW, PROBE_S
-from shmmap.daemon.loading.prefetch.prefetch import COMPARED_AT_ONCE, LOOKS_AT_ONCE, SLACK_S, Prefetch, Wish
-from shmmap.daemon.loading.prefetch.way_ahead import PASS_S, WayAhead
+from shmmap.daemon.loading.look_ahead import (
+    COMPARED_AT_ONCE,
+    IN_A_ROW,
+    LOOKS_AT_ONCE,
+    PASS_S,
+    PROBE_S,
+    SLACK_S,
+    Prefetch,
+    WayAhead,
+    Wish,
+)
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
 from shmmap.origin.catalogue import Catalogue

@@ -12,9 +12,8 @@ import pytest
 
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import PREFETCH
-from shmmap.daemon.loading.prefetch.origin_health import IN_A_ROW
-from shmmap.daemon.loading.prefetch.prefetch import URGENT_S
-from shmmap.daemon.loading.prefetch.prefetcher import FULL_S, KEPT, MOST_WAYS
+from shmmap.daemon.loading.look_ahead import IN_A_ROW, URGENT_S
+from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MOST_WAYS
 from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.events import Loaded, decode_event

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmmap.daemon.loading.prefetch.way_ahead import BESIDE_M, MOST_CELLS, LookAhead, WayAhead
+from shmmap.daemon.loading.look_ahead import BESIDE_M, MOST_CELLS, LookAhead, WayAhead
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Area, AutowareSquare, Box, Circle
 from shmmap.origin.catalogue import Catalogue

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A dictionary of very many entries that never takes long: a dict makes its table anew all at once.
-
-With 100 000 entries that takes 4 ms, and dictionaries of the same things do it at the same time.  Here the
-entries are shared out among many small ones, once there are many.  Looking something up takes three times as
-long as in one dict.
-"""
+"""Dictionaries and arrays as long as a map, of which no single step takes long."""
 
 from __future__ import annotations
 
+import contextlib
+import math
+import mmap
 from collections.abc import Hashable, Iterator, MutableMapping
 from typing import Any, Final, TypeVar, overload
 
-__all__ = ["ShardedDict"]
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+__all__ = [
+    "ShardedDict",
+    "sparse_zeros",
+]
+
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -94,3 +99,18 @@ class ShardedDict(MutableMapping[K, V]):
         return dict(self) == (dict(other) if isinstance(other, ShardedDict) else other)
 
     __hash__ = None  # type: ignore[assignment]
+
+
+SMALL_BYTES: Final = 1 << 21
+"""For less numpy does not ask for huge pages, and no other memory is worth a mapping."""
+
+
+def sparse_zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array of zeros that takes memory by small pages, as it is written."""
+    nbytes = math.prod(shape if isinstance(shape, tuple) else (shape,)) * np.dtype(dtype).itemsize
+    if nbytes < SMALL_BYTES:
+        return np.zeros(shape, dtype)
+    memory = mmap.mmap(-1, nbytes, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with contextlib.suppress(OSError):  # a kernel without huge pages
+        memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype).reshape(shape)

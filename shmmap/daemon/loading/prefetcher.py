@@ -16,8 +16,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.loading.prefetch.prefetch import URGENT_S, Prefetch
-from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
+from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch, WayAhead
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
 from shmmap.daemon.transport.sessions import MOVES_AT_ONCE, Session

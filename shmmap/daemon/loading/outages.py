@@ -1,26 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fetches ahead onto the disk what does not fit in memory, to bridge outages of the store.
+"""Outages of a published map's store: noticed, bridged from the disk, and followed by another try.
 
-It looks along the same paths as `Prefetcher`, as far ahead, and begins where `Prefetcher` has no room.  It
-fetches objects of cells that are neither in memory nor on the disk, in the order in which they will be
-needed, and only while no load waits for a loader.
+`DiskAhead` fetches onto the disk what does not fit in memory.  It looks along the same paths as `Prefetcher`,
+as far ahead, and begins where `Prefetcher` has no room.  It fetches objects of cells that are neither in
+memory nor on the disk, in the order in which they will be needed, and only while no load waits for a loader.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.loading.prefetch.prefetch import Prefetch
-from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
+from shmmap.daemon.loading.look_ahead import Prefetch, WayAhead
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.object_keeper import KeptCell, ObjectKeeper
+from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.records import Key
 from shmmap.layers.points import LAYER
 from shmmap.origin.remote.published_object import ObjectName, unpack_source
 
-__all__ = ["DiskAhead"]
+__all__ = [
+    "DiskAhead",
+    "OriginWatch",
+]
+
+
+@dataclass(eq=False, slots=True)
+class OriginWatch:
+    """A chore of the serving loop.
+
+    Parameters
+    ----------
+    try_again
+        Has fetched what of the list of cells could not be had.
+    reload
+        Called when there is another version of the map.
+    """
+
+    link: OriginLink
+    scheduler: Scheduler
+    try_again: Callable[[], None]
+    reload: Callable[[], None]
+
+    @property
+    def next_s(self) -> float:
+        """At once when a load could not read what it needs, or never."""
+        failed = self.scheduler.prefetcher.prefetch.health.failed_in_a_row
+        return -math.inf if failed and not self.link.is_doubted else math.inf
+
+    def turn(self, now_s: float) -> None:
+        """Find out whether the origin is out of reach."""
+        del now_s
+        self.link.doubt()
+
+    def collect(self) -> None:
+        """Act on what was found out."""
+        news = self.link.take()
+        health = self.scheduler.prefetcher.prefetch.health
+        health.unreachable = self.link.is_out
+        if news.back:
+            health.failed_in_a_row, health.waited_s = 0, 0.0
+            self.scheduler.loads.forget_failures()
+            self.scheduler.prefetcher.restart()
+            self.try_again()
+        if news.changed:
+            self.reload()
+
 
 LOOK_S: Final = 0.25
 """Interval of looking whether memory has room and whether loads wait, seconds."""
