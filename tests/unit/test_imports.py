@@ -37,6 +37,7 @@ BASE = {
     "sparse_table",
     "disk_budget",
     "lazy_names",
+    "version",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -52,8 +53,9 @@ PARTS = {
     "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
     "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
     "protocol": {"errors", "columns", "geometry"},
-    "kernel_cache": {"logfmt"},
-    "compiling": {"kernel_cache"},
+    "kernel_cache": {"logfmt", "version"},
+    "compiling": {"kernel_cache", "version"},
+    "version": set[str](),
     "sharded_dict": set[str](),
     "sparse_table": set[str](),
     "disk_budget": {"failpoints"},
