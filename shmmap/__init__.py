@@ -20,6 +20,7 @@ import shmmap.errors as _errors
 from shmmap.lazy_names import lazy_names
 from shmmap.optional_packages import needed_packages
 from shmmap.segment.process_limits import no_files_left
+from shmmap.version import __version__
 
 if TYPE_CHECKING:
     from shmmap.chunks.occupancy import Occupancy
@@ -90,8 +91,6 @@ if TYPE_CHECKING:
     from shmmap.layers.voxels import voxel_covariances
     from shmmap.protocol.live import LiveMapRow
     from shmmap.protocol.messages import HeldCell, Holder, Intent
-
-__version__ = "0.2.0"
 
 __all__ = [
     "Area",

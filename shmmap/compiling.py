@@ -24,8 +24,8 @@ import numba.core.serialize
 from numba.core.caching import NullCache
 from numba.core.typeinfer import register_dispatcher
 
-from shmmap import __version__
 from shmmap.kernel_cache import discard, read_kernel, write_kernel
+from shmmap.version import __version__
 
 __all__ = ["compiled", "inlined", "read_only"]
 

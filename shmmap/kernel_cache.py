@@ -27,8 +27,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from shmmap import __version__
 from shmmap.logfmt import log
+from shmmap.version import __version__
 
 __all__ = ["all_kept", "compiled_mark", "discard", "kernel_directory", "read_kernel", "write_kernel"]
 

@@ -88,7 +88,7 @@ def area_from(args: argparse.Namespace) -> Area | None:
     """Return the area the options describe, or None where they name none."""
     if all(getattr(args, name) is None for name in ("circle", "square", "box", "z")):
         return None
-    from shmmap import geometry
+    import shmmap.geometry as geometry
 
     z = geometry.ZRange(*args.z) if args.z is not None else None
     if args.circle is not None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import numpy as np
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.errors import BadRequest
 from shmmap.protocol.messages import Intent
 

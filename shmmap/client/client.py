@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 import numpy as np
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.client.arguments import checked_intent, heights, names, timeout_s
 from shmmap.client.cell_set import CellSet, Held, HeldCells
 from shmmap.client.connection import until_served

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, overload
 
 import numpy as np
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.client.session import Session
 from shmmap.errors import NoAnswer
 from shmmap.protocol import messages

@@ -33,7 +33,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from shmmap import __version__
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig, option_of
 from shmmap.daemon.config_live import state_directory
@@ -77,6 +76,7 @@ from shmmap.origin.remote.store import is_published, is_url, read_url
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 from shmmap.statistics.exclusive_name import refuse_second
+from shmmap.version import __version__
 
 if TYPE_CHECKING:
     from shmmap.daemon.map.published_origin import PublishedOrigin

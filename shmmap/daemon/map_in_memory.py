@@ -9,7 +9,6 @@ import secrets
 import time
 from typing import NamedTuple
 
-from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
@@ -34,6 +33,7 @@ from shmmap.segment.names import segment_prefix
 from shmmap.segment.process_limits import limit_behind
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
+from shmmap.version import __version__
 
 __all__ = ["FetchedFrom", "MapInMemory"]
 

@@ -10,7 +10,6 @@ import resource
 import time
 from typing import Final
 
-import shmmap
 from shmmap.daemon.host.groups import account_name
 from shmmap.daemon.pins.probe import probe_pins
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
@@ -20,6 +19,7 @@ from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import usual_directory
 from shmmap.statistics.reader import read_statistics
+from shmmap.version import __version__
 
 __all__ = [
     "check_daemon",
@@ -79,10 +79,10 @@ def check_daemon(patient: Patient) -> Finding:
             f"{fact}; it survived {counted(defects, 'exception')}",
             "please report the tracebacks in its log: journalctl -u shmmapd -g defect",
         )
-    if identity.library_version != shmmap.__version__:
+    if identity.library_version != __version__:
         return warn(
             name,
-            f"{fact}; it is version {identity.library_version}, installed is {shmmap.__version__}",
+            f"{fact}; it is version {identity.library_version}, installed is {__version__}",
             "restart it (cells stay in memory): systemctl restart shmmapd",
         )
     return ok(name, fact)

@@ -7,7 +7,7 @@ from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.errors import BadRequest
 
 __all__ = [

@@ -23,7 +23,7 @@ LOADER = "daemon/loading/worker_main.py"
 
 def upgraded(package: Path) -> None:
     """Another version, whose loaders start and speak as ours do."""
-    path = package / "__init__.py"
+    path = package / "version.py"
     text = path.read_text(encoding="utf-8")
     changed = text.replace(f'"{shmmap.__version__}"', '"99.0.0"')
     assert changed != text

@@ -36,6 +36,7 @@ BASE = {
     "large_tables",
     "disk_budget",
     "lazy_names",
+    "version",
 }
 PARTS = {
     # part: what it may import besides itself
@@ -51,8 +52,9 @@ PARTS = {
     "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
     "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
     "protocol": {"errors", "columns", "geometry"},
-    "kernel_cache": {"logfmt"},
-    "compiling": {"kernel_cache"},
+    "kernel_cache": {"logfmt", "version"},
+    "compiling": {"kernel_cache", "version"},
+    "version": set[str](),
     "large_tables": set[str](),
     "disk_budget": {"failpoints"},
     "lazy_names": set[str](),

@@ -18,9 +18,9 @@ Exit code: 0."""
 
 def installed_version() -> str:
     """Return the version of this package."""
-    import shmmap
+    from shmmap.version import __version__
 
-    return shmmap.__version__
+    return __version__
 
 
 def add_parser(subparsers: Subparsers) -> None:

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey, voxel_centers
 from shmmap.client.arguments import checked_seconds

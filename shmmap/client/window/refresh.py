@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 import msgspec
 import numpy as np
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet
 from shmmap.client.client import Client

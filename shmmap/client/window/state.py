@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import msgspec
 import numpy as np
 
-from shmmap import geometry
+import shmmap.geometry as geometry
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import PendingLayer
 from shmmap.errors import CellError, Offline, OverBudget

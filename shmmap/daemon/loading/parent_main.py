@@ -23,13 +23,13 @@ import traceback
 from dataclasses import dataclass, field
 from typing import Final, NoReturn
 
-from shmmap import __version__
 from shmmap.daemon.host.scheduling import take_slices
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
 from shmmap.kernel_cache import compiled_mark
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.packets import receive_packet
+from shmmap.version import __version__
 
 __all__ = [
     "compile_in_child",

@@ -14,7 +14,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.cache.survey import Share, Usage
@@ -33,6 +32,7 @@ from shmmap.origin.spatial_index import touches
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 from shmmap.protocol.events import Recent
+from shmmap.version import __version__
 
 __all__ = ["MapQueries"]
 
