@@ -34,7 +34,7 @@ from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.protocol.messages import Intent
-from shmmap.statistics.cell_rows import CELL_ROW_BYTES
+from shmmap.statistics.layout import CELL_ROW_BYTES
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.make_many_cells import CELL_METRES, make_many_cells
 from tests.support import connections

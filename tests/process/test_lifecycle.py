@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import shmmap
-from shmmap.statistics.cell_rows import CellRow
+from shmmap.protocol.rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, wait_ended
