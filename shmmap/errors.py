@@ -46,7 +46,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 if TYPE_CHECKING:
-    from shmmap.protocol.replies import Holder
+    from shmmap.protocol.rows import Holder
 
 __all__ = [
     "BadRequest",

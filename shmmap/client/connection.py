@@ -191,10 +191,11 @@ class Connection:
                 f"{self.path}: the answer to Hello was {type(reply).__name__}", hint=_UPDATE_HINT
             )
         if reply.major != PROTOCOL_VERSION[0]:
+            older = "daemon" if reply.major < PROTOCOL_VERSION[0] else "client"
             raise ProtocolMismatch(
                 f"{self.path}: the daemon speaks protocol {reply.major}.{reply.minor}, "
                 f"this client {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
-                hint=_UPDATE_HINT,
+                hint=f"update the {older}, and restart it",
             )
         self._slot = reply.session
         self.welcome: Welcome = reply

@@ -39,8 +39,8 @@ from shmmap.demo.localization import (
 from shmmap.demo.progress import Progress
 from shmmap.processes.end_with_parent import with_us
 from shmmap.processes.interrupts import scratch_directory
+from shmmap.protocol.rows import CellRow
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.statistics.cell_rows import CellRow
 from shmmap.testing.daemon_process import DaemonProcess
 
 __all__ = ["DemoResult", "Round", "run_demo"]

@@ -109,7 +109,7 @@ def check_prefetching(patient: Patient) -> Finding:
     if not patient.alive or patient.seen is None:
         return skip(name, "no daemon runs")
     count = patient.seen.counters
-    misses = count.get("cells_late_10min", 0)
+    misses = count.get("prefetch_misses_10min", 0)
     waited = (
         f"moving clients waited for {counted(misses, 'cell') if misses else 'no cell'} in the last 10 min"
     )

@@ -17,10 +17,9 @@ from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.memory import mount_of
 from shmmap.doctor.patient import Patient
 from shmmap.errors import ConfigError, ShmmapError
-from shmmap.protocol.live import LiveMapRow
+from shmmap.protocol.rows import LiveMapRow
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.statistics.live_rows import LiveRow
 
 __all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
 
@@ -36,7 +35,7 @@ ROOM_BYTES: Final = 64 << 20
 _MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # with a group of mappers, and without
 
 
-def _rows(patient: Patient) -> list[LiveRow]:
+def _rows(patient: Patient) -> list[LiveMapRow]:
     return patient.seen.live if patient.alive and patient.seen is not None else []
 
 
@@ -73,7 +72,7 @@ def check_live_maps(patient: Patient) -> Finding:
             what,
             "see to its files and its disk: it is tried again, and what is in memory stays there meanwhile",
         )
-    if damaged := sum(row.damaged for row in rows):
+    if damaged := sum(row.damaged_count for row in rows):
         texts = [f"{row.name}: {text}" for row in _told(patient) for text in row.damaged][:NAMED]
         named = f" ({'; '.join(texts)}{'; …' if damaged > NAMED else ''})" if texts else ""
         return warn(

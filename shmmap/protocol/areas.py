@@ -21,7 +21,7 @@ __all__ = [
     "area_to_message",
 ]
 
-MOST_VERTICES: Final = 4096
+MAX_VERTICES: Final = 4096
 """Of a route, as it may be sent; the daemon goes by its beginning."""
 
 
@@ -96,7 +96,7 @@ class Intent(msgspec.Struct, array_like=True, frozen=True):
     vx: float = 0.0
     vy: float = 0.0
     heading: float | None = None
-    route: Annotated[tuple[tuple[float, float], ...], msgspec.Meta(max_length=MOST_VERTICES)] = ()
+    route: Annotated[tuple[tuple[float, float], ...], msgspec.Meta(max_length=MAX_VERTICES)] = ()
 
 
 class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):

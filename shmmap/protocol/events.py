@@ -25,7 +25,6 @@ __all__ = [
     "Evicted",
     "Failed",
     "Joined",
-    "Late",
     "Left",
     "LiveChanged",
     "LiveDamaged",
@@ -34,6 +33,7 @@ __all__ = [
     "LiveStarted",
     "Loaded",
     "LongTurn",
+    "PrefetchMiss",
     "Pressure",
     "Recent",
     "Reloaded",
@@ -131,8 +131,8 @@ class Pressure(_Numbered, tag="pressure", frozen=True):
     zombie_bytes: int
 
 
-class Late(_Numbered, tag="late", frozen=True):
-    """A client on its way had to wait for cells: how many since the last such event, and one of them.
+class PrefetchMiss(_Numbered, tag="prefetch_miss", frozen=True):
+    """A moving client had to wait for cells: how many since the last such event, and one of them.
 
     At most one a second for each client.
     """
@@ -148,14 +148,14 @@ class Late(_Numbered, tag="late", frozen=True):
 class Reloaded(_Numbered, tag="reload", frozen=True):
     """The map's catalogue was read again; ``error`` says why that failed.
 
-    The first ``told`` of its changes follow as `Changed`.
+    The first ``listed`` of its changes follow as `Changed`.
     """
 
     map_version: int
     changed: int
     added: int
     removed: int
-    told: int
+    listed: int
     error: str = ""
 
 
@@ -239,7 +239,7 @@ Event: TypeAlias = (
     | Failed
     | Retried
     | Pressure
-    | Late
+    | PrefetchMiss
     | Reloaded
     | LongTurn
     | Joined

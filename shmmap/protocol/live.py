@@ -11,12 +11,13 @@ from typing import Annotated, Final, TypeAlias
 import msgspec
 
 from shmmap.protocol.areas import BoxMessage
+from shmmap.protocol.rows import LiveMapRow
 
 __all__ = [
     "FURTHEST_M",
     "LIVE_REQUESTS",
-    "MOST_CHUNK_ROWS",
-    "MOST_NAME_BYTES",
+    "MAX_CHUNK_ROWS",
+    "MAX_NAME_BYTES",
     "LiveApplied",
     "LiveArea",
     "LiveChunkPage",
@@ -41,13 +42,13 @@ __all__ = [
     "SphereMessage",
 ]
 
-MOST_NAME_BYTES: Final = 64
-MOST_CHUNK_ROWS: Final = 1000
+MAX_NAME_BYTES: Final = 64
+MAX_CHUNK_ROWS: Final = 1000
 """Rows of one page of chunks."""
 FURTHEST_M: Final = 1e150
 """Place and radius of a sphere are less, metres: so that their squares are numbers."""
 
-Name: TypeAlias = Annotated[str, msgspec.Meta(max_length=MOST_NAME_BYTES)]
+Name: TypeAlias = Annotated[str, msgspec.Meta(max_length=MAX_NAME_BYTES)]
 Point: TypeAlias = tuple[float, float, float]
 Key: TypeAlias = tuple[int, int, int]
 
@@ -159,64 +160,6 @@ LIVE_REQUESTS: Final = (
 )  # fmt: skip
 
 
-class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
-    """How a live map is.
-
-    Attributes
-    ----------
-    chunks, active, bytes
-        Chunks in memory, known voxels in them, and their memory.
-    loading, dirty, saving
-        Chunks that are being read, that are changed and not saved, that are being written.
-    evicting, evicting_bytes
-        0: memory of a chunk that is given up is free at once.
-    waiting_bytes
-        Scans that wait for chunks or for memory.
-    files, file_bytes
-        Chunks on disk.
-    scans, durable
-        Scans applied since the start, and of these how many are on the disk.
-    damaged
-        Files that were put aside, chunks that are missing.
-    mappers
-        Who has mapped, ``uid/name``.
-    problem
-        What keeps chunks from being saved or loaded just now; empty: nothing.
-    change
-        Number of the map's last change, as in `LiveChunkPage`.
-    beside_bytes
-        Memory of lists of voxels and of marks, within the budget as the chunks.
-    readers
-        Sessions whose requests took most of the worker's time in the last seconds, and how much of one
-        processor each took, in thousandths; the greatest first.
-    """
-
-    name: str
-    path: str
-    resolution: float
-    frame_id: str
-    chunks: int
-    active: int
-    bytes: int
-    loading: int
-    dirty: int
-    saving: int
-    evicting: int
-    evicting_bytes: int
-    waiting_bytes: int
-    files: int
-    file_bytes: int
-    scans: int
-    durable: int
-    budget_bytes: int
-    damaged: tuple[str, ...] = ()
-    mappers: tuple[str, ...] = ()
-    problem: str = ""
-    change: int = 0
-    beside_bytes: int = 0
-    readers: tuple[tuple[int, int], ...] = ()
-
-
 class LiveListed(msgspec.Struct, array_like=True, tag="live_listed"):
     """Answer to `LiveList`."""
 
@@ -239,11 +182,9 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
         Chunks are ``prefix`` + key + ``.`` + generation in this directory.
     marks_dir
         Where files of marks are to lie; empty for who does not map.
-    slot
-        Of no use: chunks are not locked any more.
     mapper, next_scan
         The mapper's number, and the least that a new scan of it may have.
-    most_marks_bytes
+    max_marks_bytes
         The longest file of marks.
     probabilities
         The six that the log-odds stand for, as they were set.
@@ -263,11 +204,10 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     free_below: int
     shm_dir: str
     prefix: str
-    slot: int
     marks_dir: str = ""
     mapper: int = 0
     next_scan: int = 1
-    most_marks_bytes: int = 0
+    max_marks_bytes: int = 0
     probabilities: tuple[float, ...] = ()
     applied: int = 0
 

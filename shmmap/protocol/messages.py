@@ -26,7 +26,6 @@ from shmmap.protocol.replies import (
     Evicted,
     FailedCell,
     Handle,
-    Holder,
     MetadataPage,
     MetadataRow,
     PendingCell,
@@ -35,9 +34,7 @@ from shmmap.protocol.replies import (
     Released,
     Reloaded,
     Reply,
-    SessionRow,
     ShownCell,
-    ShownSegment,
     StatsReply,
     Stopping,
     Welcome,
@@ -59,6 +56,7 @@ from shmmap.protocol.requests import (
     Stats,
     Unpin,
 )
+from shmmap.protocol.rows import CellRow, ClientRow, Holder, Window
 
 __all__ = [
     "PROTOCOL_VERSION",
@@ -66,8 +64,10 @@ __all__ = [
     "AreaMessage",
     "BoxMessage",
     "Bye",
+    "CellRow",
     "Cells",
     "CircleMessage",
+    "ClientRow",
     "Differential",
     "ErrorReply",
     "Evict",
@@ -92,10 +92,8 @@ __all__ = [
     "Reply",
     "Request",
     "Selected",
-    "SessionRow",
     "Show",
     "ShownCell",
-    "ShownSegment",
     "Shutdown",
     "SquareMessage",
     "Stats",
@@ -103,8 +101,9 @@ __all__ = [
     "Stopping",
     "Unpin",
     "Welcome",
+    "Window",
     "area_from_message",
     "area_to_message",
 ]
 
-PROTOCOL_VERSION: Final = (1, 6)
+PROTOCOL_VERSION: Final = (2, 0)

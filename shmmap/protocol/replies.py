@@ -9,6 +9,7 @@ import msgspec
 
 from shmmap.protocol.events import EventPage
 from shmmap.protocol.live import LiveReply
+from shmmap.protocol.rows import CellRow, ClientRow, Holder
 
 __all__ = [
     "Cells",
@@ -16,7 +17,6 @@ __all__ = [
     "Evicted",
     "FailedCell",
     "Handle",
-    "Holder",
     "MetadataPage",
     "MetadataRow",
     "PendingCell",
@@ -25,9 +25,7 @@ __all__ = [
     "Released",
     "Reloaded",
     "Reply",
-    "SessionRow",
     "ShownCell",
-    "ShownSegment",
     "StatsReply",
     "Stopping",
     "Welcome",
@@ -93,41 +91,6 @@ class PendingCell(msgspec.Struct, array_like=True, frozen=True):
 
     id: str
     layer: str
-
-
-class Holder(msgspec.Struct, array_like=True, frozen=True):
-    """Who uses memory of the daemon; ``str`` of it is a line to read.
-
-    Attributes
-    ----------
-    session : int
-        Number of the client's session; 0: a process maps segments without one.
-    pid, uid : int
-        Process and user according to the kernel; 0 and -1 where it does not tell.
-    client : str
-        What the client calls itself, by default its script's name.
-    bytes : int
-        Memory it uses.
-    cells : int
-        In how many segments; 0 where that is not counted.
-    command : str
-        What the kernel calls the process.
-    """
-
-    session: int
-    pid: int
-    uid: int
-    client: str
-    bytes: int
-    cells: int = 0
-    command: str = ""
-
-    def __str__(self) -> str:
-        what = f"{self.bytes} bytes" + (f" in {self.cells} cells" if self.cells else "")
-        if self.session == 0:
-            return f"unknown (not through the client library) holds {what}"
-        name = f" ({self.client})" if self.client else ""
-        return f"session {self.session:016x}, pid {self.pid}{name} holds {what}"
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
@@ -204,52 +167,16 @@ class Released(msgspec.Struct, array_like=True, tag="released"):
     request: int
 
 
-class SessionRow(msgspec.Struct, array_like=True, frozen=True):
-    """One client as the daemon sees it; ``pid`` is what the kernel says, 0 where it says nothing.
-
-    ``cells`` and ``bytes`` are what it was handed and did not say it dropped; ``mapped_bytes`` what
-    it maps according to the kernel, ``superseded`` the segments among them that have left service or have a
-    successor.
-    """
-
-    session: int
-    pid: int
-    uid: int
-    gid: int
-    client: str
-    command: str
-    cells: int
-    bytes: int
-    requests: int
-    idle_s: float
-    pose: tuple[float, float] | None = None
-    mapped_bytes: int = 0
-    superseded: int = 0
-    superseded_bytes: int = 0
-
-
 class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
-    """Answer to `Stats`: counters by name, sessions, and segments in use by processes without a session."""
+    """Answer to `Stats`: counters by name, sessions, segments in use by processes without a session."""
 
     request: int
     epoch: int
     map_version: int
     counters: dict[str, int]
-    sessions: tuple[SessionRow, ...]
+    sessions: tuple[ClientRow, ...]
     unknown_holders: int = 0
     unknown_bytes: int = 0
-
-
-class ShownSegment(msgspec.Struct, array_like=True, frozen=True):
-    """One segment of a shown cell; ``state`` is resident, stale or zombie (retired, but still in use)."""
-
-    layer: str
-    version: int
-    segment: str
-    state: str
-    bytes: int
-    points: int
-    holders: tuple[Holder, ...] = ()
 
 
 class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
@@ -266,7 +193,7 @@ class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
     max_x: float
     max_y: float
     source_bytes: int
-    segments: tuple[ShownSegment, ...]
+    segments: tuple[CellRow, ...]
     loading: tuple[str, ...] = ()
     failure: str = ""
     z_min: float | None = None

@@ -32,13 +32,13 @@ __all__ = [
     "Unpin",
 ]
 
-MOST_NAMES: Final = 20_000
+MAX_NAMES: Final = 20_000
 """Cells that a request names one by one."""
-MOST_LAYERS: Final = 64
+MAX_LAYERS: Final = 64
 
-Ids: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MOST_NAMES)]
-Layers: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MOST_LAYERS)]
-Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MOST_NAMES)]
+Ids: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MAX_NAMES)]
+Layers: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MAX_LAYERS)]
+Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NAMES)]
 
 
 class Hello(msgspec.Struct, array_like=True, tag="hello"):

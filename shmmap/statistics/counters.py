@@ -42,7 +42,7 @@ WINDOWED: Final = {
     "evictions": "Segments retired to make room",
     "loads_after_eviction": "Loads of cells that had been evicted to make room",
     "refused_over_budget": "Cells refused because the budget is full",
-    "cells_late": "Cells that a client on its way asked for and had to wait for",
+    "prefetch_misses": "Cells that a moving client requested and had to wait for",
 }
 """Counters of which the last 10 s, 1 min and 10 min are told: what the present state is judged by."""
 
@@ -147,7 +147,7 @@ COUNTERS: Final = (
     Counter("events_published", "counter", "", "Events of this life of the daemon"),
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
-    Counter("cells_late", "counter", "", WINDOWED["cells_late"]),
+    Counter("prefetch_misses", "counter", "", WINDOWED["prefetch_misses"]),
     Counter("prefetch_started", "counter", "", "Loads begun before anybody asked for the cell"),
     Counter("prefetch_used", "counter", "", "Segments fetched ahead that somebody then asked for"),
     Counter(

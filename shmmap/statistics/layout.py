@@ -12,14 +12,17 @@ from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.statistics.cell_rows import CELL_ROW_BYTES, MAX_CELLS
-from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS
 from shmmap.statistics.counters import Counter
 from shmmap.statistics.histogram import BUCKETS
-from shmmap.statistics.live_rows import LIVE_ROW_BYTES, MAX_LIVE
 
 __all__ = [
+    "CELL_ROW_BYTES",
+    "CLIENT_ROW_BYTES",
     "LAYOUT_VERSION",
+    "LIVE_ROW_BYTES",
+    "MAX_CELLS",
+    "MAX_CLIENTS",
+    "MAX_LIVE",
     "Header",
     "State",
     "pack_header",
@@ -32,9 +35,16 @@ __all__ = [
 ]
 
 MAGIC: Final = b"SHMSTAT\x01"
-LAYOUT_VERSION: Final = (1, 5)
+LAYOUT_VERSION: Final = (2, 0)
 BYTE_ORDER: Final = 0x01020304
 PAGE_BYTES: Final = 4096
+
+CELL_ROW_BYTES: Final = 256
+CLIENT_ROW_BYTES: Final = 256
+LIVE_ROW_BYTES: Final = 1024
+MAX_CELLS: Final = 1 << 17  # 32 MiB of rows; further cells are counted, not listed
+MAX_CLIENTS: Final = 256  # further ones are counted, not listed
+MAX_LIVE: Final = 64  # further ones are not shown
 
 START: Final = struct.Struct("<8sHHI12I")
 EXTENSION: Final = struct.Struct("<9I24xI")
@@ -64,15 +74,15 @@ class Header(NamedTuple):
     rows_offset: int
     row_bytes: int
     max_rows: int
-    histograms: tuple[Counter, ...] = ()
-    bucket_count: int = 0
-    clients_offset: int = 0
-    client_row_bytes: int = 0
-    max_clients: int = 0
-    changes_offset: int = 0
-    live_offset: int = 0
-    live_row_bytes: int = 0
-    max_live: int = 0
+    histograms: tuple[Counter, ...]
+    bucket_count: int
+    clients_offset: int
+    client_row_bytes: int
+    max_clients: int
+    changes_offset: int
+    live_offset: int
+    live_row_bytes: int
+    max_live: int
 
     @property
     def descriptions_end(self) -> int:
@@ -171,21 +181,19 @@ def unpack_header(data: bytes) -> Header:
     if magic != MAGIC:
         raise SegmentCorrupt(f"not a statistics segment: it starts with {magic!r}")
     if major != LAYOUT_VERSION[0]:
+        age, update = ("an older", "daemon") if major < LAYOUT_VERSION[0] else ("a newer", "program")
         raise SegmentCorrupt(
-            f"statistics layout {major}.{minor}, this program reads {LAYOUT_VERSION[0]}.x",
-            hint="update the older of daemon and program",
+            f"statistics {major}.{minor} of {age} daemon: this program reads {LAYOUT_VERSION[0]}.x",
+            hint=f"update the {update}, and restart it",
         )
     if order != BYTE_ORDER:
         raise SegmentCorrupt("the statistics were written on a machine of other byte order")
     end = at + count * row
-    if at < START.size or row < DESCRIPTION.size or end > len(data):
+    if at < DESCRIPTIONS_OFFSET or row < DESCRIPTION.size or end > len(data):
         raise SegmentCorrupt("the statistics' counter table lies outside the segment")
     if crc != zlib.crc32(data[at:end], zlib.crc32(data[: START.size - 4])):
         raise SegmentCorrupt("the statistics' header checksum does not match")
     counters = _unpack_descriptions(data, at, count, row)
-    header = Header(counters, *places)
-    if at < START.size + EXTENSION.size:  # layout 1.0
-        return header
     histogram_count, buckets, *tables, crc = EXTENSION.unpack_from(data, START.size)
     last = end + histogram_count * row
     if last > len(data):
@@ -194,11 +202,8 @@ def unpack_header(data: bytes) -> Header:
         data[end:last], zlib.crc32(data[START.size : START.size + EXTENSION.size - CRC_BYTES])
     ):
         raise SegmentCorrupt("the checksum of the statistics' second header does not match")
-    return header._replace(
-        histograms=_unpack_descriptions(data, end, histogram_count, row),
-        bucket_count=buckets,
-        **dict(zip(Header._fields[11:], tables, strict=True)),
-    )
+    described = _unpack_descriptions(data, end, histogram_count, row)
+    return Header._make((counters, *places, described, buckets, *tables))
 
 
 def _unpack_descriptions(data: bytes, at: int, count: int, step: int) -> tuple[Counter, ...]:
@@ -254,11 +259,8 @@ def pack_state(state: State, packer: struct.Struct) -> bytes:
     return whole + CRC.pack(zlib.crc32(whole))
 
 
-def unpack_state(data: bytes, *, extended: bool = True) -> State | None:
-    """Return a state block; None if it was never written or is torn.
-
-    ``extended`` is false for segments of layout 1.0, which end with the counters.
-    """
+def unpack_state(data: bytes) -> State | None:
+    """Return a state block; None if it was never written or is torn."""
     sequence, beat, unix, used, missing, count, _ = STATE.unpack_from(data)
     end = STATE.size + 8 * count
     tail = end + CRC.size
@@ -267,8 +269,6 @@ def unpack_state(data: bytes, *, extended: bool = True) -> State | None:
     if CRC.unpack_from(data, end)[0] != zlib.crc32(data[:end]):
         return None
     values = struct.unpack_from(f"<{count}q", data, STATE.size)
-    if not extended:
-        return State(sequence, beat, unix, used, missing, values)
     if tail + TAIL.size > len(data):
         return None
     clients, many = TAIL.unpack_from(data, tail)

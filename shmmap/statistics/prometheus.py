@@ -7,11 +7,14 @@ https://prometheus.io/docs/instrumenting/exposition_formats/ says what a line ma
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from shmmap.statistics.counters import PUBLISHED, SPANS, WINDOWED
 from shmmap.statistics.histogram import STEPS, Histogram, lower_bound_ns
-from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from shmmap.protocol.rows import LiveMapRow
 
 __all__ = ["exposition"]
 
@@ -26,7 +29,7 @@ _LIVE = {
     "file_bytes": ("file_bytes", "gauge", "Chunks on disk: bytes of their files"),
     "scans": ("scans_applied_total", "counter", "Scans applied"),
     "durable": ("scans_durable_total", "counter", "Scans applied that are on disk"),
-    "damaged": ("damaged_files", "gauge", "Files put aside as damaged, and chunks that are missing"),
+    "damaged_count": ("damaged_files", "gauge", "Damaged files in quarantine, and missing chunks"),
     "failing": ("failing", "gauge", "1 while chunks cannot be loaded or saved"),
 }
 
@@ -97,7 +100,7 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
         yield from _histogram(name, label, found.histograms[described.name])
 
 
-def _live_maps(rows: Sequence[LiveRow], label: str) -> Iterator[str]:
+def _live_maps(rows: Sequence[LiveMapRow], label: str) -> Iterator[str]:
     """Each family once, with a sample for each map."""
     labels = [f'{label},map="{_escaped(row.name)}"' for row in rows]
     for field, (name, kind, text) in _LIVE.items() if rows else ():

@@ -196,7 +196,7 @@ def _newest_identity(fd: int, header: Header) -> bytes:
 
 
 def _newest_state(fd: int, header: Header) -> State:
-    size, extended = header.state_bytes, header.bucket_count > 0
+    size = header.state_bytes
     for _ in range(_ATTEMPTS):
         both = os.pread(fd, 2 * size, header.state_offset)
         halves = both[:size], both[size:]
@@ -204,7 +204,7 @@ def _newest_state(fd: int, header: Header) -> State:
         if halves[0][:8][::-1] < halves[1][:8][::-1]:
             halves = halves[::-1]
         for half in halves:
-            state = unpack_state(half, extended=extended)
+            state = unpack_state(half)
             if state is not None:
                 return state
     raise SegmentCorrupt("the statistics' counters are damaged")

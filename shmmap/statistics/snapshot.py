@@ -3,22 +3,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.statistics.cell_rows import CellRow, unpack_cell
-from shmmap.statistics.client_rows import ClientRow, unpack_client
 from shmmap.statistics.counters import Counter
 from shmmap.statistics.histogram import Histogram
 from shmmap.statistics.identity import DaemonIdentity, DaemonState
 from shmmap.statistics.layout import Header, State
-from shmmap.statistics.live_rows import LiveRow, unpack_live
+
+if TYPE_CHECKING:
+    import msgspec
+
+    from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow
 
 __all__ = ["Snapshot"]
 
-_Row = TypeVar("_Row")
+_Row = TypeVar("_Row", bound="msgspec.Struct")
 
 
 class Snapshot:
@@ -106,31 +107,39 @@ class Snapshot:
 
         A row the daemon was changing at that very moment (it was stopped in mid-write) is left out.
         """
+        from shmmap.protocol.rows import CellRow
+
         step = self._header.row_bytes if self._header is not None else 0
-        return sorted(
-            _in_use(self._rows, step, unpack_cell), key=lambda row: (row.id, row.layer, row.version)
-        )
+        return sorted(_in_use(CellRow, self._rows, step), key=lambda row: (row.id, row.layer, row.version))
 
     @cached_property
     def clients(self) -> list[ClientRow]:
         """The clients there is room for in the table, in the order they came."""
+        from shmmap.protocol.rows import ClientRow
+
         step = self._header.client_row_bytes if self._header is not None else 0
-        return _in_use(self._clients, step, unpack_client)
+        return _in_use(ClientRow, self._clients, step)
 
     @cached_property
-    def live(self) -> list[LiveRow]:
+    def live(self) -> list[LiveMapRow]:
         """The live maps that the daemon keeps."""
+        if not self._live.strip(b"\0"):
+            return []  # without the import: most daemons keep none
+        from shmmap.protocol.rows import LiveMapRow
+
         step = self._header.live_row_bytes if self._header is not None else 0
-        return _in_use(self._live, step, unpack_live)
+        return _in_use(LiveMapRow, self._live, step)
 
 
-def _in_use(data: bytes, step: int, unpack: Callable[[memoryview], _Row | None]) -> list[_Row]:
+def _in_use(kind: type[_Row], data: bytes, step: int) -> list[_Row]:
     """The rows of a table that are in use, but for those that were being changed."""
+    from shmmap.statistics.rows import unpack_row
+
     found = []
     view = memoryview(data)
     for at in range(0, len(view) - step + 1, step) if step else ():
         try:
-            row = unpack(view[at : at + step])
+            row = unpack_row(kind, view[at : at + step])
         except SegmentCorrupt:
             continue
         if row is not None:

@@ -17,19 +17,25 @@ from collections.abc import Callable, Hashable, Sequence
 from itertools import chain, islice
 from typing import Final, Generic, TypeVar
 
+import msgspec
+
 from shmmap.errors import ShmmapError
 from shmmap.large_tables import ShardedDict
 from shmmap.logfmt import log
+from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
-from shmmap.statistics.cell_rows import CELL_ROW_BYTES, CellRow, pack_cell
-from shmmap.statistics.client_rows import CLIENT_ROW_BYTES, MAX_CLIENTS, ClientRow, pack_client
 from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, OBJECTS_READ, TURN_KINDS
 from shmmap.statistics.exclusive_name import hold, take_name
 from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
+    CELL_ROW_BYTES,
     CHANGES,
+    CLIENT_ROW_BYTES,
+    LIVE_ROW_BYTES,
+    MAX_CLIENTS,
+    MAX_LIVE,
     PAGE_BYTES,
     TABLE,
     State,
@@ -38,11 +44,11 @@ from shmmap.statistics.layout import (
     pack_state,
     plan,
 )
-from shmmap.statistics.live_rows import LIVE_ROW_BYTES, MAX_LIVE, LiveRow, pack_live
+from shmmap.statistics.rows import FREE_ROW, pack_row
 
 __all__ = ["StatisticsWriter"]
 
-_Row = TypeVar("_Row")
+_Row = TypeVar("_Row", bound=msgspec.Struct)
 
 _GROWTH_ROWS = 256  # 64 KiB at a time
 _CLIENTS_A_PAGE = 16
@@ -54,8 +60,6 @@ def _always(nbytes: int) -> bool:
     del nbytes
     return True
 
-
-_FREE_ROW = pack_cell(CellRow("", "", 0, "", "free", 0, 0, (0.0, 0.0, 0.0, 0.0)))
 
 _LONGEST: Final = {kind: f"longest_turn_{kind}_ns" for kind in TURN_KINDS}
 
@@ -69,8 +73,6 @@ class _RowTable(Generic[_Row]):
     ----------
     place, row_bytes, most
         Where the table is, how long a row is, and how many there can be.
-    pack
-        Makes of a row its bytes.
     write
         Writes bytes at a place; False if that cannot be done.
     allocate
@@ -84,7 +86,6 @@ class _RowTable(Generic[_Row]):
         place: int,
         row_bytes: int,
         most: int,
-        pack: Callable[[_Row], bytes],
         write: Callable[[bytes, int], bool],
         allocate: Callable[[int, int], bool],
         *,
@@ -94,7 +95,6 @@ class _RowTable(Generic[_Row]):
         self._place = place
         self._row_bytes = row_bytes
         self._most = most
-        self._pack = pack
         self._write = write
         self._allocate = allocate
         self._allocated = allocated
@@ -107,7 +107,7 @@ class _RowTable(Generic[_Row]):
         self.used = 0
         for index, row in enumerate(rows[:count]):
             place = self._place + index * self._row_bytes
-            if self._rows[index] != row and not self._write(self._pack(row), place):
+            if self._rows[index] != row and not self._write(pack_row(row, self._row_bytes), place):
                 break
             self._rows[index] = row
             self.used += 1
@@ -183,11 +183,15 @@ class StatisticsWriter:
         self._used = 0
         self._allocated = 0
         self._clients: _RowTable[ClientRow] = _RowTable(
-            self._layout.clients_offset, CLIENT_ROW_BYTES, MAX_CLIENTS, pack_client, self._write,
-            self._allocate, allocated=_CLIENTS_A_PAGE,
-        )  # fmt: skip
-        self._live: _RowTable[LiveRow] = _RowTable(
-            self._layout.live_offset, LIVE_ROW_BYTES, MAX_LIVE, pack_live, self._write, self._allocate
+            self._layout.clients_offset,
+            CLIENT_ROW_BYTES,
+            MAX_CLIENTS,
+            self._write,
+            self._allocate,
+            allocated=_CLIENTS_A_PAGE,
+        )
+        self._live: _RowTable[LiveMapRow] = _RowTable(
+            self._layout.live_offset, LIVE_ROW_BYTES, MAX_LIVE, self._write, self._allocate
         )
         self._changed: dict[Hashable, CellRow] = {}
         self._missing: dict[Hashable, CellRow] = {}  # there was no room for these, or no writing them
@@ -252,7 +256,7 @@ class StatisticsWriter:
         """Show these clients, from the next beat on; at most 256, and as many as there is room for."""
         self._clients.show(rows)
 
-    def show_live_maps(self, rows: Sequence[LiveRow]) -> None:
+    def show_live_maps(self, rows: Sequence[LiveMapRow]) -> None:
         """Show these live maps, always the same in the same order; at most 64."""
         self._live.show(rows)
 
@@ -320,7 +324,7 @@ class StatisticsWriter:
         if not self._mark_table(self._table_sequence + 1 | 1):  # odd already where no even one could follow
             return
         for _ in range(min(max_rows, len(self._removed))):
-            if not self._write_row(self._removed[-1], _FREE_ROW):
+            if not self._write_row(self._removed[-1], FREE_ROW):
                 break
             self._free.append(self._removed.pop())
         for key in list(islice(self._changed, max_rows)):
@@ -335,7 +339,7 @@ class StatisticsWriter:
 
     def _place(self, key: Hashable, row: CellRow) -> bool:
         slot = self._slot(key)
-        return slot is not None and self._write_row(slot, pack_cell(row))
+        return slot is not None and self._write_row(slot, pack_row(row, CELL_ROW_BYTES))
 
     def _mark_table(self, sequence: int) -> bool:
         if not self._write(TABLE.pack(sequence), self._layout.table_offset):

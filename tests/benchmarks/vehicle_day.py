@@ -251,7 +251,7 @@ def row(day: Day) -> str:
     return (
         f"{day.kind:7} {len(day.counted):5} queries, {day.misses} misses"
         f" ({100 - 100 * day.misses / max(1, len(day.counted)):.2f} % warm),"
-        f" {day.counters['cells_late']} cells late, longest wait {day.longest_wait_s:.1f} s;"
+        f" {day.counters['prefetch_misses']} cells late, longest wait {day.longest_wait_s:.1f} s;"
         f" {day.mb_per_km:.0f} MB/km, over-fetch {day.over_fetch:.2f}, disk hits {100 * day.disk_hits:.1f} %;"
         f" memory {day.peak_bytes / 2**30:.2f} GiB, disk {day.disk_bytes / 2**30:.2f} GiB;"
         f" {len(day.outages)} outages, {out_s:.0f} s"

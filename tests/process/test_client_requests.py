@@ -534,9 +534,10 @@ def test_another_major_version_is_refused(
     daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = daemon(divided_map.root)
-    monkeypatch.setattr("shmmap.client.connection.PROTOCOL_VERSION", (2, 0))
-    with pytest.raises(ProtocolMismatch, match=r"2\.0"):
+    monkeypatch.setattr("shmmap.client.connection.PROTOCOL_VERSION", (1, 6))
+    with pytest.raises(ProtocolMismatch, match=r"client speaks protocol 1\.6, daemon 2\.0") as refused:
         shmmap.connect(one.endpoint)
+    assert (refused.value.exit_code, refused.value.hint) == (76, "update the client, and restart it")
 
 
 def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(

@@ -111,7 +111,7 @@ def test_a_client_in_a_container(
         rows = {row[4]: row for row in client.ask("stats")[5]}
         assert rows["boxed"][1] == pid
         (segment,) = client.ask("show", "0_0.pcd")[9]
-        assert [(holder[1], holder[3]) for holder in segment[6]] == [(pid, "boxed")]
+        assert [(holder[1], holder[3]) for holder in segment[12]] == [(pid, "boxed")]
         freed = client.ask("evict")
         assert (freed[2], freed[3]) == (0, len(expected))
         os.kill(pid, signal.SIGKILL)

@@ -92,7 +92,7 @@ def test_a_drive_through_a_time_without_the_files(
             pass
         told = shmmap.json("status")["ahead"]
         assert (told["ride_out_s"], told["prefetch_started"] >= len(fetched)) == (10.0, True)
-        assert (told["cells_late"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
+        assert (told["prefetch_misses"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
         finding = prefetching(shmmap)
         assert (finding["state"], finding["fact"]) == (
             "ok",
@@ -108,7 +108,7 @@ def test_a_drive_through_a_time_without_the_files(
             mark.touch()
         assert window.move_to(-100, 0, vx=5.0, route=EAST, wait=TIMEOUT_S).complete
         told = until_ahead(shmmap, lambda ahead: bool(ahead["origin_out"]))
-        assert told["cells_late"] == 0, "no client has noticed"
+        assert told["prefetch_misses"] == 0, "no client has noticed"
         assert told["prefetch_used"] == 4
         shown = {row["id"]: row["ahead"] for row in shmmap.json("ls")["cells"]}
         assert not shown[street.id("-100_0.pcd")]
@@ -121,16 +121,16 @@ def test_a_drive_through_a_time_without_the_files(
         assert "origin out of reach for" in " ".join(shmmap("top").split())
 
         x, waiting = -60, Deadline()
-        while waiting(not shmmap.json("status")["counters"]["cells_late"]):  # beyond what was fetched in time
+        while waiting(not shmmap.json("status")["counters"]["prefetch_misses"]):  # beyond what was fetched in time
             x = min(x + 20, 100)
             window.move_to(x, 0, vx=5.0, route=EAST)
         for stream in streams:
-            late = until(stream, lambda h: isinstance(h, e.Late))
+            late = until(stream, lambda h: isinstance(h, e.PrefetchMiss))
             assert (late.client, late.layer) == ("driver", "points")
             assert 1 <= late.cells <= len(street.corners)
             assert late.id in set(street.corners) - fetched
-        assert any(" late " in line and "driver" in line for line in shmmap("tail").splitlines())
-        assert shmmap.json("status")["counters"]["cells_late"] >= late.cells
+        assert any(" miss " in line and "driver" in line for line in shmmap("tail").splitlines())
+        assert shmmap.json("status")["counters"]["prefetch_misses"] >= late.cells
 
         for mark in marks:
             mark.unlink()
@@ -147,7 +147,7 @@ def test_a_drive_through_a_time_without_the_files(
         }
         assert shown_as["shmmap_origin_outages_total"] >= 1.0
         assert shown_as["shmmap_load_points_seconds_count"] > 8.0
-        assert shown_as["shmmap_cells_late_total"] >= 1.0
+        assert shown_as["shmmap_prefetch_misses_total"] >= 1.0
 
 
 def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path)
             pass
     assert finding["fact"] == "off; moving clients waited for 2 cells in the last 10 min"
     told = shmmap.json("status")["ahead"]
-    assert (told["cells_late"], told["prefetch_started"]) == (2, 0)
+    assert (told["prefetch_misses"], told["prefetch_started"]) == (2, 0)
 
 
 def test_load_times_by_what_was_done(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:

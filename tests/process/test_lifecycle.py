@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.statistics.cell_rows import CellRow
+from shmmap.protocol.rows import CellRow
 from shmmap.statistics.reader import read_statistics
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, Deadline, wait_ended

@@ -19,7 +19,7 @@ import shmmap as client_library
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.event_stream import EventStream
 from shmmap.protocol import events as e
-from shmmap.statistics.live_rows import LiveRow
+from shmmap.protocol.rows import LiveMapRow
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
@@ -52,7 +52,7 @@ def until(stream: EventStream, wanted: Callable[[Any], bool]) -> Any:
             return happening
 
 
-def after(one: DaemonProcess, told: Callable[[LiveRow], bool]) -> LiveRow:
+def after(one: DaemonProcess, told: Callable[[LiveMapRow], bool]) -> LiveMapRow:
     """Wait until the statistics tell this of the live map."""
     waiting = Deadline()
     with StatisticsReader(one.instance, one.shm_dir) as reader:
@@ -80,9 +80,10 @@ def test_what_operators_see(live_daemon: LiveDaemon, tmp_path: Path) -> None:
     shmmap = Shmmap(one, tmp_path)
     with mapped(one, 3):
         row = after(one, lambda row: row.durable == 3 and row.chunks > 0 and not row.unsaved + row.loading)
-        assert (row.name, row.scans, row.mappers, row.budget_bytes) == ("lidar", 3, 1, 16 << 20)
+        assert (row.name, row.scans, row.mapper_count, row.budget_bytes) == ("lidar", 3, 1, 16 << 20)
+        assert [name.partition("/")[2] for name in row.mappers] == ["front"]
         (told,) = shmmap.json("status")["live"]
-        assert told.keys() == row._asdict().keys() == shmmap.json("top")["live"][0].keys()
+        assert tuple(told) == row.__struct_fields__ == tuple(shmmap.json("top")["live"][0])
         assert {name: told[name] for name in ("name", "scans", "problem")} == {
             "name": "lidar", "scans": 3, "problem": "",
         }  # fmt: skip

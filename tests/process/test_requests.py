@@ -22,7 +22,7 @@ Connect = Callable[..., RawClient]
 def test_welcome(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     client = connect(one, name="visitor")
-    assert (client.major, client.instance, client.frame_id) == (1, one.instance, "map")
+    assert (client.major, client.instance, client.frame_id) == (2, one.instance, "map")
     assert client.shm_dir == one.shm_dir
     assert client.pid == one.pid
     assert client.cells == 36
@@ -153,8 +153,16 @@ def test_no_session_and_other_versions(
         client.area(circle(0, 0, 5))
     assert failure.value.code == "no_session"
     with pytest.raises(DaemonError) as failure:
-        client.ask("hello", 2, 0, "from the future")
+        client.ask("hello", 3, 0, "from the future")
+    assert (failure.value.code, failure.value.hint) == (
+        "protocol_mismatch",
+        "update the daemon, and restart it",
+    )
+    with pytest.raises(DaemonError) as failure:
+        client.ask("hello", 1, 6, "a client of 1.x")
     assert failure.value.code == "protocol_mismatch"
+    assert failure.value.message == "client speaks protocol 1.6, daemon 2.0"
+    assert failure.value.hint == "update the client, and restart it"
     client.hello()
     assert len(client.area(circle(0, 0, 5)).cells) == 4
 

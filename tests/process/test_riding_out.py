@@ -60,7 +60,7 @@ def drive(one: DaemonProcess, window: shmmap.MapWindow) -> None:
         update = window.move_to(x, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S)
         assert update.complete, (x, update.failed)
     counts = counters(one)
-    assert counts["cells_late"] == 0
+    assert counts["prefetch_misses"] == 0
     assert counts["origin_out"] == 1, "it was away all the time"
 
 

@@ -172,7 +172,7 @@ def test_a_damaged_leftover_that_somebody_maps_is_known_until_it_is_let_go(
         reply = client.selected(["0_0.pcd"])
         assert_right(client, reply, divided_map)
         shown = client.ask("show", "0_0.pcd")[9]
-        assert sorted((row[2], row[3]) for row in shown) == sorted(
+        assert sorted((row[3], row[4]) for row in shown) == sorted(
             [(reply.cells[0].segment, "resident"), (handle.segment, "zombie")]
         )
         assert reader.checksums()
@@ -201,7 +201,7 @@ def test_what_changed_while_nobody_looked_is_loaded_anew(
         after = segments_of(again)
         assert divided_map.id("20_20.pcd") not in after
         assert [cell for cell in after if after[cell] != before[cell]] == [changed]
-        assert [(row[2], row[3]) for row in client.ask("show", changed)[9]] == [
+        assert [(row[3], row[4]) for row in client.ask("show", changed)[9]] == [
             (after[changed], "resident"), (before[changed], "zombie"),
         ]  # fmt: skip
         assert reader.checksums() == [checksum]

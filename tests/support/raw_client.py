@@ -71,7 +71,7 @@ class DaemonError(Exception):
 
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(f"{code}: {message} ({hint})")
-        self.code = code
+        self.code, self.message, self.hint = code, message, hint
 
 
 def pack_versions(versions: list[int]) -> bytes:
@@ -171,7 +171,7 @@ class RawClient:
 
     def hello(self) -> list[Any]:
         """Open the session."""
-        welcome = self.ask("hello", 1, 0, self.name)
+        welcome = self.ask("hello", 2, 0, self.name)
         assert welcome[0] == "welcome"
         (
             _, _, self.major, self.minor, self.daemon, self.instance, self.epoch, self.session,

@@ -59,7 +59,7 @@ PARTS = {
     "disk_budget": {"failpoints"},
     "lazy_names": set[str](),
     "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
-    "statistics": {"errors", "columns", "geometry", "logfmt", "large_tables", "segment"},
+    "statistics": {"errors", "columns", "geometry", "logfmt", "protocol", "large_tables", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},

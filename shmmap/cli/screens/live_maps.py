@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 from shmmap.cli.screens.output import counted, format_bytes
 
 if TYPE_CHECKING:
-    from shmmap.statistics.live_rows import LiveRow
+    from shmmap.protocol.rows import LiveMapRow
 
-__all__ = ["STATE_STYLES", "live_problems", "status_lines"]
+__all__ = ["STATE_STYLES", "live_as_json", "live_problems", "status_lines"]
 
 STATE_STYLES: Final = {
     "loading": "bright_black",
@@ -22,15 +22,22 @@ STATE_STYLES: Final = {
 """Colours of chunks by state, as Rolling-Bonxai has them."""
 
 
-def live_problems(row: LiveRow) -> list[str]:
+def live_as_json(row: LiveMapRow) -> dict[str, object]:
+    """Return all that is known of a live map, for programs."""
+    import msgspec
+
+    return msgspec.structs.asdict(row)
+
+
+def live_problems(row: LiveMapRow) -> list[str]:
     """What is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
-    if row.damaged:
-        found.append(f"damaged files, missing chunks: {row.damaged:,}; `shmmap live ls` names them")
+    if row.damaged_count:
+        found.append(f"damaged files, missing chunks: {row.damaged_count:,}; `shmmap live ls` names them")
     return found
 
 
-def status_lines(rows: Sequence[LiveRow], restarts: int) -> list[tuple[str, str]]:
+def status_lines(rows: Sequence[LiveMapRow], restarts: int) -> list[tuple[str, str]]:
     """Return the lines of ``status``: one for each map, and what is wrong; none where there are no maps."""
     lines = []
     for row in rows:

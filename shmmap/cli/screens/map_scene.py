@@ -13,8 +13,7 @@ from shmmap.cli.screens.picture import CellSquare, Vehicle, top_view_svg
 from shmmap.formats.svg import BoxTuple, escape
 
 if TYPE_CHECKING:
-    from shmmap.statistics.cell_rows import CellRow
-    from shmmap.statistics.client_rows import ClientRow
+    from shmmap.protocol.rows import CellRow, ClientRow
 
 __all__ = ["GLYPHS", "Scene", "html_page", "svg", "terminal_rows"]
 
@@ -171,8 +170,9 @@ def svg(scene: Scene) -> str:
         title, window = _client_title(client, scene.now_ns), client.window
         circle = window is not None and window.shape == "circle"
         if window is not None and not circle:
-            x, y, half_x, half_y = window[1:]
-            windows.append(((x - half_x, y - half_y, x + half_x, y + half_y), title))
+            half_x, half_y = window.half_x, window.half_y
+            box = (window.x - half_x, window.y - half_y, window.x + half_x, window.y + half_y)
+            windows.append((box, title))
         if client.pose is not None:
             radius = window.half_x if window is not None and circle else 0.0
             label = client.client or client.command

@@ -9,7 +9,7 @@ from typing import Final
 __all__ = ["over_fetch", "prefetch_as_json", "prefetch_words"]
 
 COUNTS: Final = (
-    "cells_late",
+    "prefetch_misses",
     "prefetch_started",
     "prefetch_used",
     "prefetch_in_vain",
@@ -42,7 +42,7 @@ def prefetch_as_json(counters: Mapping[str, int]) -> dict[str, object]:
 
 def prefetch_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
     """Return short texts, each with whether it is a problem; none while prefetching has nothing to do."""
-    misses, lately = counters.get("cells_late", 0), counters.get("cells_late_1min", 0)
+    misses, lately = counters.get("prefetch_misses", 0), counters.get("prefetch_misses_1min", 0)
     if not (counters.get("prefetch_started") or misses):
         return []
     words = [

@@ -15,10 +15,9 @@ from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
-    from shmmap.statistics.client_rows import ClientRow
+    from shmmap.protocol.rows import ClientRow, LiveMapRow
     from shmmap.statistics.histogram import Histogram
     from shmmap.statistics.identity import DaemonIdentity
-    from shmmap.statistics.live_rows import LiveRow
     from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["Line", "budget_parts", "screen"]
@@ -261,7 +260,7 @@ def _segments(counters: dict[str, int]) -> list[Line]:
     ]
 
 
-def _live(row: LiveRow, width: int) -> list[Line]:
+def _live(row: LiveMapRow, width: int) -> list[Line]:
     states = [[(f"{count:,} {state}", STATE_STYLES[state])] for state, count in row.states.items() if count]
     memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
     pieces: list[Line] = [

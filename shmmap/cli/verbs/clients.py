@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
@@ -20,7 +21,7 @@ from shmmap.cli.screens.output import (
 )
 
 if TYPE_CHECKING:
-    from shmmap.protocol.messages import SessionRow
+    from shmmap.protocol.messages import ClientRow
 
 __all__ = ["add_parser", "run"]
 
@@ -95,7 +96,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _as_json(row: SessionRow) -> dict[str, object]:
+def _idle_s(row: ClientRow) -> float:
+    return max(time.monotonic_ns() - row.last_request_monotonic_ns, 0) * 1e-9
+
+
+def _as_json(row: ClientRow) -> dict[str, object]:
     return {
         "session": f"{row.session:016x}",
         "pid": row.pid,
@@ -107,7 +112,7 @@ def _as_json(row: SessionRow) -> dict[str, object]:
         "cells": row.cells,
         "bytes": row.bytes,
         "requests": row.requests,
-        "idle_s": round(row.idle_s, 3),
+        "idle_s": round(_idle_s(row), 3),
         "pose": None if row.pose is None else list(row.pose),
         "mapped_bytes": row.mapped_bytes,
         "superseded": row.superseded,
@@ -115,7 +120,7 @@ def _as_json(row: SessionRow) -> dict[str, object]:
     }
 
 
-def _as_text(row: SessionRow) -> list[str]:
+def _as_text(row: ClientRow) -> list[str]:
     return [
         row.client or "-",
         str(row.pid or "?"),
@@ -125,7 +130,7 @@ def _as_text(row: SessionRow) -> list[str]:
         format_bytes(row.mapped_bytes),
         format_bytes(row.superseded_bytes) if row.superseded else "-",
         f"{row.requests:,}",
-        format_duration(row.idle_s),
+        format_duration(_idle_s(row)),
         "-" if row.pose is None else f"{row.pose[0]:.1f},{row.pose[1]:.1f}",
         row.command,
     ]

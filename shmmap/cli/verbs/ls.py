@@ -22,7 +22,7 @@ from shmmap.errors import DaemonUnreachable
 from shmmap.lacking import area_text, extent_text
 
 if TYPE_CHECKING:
-    from shmmap.statistics.cell_rows import CellRow
+    from shmmap.protocol.rows import CellRow
 
 __all__ = ["add_parser", "run"]
 
@@ -157,9 +157,9 @@ def _as_json(row: CellRow, id_prefix: str, instance: str, now_ns: int) -> dict[s
     idle_s = _idle_s(row, now_ns)
     segment = segment_prefix(instance) + row.segment
     return {
-        "id": f"…{row.id}" if row.id_cut else id_prefix + row.id,
+        "id": row.id if row.id.startswith("…") else id_prefix + row.id,
         "version": f"{row.version:016x}",
-        "layer": row.whole_layer,
+        "layer": row.layer,
         "state": row.state,
         "segment": retired_name(segment) if row.state == "zombie" else segment,
         "ahead": row.ahead,
@@ -179,12 +179,12 @@ def _whole_seconds(span_s: float) -> str:
 def _as_text(row: CellRow, now_ns: int) -> list[str]:
     idle_s = _idle_s(row, now_ns)
     return [
-        f"…{row.id}" if row.id_cut else row.id,
+        row.id,
         format_metres(row.box[0]),
         format_metres(row.box[1]),
         f"{format_metres(max(row.box[2] - row.box[0], row.box[3] - row.box[1]))} m",
         _shown_state(row),
-        row.whole_layer,
+        row.layer,
         f"{row.points:,}",
         format_bytes(row.bytes),
         f"{row.hits:,}",

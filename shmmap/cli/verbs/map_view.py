@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from shmmap.cli.areas import BoxTuple
     from shmmap.cli.screens.map_scene import Scene
     from shmmap.geometry import Area
-    from shmmap.statistics.cell_rows import CellRow
+    from shmmap.protocol.rows import CellRow
     from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["add_parser", "run"]

@@ -14,7 +14,7 @@ from shmmap.errors import UnknownCell
 from shmmap.lacking import extent_text, near_cells_hint
 
 if TYPE_CHECKING:
-    from shmmap.protocol.messages import Holder, ShownCell, ShownSegment
+    from shmmap.protocol.messages import CellRow, Holder, ShownCell
 
 __all__ = ["add_parser", "run"]
 
@@ -116,7 +116,7 @@ def _lines(cell: ShownCell) -> list[tuple[str, str]]:
     return lines
 
 
-def _segment_line(segment: ShownSegment) -> str:
+def _segment_line(segment: CellRow) -> str:
     state = "retired" if segment.state == "zombie" else segment.state
     rows = rows_text(segment.points, segment.layer)
     return (

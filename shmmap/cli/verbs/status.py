@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.live_maps import status_lines
+from shmmap.cli.screens.live_maps import live_as_json, status_lines
 from shmmap.cli.screens.output import (
     counted,
     format_bytes,
@@ -35,9 +35,9 @@ _JSON = """\
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
-   "ahead": {"ride_out_s": setting, "origin_out": bool: no load succeeds, "last_outage_s", "cells_late": that
-             moving clients waited for, "prefetch_started", "prefetch_used", "prefetch_in_vain",
-             "prefetch_overtaken", "bytes_prefetched",
+   "ahead": {"ride_out_s": setting, "origin_out": bool: no load succeeds, "last_outage_s",
+             "prefetch_misses": cells that moving clients waited for, "prefetch_started",
+             "prefetch_used", "prefetch_in_vain", "prefetch_overtaken", "bytes_prefetched",
              "over_fetch": bytes loaded by bytes handed out at least once, or null},
    "published": null where the map is files, or
             {"version": number, "refused": number of a version that is offered and refused, or null,
@@ -45,9 +45,7 @@ _JSON = """\
              "cells", "cells_known", "pages", "pages_known": of the list of cells,
              "objects_fetched", "bytes_fetched", "objects_from_disk", "bytes_from_disk",
              "objects_damaged_on_disk", "objects_damaged_in_store", "fetches_failed"},
-   "live": [{"name", "problem": text, may be empty, "chunks": in memory, "active": known voxels in them,
-             "bytes", "budget_bytes", "loading", "dirty", "saving", "evicting", "evicting_bytes",
-             "waiting_bytes", "files", "file_bytes", "scans", "durable", "damaged", "mappers", "change"}]}
+   "live": [as in `shmmap live ls --json`]}
 Exit code: 0, or 69 when the daemon is dead or was never started."""
 
 
@@ -91,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
                 "counters": found.counters,
                 "ahead": prefetch_as_json(found.counters),
                 "published": published_as_json(found.counters),
-                "live": [row._asdict() for row in found.live],
+                "live": [live_as_json(row) for row in found.live],
             }
         )
     else:

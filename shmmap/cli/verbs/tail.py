@@ -30,7 +30,7 @@ __all__ = ["add_parser", "run"]
 
 _JSON = """\
   one object a line: {"event": "epoch" | "loaded" | "changed" | "evicted" | "failed" | "retried" |
-  "pressure" | "late" | "reload" | "long_turn" | "joined" | "left" | "live_started" | "live_ended" |
+  "pressure" | "prefetch_miss" | "reload" | "long_turn" | "joined" | "left" | "live_started" | "live_ended" |
   "live_problem" | "live_damaged" | "live_changed", "seq", "epoch": hex, "time": Unix seconds, and what
   the protocol's table of events says of that kind; versions and sessions as hex}, or
   {"event": "missed", "epoch": hex, "first", "last"} for events that the daemon does not keep any more.
@@ -172,7 +172,7 @@ def _pressure(f: dict[str, Any]) -> str:
     )
 
 
-def _late(f: dict[str, Any]) -> str:
+def _prefetch_miss(f: dict[str, Any]) -> str:
     who = f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}"
     return f"{who} had to wait for {counted(f['cells'], 'cell')}, such as {f['id']} {f['layer']}"
 
@@ -206,7 +206,10 @@ _CHANGES: Final = {
     "removed": "removed from the map",
 }
 
-_COLUMN: Final = dict.fromkeys(("live_started", "live_ended", "live_problem", "live_damaged"), "live")
+_COLUMN: Final = {
+    "prefetch_miss": "miss",
+    **dict.fromkeys(("live_started", "live_ended", "live_problem", "live_damaged"), "live"),
+}
 """Kinds that have another name in the narrow column."""
 
 _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
@@ -217,7 +220,7 @@ _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "failed": lambda f: f"{f['id']} {f['layer']}  {f['code']}: {f['message']}",
     "retried": lambda f: f"{f['id']} {f['layer']}  again after {f['code']}",
     "pressure": _pressure,
-    "late": _late,
+    "prefetch_miss": _prefetch_miss,
     "reload": _reload,
     "long_turn": _long_turn,
     "joined": lambda f: f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}, uid {f['uid']}",

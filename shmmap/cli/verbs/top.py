@@ -15,6 +15,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb, seconds
+from shmmap.cli.screens.live_maps import live_as_json
 from shmmap.cli.screens.output import print_json, print_line, printable
 from shmmap.errors import DaemonUnreachable
 
@@ -205,7 +206,7 @@ def _as_json(found: Snapshot) -> dict[str, object]:
             for name, h in found.histograms.items()
         },
         **{name: count[name] for name in _TOLD_AS_THEY_ARE},
-        "live": [row._asdict() for row in found.live],
+        "live": [live_as_json(row) for row in found.live],
         "clients": [
             {
                 "client": client.client,

@@ -274,9 +274,9 @@ class LiveMapper:
         marks, self.counts = self._marker.mark(points, pose)
         number, opened = self._last + 1, self._sender.opened
         data = encode_marks(marks, opened.map_id, opened.mapper, number)
-        if len(data) > opened.most_marks_bytes:
+        if len(data) > opened.max_marks_bytes:
             raise BadRequest(
-                f"the scan's marks have {len(data)} bytes; {opened.most_marks_bytes} are the most",
+                f"the scan's marks have {len(data)} bytes; {opened.max_marks_bytes} are the most",
                 hint="lower max_range, make the map with larger voxels, or raise --live-budget",
             )
         x, y, z = (float(value) for value in np.asarray(pose, np.float64)[:3, 3])

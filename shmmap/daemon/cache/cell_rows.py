@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from shmmap.daemon.records import Resident
-from shmmap.statistics.cell_rows import CellRow
+from shmmap.protocol.rows import CellRow, CellState
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["CellRows"]
@@ -26,15 +26,26 @@ class CellRows:
     id_prefix: str
     segment_prefix: str
 
-    def show(self, resident: Resident, state: str) -> None:
-        """Show a segment as it is now; ``state`` is ``resident``, ``stale`` or ``zombie`` (retired)."""
-        row = CellRow(
-            resident.key.cell_id.removeprefix(self.id_prefix), resident.key.layer, resident.version,
-            resident.name.removeprefix(self.segment_prefix), state, resident.nbytes, resident.points,
-            resident.box, resident.hits, int(resident.last_use_s * 1e9), resident.load_ns,
+    def show(self, resident: Resident, state: CellState) -> None:
+        """Show a segment as it is now."""
+        self.statistics.cell_changed(resident.name, self.row(resident, state))
+
+    def row(self, resident: Resident, state: CellState) -> CellRow:
+        """Return the row of a segment."""
+        return CellRow(
+            resident.key.cell_id.removeprefix(self.id_prefix),
+            resident.key.layer,
+            resident.version,
+            resident.name.removeprefix(self.segment_prefix),
+            state,
+            resident.nbytes,
+            resident.points,
+            resident.box,
+            resident.hits,
+            int(resident.last_use_s * 1e9),
+            resident.load_ns,
             ahead=resident.prefetched and state == "resident",
-        )  # fmt: skip
-        self.statistics.cell_changed(resident.name, row)
+        )
 
     def hide(self, name: str) -> None:
         """There is no segment of this name any more."""

@@ -119,7 +119,7 @@ class PrefetchMisses:
                 self._waited.move_to_end(slot)
             elif one.cells:
                 self._log.publish(
-                    events.Late, one.session, one.pid, one.client, one.cells, one.cell_id, one.layer
+                    events.PrefetchMiss, one.session, one.pid, one.client, one.cells, one.cell_id, one.layer
                 )
                 one.cells, one.quiet_until_s = 0, now_s + QUIET_S
                 self._waited.move_to_end(slot)

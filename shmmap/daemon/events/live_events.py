@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Telling what happens to live maps, as events and in the statistics: what changed since the last look."""
+"""Live maps as events and in the statistics: what changed since the last look."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Final
 
 from shmmap.daemon.events.log import EventLog
 from shmmap.protocol import events
-from shmmap.protocol.live import LiveMapRow
-from shmmap.statistics.live_rows import LiveRow
+from shmmap.protocol.rows import LiveMapRow
 from shmmap.statistics.writer import StatisticsWriter
 
 __all__ = ["LiveEvents"]
@@ -58,7 +57,7 @@ class LiveEvents:
     def told(self, rows: Sequence[LiveMapRow]) -> None:
         """This is how the maps are now."""
         self._rows = {row.name: row for row in rows}
-        self.statistics.show_live_maps([_shown(row) for row in rows])
+        self.statistics.show_live_maps(rows)
         if self._begun:
             self._tell()
 
@@ -80,11 +79,3 @@ class LiveEvents:
 def _cause(problem: str) -> str:
     """What is wrong, whichever chunk met it first."""
     return _CHUNK.sub("chunk", problem)
-
-
-def _shown(row: LiveMapRow) -> LiveRow:
-    return LiveRow(
-        row.name, row.problem, row.chunks, row.active, row.bytes, row.loading, row.dirty, row.saving,
-        row.evicting, row.evicting_bytes, row.waiting_bytes, row.files, row.file_bytes, row.scans,
-        row.durable, row.budget_bytes, len(row.damaged), len(row.mappers), row.change,
-    )  # fmt: skip

@@ -131,7 +131,7 @@ def not_served(one: LiveSettings, budget_bytes: int, problem: str) -> LiveMapRow
     """How a map is of which nothing is in memory, and why."""
     return LiveMapRow(
         one.name, one.path, one.resolution, one.frame_id, chunks=0, active=0, bytes=0, loading=0, dirty=0,
-        saving=0, evicting=0, evicting_bytes=0, waiting_bytes=0, files=0, file_bytes=0, scans=0, durable=0,
+        saving=0, waiting_bytes=0, files=0, file_bytes=0, scans=0, durable=0,
         budget_bytes=budget_bytes, problem=problem,
     )  # fmt: skip
 

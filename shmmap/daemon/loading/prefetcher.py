@@ -105,7 +105,7 @@ class Prefetcher:
             if session.motion.travelled_m > 0.0:
                 cell_id = cache.wire_id(key.cell_id)
                 cache.statistics.add(
-                    "cells_late", cache.events.prefetch_misses.note(session, cell_id, key.layer)
+                    "prefetch_misses", cache.events.prefetch_misses.note(session, cell_id, key.layer)
                 )
 
     # --- a chore of the serving loop --------------------------------------------------------------

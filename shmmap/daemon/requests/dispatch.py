@@ -121,5 +121,5 @@ class Dispatch:
 
     def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:
         self.sampler.measure()
-        reply = yield from self.queries.stats(message, usage, time.monotonic())
+        reply = yield from self.queries.stats(message, usage)
         session.connection.reply(encode(reply))

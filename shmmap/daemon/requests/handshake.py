@@ -62,10 +62,11 @@ class Handshake:
             There are too many sessions.
         """
         if message.major != PROTOCOL_VERSION[0]:
+            older = "client" if message.major < PROTOCOL_VERSION[0] else "daemon"
             raise ProtocolMismatch(
                 f"client speaks protocol {message.major}.{message.minor},"
                 f" daemon {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
-                hint="update the older of the two",
+                hint=f"update the {older}, and restart it",
             )
         if connection.session is not None:
             return connection.session  # a repeated hello: its answer was late or lost

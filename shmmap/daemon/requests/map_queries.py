@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -24,6 +25,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.pending_request import parts
+from shmmap.daemon.telemetry.sampler import client_row
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
@@ -32,6 +34,7 @@ from shmmap.origin.spatial_index import touches
 from shmmap.protocol import messages
 from shmmap.protocol.codec import encode
 from shmmap.protocol.events import Recent
+from shmmap.protocol.rows import CellState
 from shmmap.version import __version__
 
 __all__ = ["MapQueries"]
@@ -290,15 +293,13 @@ class MapQueries:
         wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.source_bytes(index)
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
-    def stats(
-        self, message: messages.Stats, usage: Usage, now_s: float
-    ) -> Generator[None, None, messages.StatsReply]:
+    def stats(self, message: messages.Stats, usage: Usage) -> Generator[None, None, messages.StatsReply]:
         """Answer a request for statistics with what a survey found, some sessions a turn."""
-        rows: list[messages.SessionRow] = []
+        rows: list[messages.ClientRow] = []
         for number, sessions in enumerate(parts(tuple(self.sessions))):
             if number:
                 yield
-            rows += [_session_row(one, usage.shares.get(one.slot, Share()), now_s) for one in sessions]
+            rows += [_with_share(client_row(one), usage.shares.get(one.slot, Share())) for one in sessions]
         return messages.StatsReply(
             message.request, self.cache.epoch, self._catalogue.map_version,
             dict(self.cache.statistics.values), tuple(rows), usage.unknown, usage.unknown_bytes,
@@ -331,22 +332,19 @@ class MapQueries:
             z_min=z_min, z_max=z_max, pinned=self.pins.layers_of(cell_id),
         )  # fmt: skip
 
-    def _segment(self, resident: Resident) -> messages.ShownSegment:
-        state = "resident" if self.cache.is_current(resident) else "stale"
+    def _segment(self, resident: Resident) -> messages.CellRow:
+        state: CellState = "resident" if self.cache.is_current(resident) else "stale"
         if resident.name in self.cache.ledger.retired:
             state = "zombie"
+        row = self.cache.rows.row(resident, state)
         holders = self.cache.holders.of(resident)
-        return messages.ShownSegment(
-            resident.key.layer, resident.version, resident.name, state, resident.nbytes, resident.points,
-            holders,
-        )  # fmt: skip
+        return replace(row, id=resident.key.cell_id, segment=resident.name, holders=holders)
 
 
-def _session_row(session: Session, share: Share, now_s: float) -> messages.SessionRow:
-    intent, peer = session.intent, session.peer
-    return messages.SessionRow(
-        session.slot, peer.pid, peer.uid, peer.gid, session.client, session.command, len(session.held),
-        session.held_bytes, session.requests, now_s - session.last_request_s,
-        (intent.x, intent.y) if intent is not None else None,
-        share.mapped_bytes, share.superseded, share.superseded_bytes,
-    )  # fmt: skip
+def _with_share(row: messages.ClientRow, share: Share) -> messages.ClientRow:
+    return replace(
+        row,
+        mapped_bytes=share.mapped_bytes,
+        superseded=share.superseded,
+        superseded_bytes=share.superseded_bytes,
+    )

@@ -21,10 +21,11 @@ from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.geometry import Area, Box, Circle
-from shmmap.statistics.client_rows import MAX_CLIENTS, ClientRow, Window
+from shmmap.protocol.rows import ClientRow, Window
 from shmmap.statistics.counters import SPANS, WINDOWED
+from shmmap.statistics.layout import MAX_CLIENTS
 
-__all__ = ["BEAT_S", "RecentCounts", "Sampler", "SessionRows"]
+__all__ = ["BEAT_S", "RecentCounts", "Sampler", "SessionRows", "client_row"]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
@@ -117,12 +118,20 @@ def client_row(session: Session) -> ClientRow:
     """Return what operators see of a client."""
     intent, peer = session.intent, session.peer
     return ClientRow(
-        session.slot, peer.pid, peer.uid, len(session.held), session.held_bytes, session.requests,
-        int(session.last_request_s * 1e9), session.client, session.command,
+        session.slot,
+        peer.pid,
+        peer.uid,
+        peer.gid,
+        session.client,
+        session.command,
+        len(session.held),
+        session.held_bytes,
+        session.requests,
+        int(session.last_request_s * 1e9),
         (float(intent.x), float(intent.y)) if intent is not None else None,
         None if intent is None or intent.heading is None else float(intent.heading),
         _window(session.area) if session.area is not None else None,
-    )  # fmt: skip
+    )
 
 
 def _window(area: Area) -> Window:

@@ -452,7 +452,7 @@ def test_a_page_that_comes_is_no_other_state_of_the_map(paged: Paged) -> None:
     assert (cache.warm is warm, paged.view.map_version) == (True, version)
     assert {name: statistics.values[name] for name in before} == before
     recent = paged.ask(lambda n: events.Recent(n, after=first - 1)).events
-    assert {type(events.decode_event(one)) for one in recent} <= {events.Loaded, events.Late}
+    assert {type(events.decode_event(one)) for one in recent} <= {events.Loaded, events.PrefetchMiss}
     since = paged.ask(lambda n: m.Metadata(n, since=version))
     assert (since.rows, since.since_known, since.map_version) == ((), True, version)
 

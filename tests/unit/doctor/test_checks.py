@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
@@ -20,10 +21,8 @@ from shmmap.doctor.checks import CHECKS, diagnose
 from shmmap.doctor.finding import Finding, worst
 from shmmap.doctor.patient import Machine, Patient, examine
 from shmmap.doctor.verdicts import cache_verdict
-from shmmap.protocol.live import LiveMapRow
-from shmmap.statistics.client_rows import ClientRow
+from shmmap.protocol.rows import ClientRow, LiveMapRow
 from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
-from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
 from tests.support.doctor_ward import USER, Ward, snapshot
@@ -206,7 +205,7 @@ WAITED = "moving clients waited for 150 cells in the last 10 min"
     [
         ({}, "ok", "off; moving clients waited for no cell in the last 10 min", ""),
         (
-            {"cells_late_10min": 2},
+            {"prefetch_misses_10min": 2},
             "ok",
             "off; moving clients waited for 2 cells in the last 10 min",
             "raise --prefetch-share",
@@ -219,37 +218,37 @@ WAITED = "moving clients waited for 150 cells in the last 10 min"
             "",
         ),
         (  # two in a hundred
-            DRIVING | {"cells_late_10min": 100, "misses_10min": 1000, "prefetch_short": 1},
+            DRIVING | {"prefetch_misses_10min": 100, "misses_10min": 1000, "prefetch_short": 1},
             "ok",
             "moving clients waited for 100 cells in the last 10 min",
             "",
         ),
         (
-            DRIVING | {"origin_out": 1, "last_outage_ns": 3 * S, "cells_late_10min": 1},
+            DRIVING | {"origin_out": 1, "last_outage_ns": 3 * S, "prefetch_misses_10min": 1},
             "warn",
             "the map's storage is out of reach: no load has succeeded for 3.0 s; moving clients waited for 1",
             "see to its disk or network; `shmmap tail` says why loads fail",
         ),
         (
-            DRIVING | {"cells_late_10min": 1, "last_outage_ns": 13 * S + 1},
+            DRIVING | {"prefetch_misses_10min": 1, "last_outage_ns": 13 * S + 1},
             "warn",
             "moving clients waited for 1 cell in the last 10 min; the map's storage was out of reach for 13",
             "raise --ride-out (14)",
         ),
         (
-            DRIVING | {"cells_late_10min": 150, "prefetch_short": 1},
+            DRIVING | {"prefetch_misses_10min": 150, "prefetch_short": 1},
             "warn",
             f"{WAITED}; cells fetched ahead take all of their share, 512 MiB",
             f"raise --prefetch-share or --budget, or {SMALLER}",
         ),
         (
-            DRIVING | {"cells_late_10min": 150, "prefetch_short": 2},
+            DRIVING | {"prefetch_misses_10min": 150, "prefetch_short": 2},
             "warn",
             f"{WAITED}; the budget of 1.0 GiB is full of what is in use or needed sooner",
             f"raise --budget, or {SMALLER}",
         ),
         (
-            DRIVING | {"cells_late_10min": 150, "misses_10min": 1000},
+            DRIVING | {"prefetch_misses_10min": 150, "misses_10min": 1000},
             "warn",
             WAITED,
             ROUTES,
@@ -314,10 +313,12 @@ def test_huge_pages(
 
 # --- live maps ---
 
-LIDAR = LiveRow("lidar", "", 12, 1000, 4 << 20, 0, 3, 1, 0, 0, 0, 40, 9 << 20, 100, 93, 16 << 20, 0, 1, 7)
+LIDAR = LiveMapRow(
+    "lidar", "/maps/lidar", 0.1, "map", 12, 1000, 4 << 20, 0, 3, 1, 0, 40, 9 << 20, 100, 93, 16 << 20
+)
 
 
-def with_live(*rows: LiveRow, clients: Sequence[ClientRow] = (), **counters: int) -> Snapshot:
+def with_live(*rows: LiveMapRow, clients: Sequence[ClientRow] = (), **counters: int) -> Snapshot:
     """A daemon that keeps these live maps, and lets nobody connect."""
     seen = snapshot("hung")
     seen.__dict__ |= {"counters": counters, "live": list(rows), "clients": list(clients)}
@@ -341,16 +342,18 @@ def test_without_live_maps_there_is_nothing_to_look_at(ward: Ward) -> None:
     [
         (LIDAR, 0, "ok", "lidar: 4 chunks not saved yet"),
         (LIDAR, 2, "warn", "the process that keeps them ended 2 times"),
-        (LIDAR._replace(damaged=2), 2, "warn", "damaged files, missing chunks: 2"),
+        (replace(LIDAR, damaged_count=2), 2, "warn", "damaged files, missing chunks: 2"),
         (
-            LIDAR._replace(damaged=2, problem="chunk 0_0_0 cannot be saved: full"),
+            replace(LIDAR, damaged_count=2, problem="chunk 0_0_0 cannot be saved: full"),
             0,
             "fail",
             "lidar: chunk 0_",
         ),
     ],
 )
-def test_what_is_wrong_with_live_maps(ward: Ward, row: LiveRow, restarts: int, state: str, fact: str) -> None:
+def test_what_is_wrong_with_live_maps(
+    ward: Ward, row: LiveMapRow, restarts: int, state: str, fact: str
+) -> None:
     found = live.check_live_maps(ward.patient(with_live(row, live_restarts=restarts)))
     assert (found.state, fact in found.fact) == (state, True), found
 
@@ -367,9 +370,9 @@ def test_the_disk_of_live_maps(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
     assert check().state == "ok"  # the daemon makes it
     assert "/maps/lidar is gone" in check(seen=with_live(LIDAR)).fact
     (ward.root / "maps/lidar").mkdir(mode=0o700)
-    found = check(seen=with_live(LIDAR._replace(budget_bytes=1)))
+    found = check(seen=with_live(replace(LIDAR, budget_bytes=1)))
     assert (found.state, "lidar: /maps/lidar, " in found.fact) == ("ok", True)
-    found = check(seen=with_live(LIDAR._replace(budget_bytes=1 << 60)))
+    found = check(seen=with_live(replace(LIDAR, budget_bytes=1 << 60)))
     assert (found.state, "may have to be saved" in found.fact) == ("warn", True)
     found = check(uid=USER)
     assert (found.state, f"{USER} may not write to /maps/lidar" in found.fact) == ("fail", True)
@@ -472,10 +475,9 @@ def test_readers_that_keep_chunks_are_named(ward: Ward) -> None:
 
 def test_readers_whose_requests_take_much_time_are_named(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     marks(ward)
-    clients = [ClientRow(3, 4242, 0, 0, 0, 0, 0, "perception", "python3")]
-    numbers = dict.fromkeys(LiveMapRow.__struct_fields__[4:18], 0)
+    clients = [ClientRow(3, 4242, 0, 0, "perception", "python3", 0, 0, 0, 0)]
     busiest = ((3, 730), (9, 500), (5, 499))
-    row = LiveMapRow("lidar", "/maps/lidar", 0.1, "map", **numbers, readers=busiest)  # type: ignore[arg-type]
+    row = replace(LIDAR, readers=busiest)
     monkeypatch.setattr(live, "_told", lambda _patient: (row,))
     found = live.check_live_memory(ward.patient(with_live(LIDAR, clients=clients)))
     assert found.state == "warn"

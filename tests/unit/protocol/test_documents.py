@@ -15,9 +15,7 @@ from shmmap.protocol import events, live
 from shmmap.protocol import messages as m
 from shmmap.segment import header, layout
 from shmmap.statistics import layout as statistics_layout
-from shmmap.statistics.cell_rows import CELL_ROW_BYTES
-from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
-from shmmap.statistics.live_rows import LIVE_ROW_BYTES
+from shmmap.statistics.rows import HEAD
 
 PROTOCOL = files("shmmap.protocol").joinpath("PROTOCOL.md").read_text(encoding="utf-8")
 REQUESTS = PROTOCOL[: PROTOCOL.index("\n## Replies\n")]
@@ -88,8 +86,8 @@ def test_events(kind: Any) -> None:
         ("Failed", m.FailedCell),
         ("Holder", m.Holder),
         ("Row", m.MetadataRow),
-        ("Session", m.SessionRow),
-        ("Segment", m.ShownSegment),
+        ("Client", m.ClientRow),
+        ("Segment", m.CellRow),
         ("Pinned", m.PinnedCell),
         ("Intent", m.Intent),
         ("LiveMap", live.LiveMapRow),
@@ -99,7 +97,7 @@ def test_events(kind: Any) -> None:
 def test_rows(name: str, kind: Any) -> None:
     found = re.search(rf"\*{name}\*(?:\*)? ?(?:is|:)?\**:?\s*`\[(.*?)\]`", PROTOCOL)
     assert found is not None
-    assert names_in(found[1].replace("(whole name)", "")) == field_names(kind)
+    assert names_in(found[1]) == field_names(kind)
 
 
 def test_every_code_is_explained() -> None:
@@ -158,9 +156,7 @@ def tables(document: str) -> list[list[tuple[int, str]]]:
                 statistics_layout.EXTENSION.size,
                 statistics_layout.STATE.size,
                 statistics_layout.CHANGES.size,
-                CELL_ROW_BYTES,
-                CLIENT_ROW_BYTES,
-                LIVE_ROW_BYTES,
+                HEAD.size,
             ],
         ),
     ],

@@ -26,7 +26,7 @@ HANDLE = m.Handle("a.pcd", 1, "points", "00", 0, 8192, 9, 0.0, 0.0, 20.0, 20.0)
 
 # message, what PROTOCOL.md makes of it, and the bytes
 REQUESTS: list[tuple[Any, list[Any], str]] = [
-    (m.Hello(1, 1, 0, "c", 9), ["hello", 1, 1, 0, "c", 9], "96a568656c6c6f010100a16309"),
+    (m.Hello(1, 2, 0, "c", 9), ["hello", 1, 2, 0, "c", 9], "96a568656c6c6f010200a16309"),
     (
         m.Metadata(2, m.BoxMessage(0.0, 1.0, 2.0, 3.0), 5, 6, 7),
         ["metadata", 2, ["box", 0.0, 1.0, 2.0, 3.0, None, None], 5, 6, 7],
@@ -234,7 +234,26 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             3,
             5,
             {"requests": 1},
-            (m.SessionRow(4, 5, 6, 7, "c", "cmd", 1, 2, 3, 0.5, (1.0, 2.0), 8, 9, 10),),
+            (
+                m.ClientRow(
+                    4,
+                    5,
+                    6,
+                    -1,
+                    "c",
+                    "cmd",
+                    1,
+                    2,
+                    3,
+                    4,
+                    (1.0, 2.0),
+                    0.5,
+                    m.Window("box", 1, 2, 3, 4),
+                    8,
+                    9,
+                    10,
+                ),
+            ),
             1,
             2,
         ),
@@ -244,13 +263,14 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             3,
             5,
             {"requests": 1},
-            [[4, 5, 6, 7, "c", "cmd", 1, 2, 3, 0.5, [1.0, 2.0], 8, 9, 10]],
+            [[4, 5, 6, -1, "c", "cmd", 1, 2, 3, 4, [1.0, 2.0], 0.5, ["box", 1, 2, 3, 4], 8, 9, 10]],
             1,
             2,
         ],
         (
-            "98ab73746174735f7265706c7907030581a8726571756573747301919e04050607a163a3636d6401"
-            "0203cb3fe000000000000092cb3ff0000000000000cb400000000000000008090a0102"
+            "98ab73746174735f7265706c7907030581a872657175657374730191dc0010040506ffa163a3636d"
+            "640102030492cb3ff0000000000000cb4000000000000000cb3fe000000000000095a3626f780102"
+            "030408090a0102"
         ),
     ),
     (
@@ -263,7 +283,23 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             20.0,
             20.0,
             300,
-            (m.ShownSegment("points", 1, "00", "zombie", 1, 2, (m.Holder(4, 5, 6, "c", 7, 8, "cmd"),)),),
+            (
+                m.CellRow(
+                    "a",
+                    "points",
+                    1,
+                    "00",
+                    "zombie",
+                    1,
+                    2,
+                    (0, 0, 20, 20),
+                    3,
+                    4,
+                    5,
+                    True,
+                    (m.Holder(4, 5, 6, "c", 7, 8, "cmd"),),
+                ),
+            ),
             ("points",),
             "bad",
             -1.0,
@@ -280,7 +316,23 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
             20.0,
             20.0,
             300,
-            [["points", 1, "00", "zombie", 1, 2, [[4, 5, 6, "c", 7, 8, "cmd"]]]],
+            [
+                [
+                    "a",
+                    "points",
+                    1,
+                    "00",
+                    "zombie",
+                    1,
+                    2,
+                    [0, 0, 20, 20],
+                    3,
+                    4,
+                    5,
+                    True,
+                    [[4, 5, 6, "c", 7, 8, "cmd"]],
+                ]
+            ],
             ["points"],
             "bad",
             -1.0,
@@ -289,9 +341,9 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
         ],
         (
             "9faa73686f776e5f63656c6c08a16101cb0000000000000000cb0000000000000000cb4034000000"
-            "000000cb4034000000000000cd012c9197a6706f696e747301a23030a67a6f6d6269650102919704"
-            "0506a1630708a3636d6491a6706f696e7473a3626164cbbff0000000000000cb3ff0000000000000"
-            "91a6706f696e7473"
+            "000000cb4034000000000000cd012c919da161a6706f696e747301a23030a67a6f6d626965010294"
+            "00001414030405c39197040506a1630708a3636d6491a6706f696e7473a3626164cbbff000000000"
+            "0000cb3ff000000000000091a6706f696e7473"
         ),
     ),
     (
@@ -357,7 +409,7 @@ def test_replies_of_a_later_minor_version_are_read(message: object, elements: li
 @pytest.mark.parametrize(
     ("short", "full"),
     [
-        (["hello", 1, 1, 0], m.Hello(1, 1, 0, "", 0)),
+        (["hello", 1, 2, 0], m.Hello(1, 2, 0, "", 0)),
         (["metadata", 1], m.Metadata(1, None, None, 0, 1000)),
         (
             ["area", 1, ["box", 0, 1, 2, 3]],

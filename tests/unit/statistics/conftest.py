@@ -8,9 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow
 from shmmap.segment.directory import ShmDirectory
-from shmmap.statistics.cell_rows import CellRow
-from shmmap.statistics.client_rows import ClientRow
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -24,7 +23,12 @@ def row(number: int, *, nbytes: int = 4096) -> CellRow:
 
 def client(number: int) -> ClientRow:
     """Row of a client of that number."""
-    return ClientRow(number + 1, 100 + number, 0, number, 0, 0, 0, f"client {number}", "python3")
+    return ClientRow(number + 1, 100 + number, 0, 0, f"client {number}", "python3", number, 0, 0, 0)
+
+
+def live_map(number: int) -> LiveMapRow:
+    """Row of a live map of that number."""
+    return LiveMapRow(f"map{number}", "/live", 0.1, "map", number, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12)
 
 
 @pytest.fixture

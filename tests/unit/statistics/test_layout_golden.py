@@ -3,18 +3,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import struct
+import zlib
+from typing import Any
 
+import msgspec
 import pytest
 
 from shmmap.errors import SegmentCorrupt
+from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow, Window
 from shmmap.statistics import layout
-from shmmap.statistics.cell_rows import CellRow, pack_cell, unpack_cell
-from shmmap.statistics.client_rows import ClientRow, Window, pack_client, unpack_client
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, Counter
 from shmmap.statistics.layout import State
-from shmmap.statistics.live_rows import LiveRow, pack_live, unpack_live
+from shmmap.statistics.rows import FREE_ROW, pack_row, unpack_row
+from tests.support.message_pack import pack
 
 TWO = (
     Counter("requests", "counter", "", "Requests received"),
@@ -22,16 +24,16 @@ TWO = (
 )
 LOAD = (Counter("load", "histogram", "ns", "How long"),)
 GOLDEN_START = (
-    "53484d5354415401 0100 0500 04030201"  # magic, 1.5, byte order
+    "53484d5354415401 0200 0000 04030201"  # magic, 2.0, byte order
     "80000000 02000000 a0000000"  # descriptions at 128: 2 of 160 bytes
     "80020000 00400000"  # identity at 640, 16384 bytes each
     "80820000 80040000"  # state at 33408, 1152 bytes each
-    "808b0000 00100200 00010000 00000200"  # table 35712, rows at 135168 of 256, at most 131072
-    "b223c556"
+    "808b0000 00900200 00010000 00000200"  # table 35712, rows at 167936 of 256, at most 131072
+    "cc154863"
     "01000000 82000000 00900000 00010000 00010000"  # 1 histogram of 130; clients at 36864, 256 of 256
-    "c08b0000 00900100 00020000 40000000"
+    "c08b0000 00900100 00040000 40000000"
     + "00" * 24
-    + "ed8068a8"  # changes at 35776; live at 102400, 64 of 512
+    + "26ff5804"  # changes at 35776; live at 102400, 64 of 1024
 )
 GOLDEN_FIRST = "7265717565737473" + "00" * 40 + "00" + "5265717565737473207265636569766564" + "00" * 94
 GOLDEN_SECOND = (
@@ -43,36 +45,65 @@ GOLDEN_STATE = (
     "0b00000000000000 f3ffffffffffffff 4b3f656d 00000000"
     "04000000 02000000 1100000000000000 1300000000000000 b924b90000000000"
 )
-GOLDEN_CLIENT = (
-    "0807060504030201 4d000000 ffffffff"  # session, pid, uid
-    "0300000000000000 0010000000000000 0900000000000000 0600000000000000"  # cells, bytes, requests, last
-    "000000000000f83f 00000000000004c0 000000000000e03f"  # pose, heading
-    "000000000000f03f 0000000000000040 0000000000004440 0000000000804440"  # window
-    "02 03 0000 00000000 76c3a9" + "00" * 45 + "707974686f6e33" + "00" * 9 + "00" * 76 + "f84f0e29"
+GOLDEN_IDENTITY = "02000000000000000600000092abc882706964003100"
+CELL = CellRow(
+    "a.pcd",
+    "points",
+    0x0102030405060708,
+    "00112233445566ff",
+    "stale",
+    8192,
+    100,
+    (0.0, 20.0, 20.0, 40.0),
+    5,
+    6,
+    7,
 )
 CLIENT = ClientRow(
-    0x0102030405060708, 77, -1, 3, 4096, 9, 6, "vé", "python3",
-    (1.5, -2.5), 0.5, Window("square", 1.0, 2.0, 40.0, 41.0),
+    0x0102030405060708, 77, -1, 9, "vé", "python3", 3, 4096, 9, 6, (1.5, -2.5), 0.5,
+    Window("square", 1.0, 2.0, 40.0, 41.0),
 )  # fmt: skip
-GOLDEN_LIVE = (
-    "6c6964c3a472" + "00" * 58 + "6469736b2066756c6c" + "00" * 247  # name, problem
-    + "".join(f"{number:02x}" + "00" * 7 for number in range(1, 17))
-    + "00" * 7 + "40" + "00" * 52 + "498faf27"
+LIVE = LiveMapRow(
+    "lidär", "/m", 0.5, "map", 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, ("x.chunk: torn",), ("0/front",),
+    "disk full", 2**62, 13, ((14, 15),), 1, 1,
 )  # fmt: skip
-LIVE = LiveRow._make(("lidär", "disk full", *range(1, 17), 2**62))
-GOLDEN_IDENTITY = "02000000000000000600000092abc882706964003100"
-GOLDEN_ROW = (
-    "0807060504030201 0020000000000000 6400000000000000"  # version, bytes, points
-    "0000000000000000 0000000000003440 0000000000003440 0000000000004440"  # box
-    "0500000000000000 0600000000000000 0700000000000000"  # hits, last use, load
-    "30303131323233333434353536366666"  # segment
-    "02 00 0500 0600 0000"  # stale, id of 5, layer of 6
-    "706f696e7473" + "00" * 34 + "612e706364" + "00" * 99 + "00000000 e415eb0e"
-)
-ROW = CellRow(
-    "a.pcd", "points", 0x0102030405060708, "00112233445566ff", "stale", 8192, 100,
-    (0.0, 20.0, 20.0, 40.0), 5, 6, 7,
-)  # fmt: skip
+ROWS: list[tuple[Any, int, str]] = [
+    (
+        CELL,
+        layout.CELL_ROW_BYTES,
+        (
+            "5c000000 5bcf6a95 9d"  # length, checksum, an array of 13
+            "a5612e706364 a6706f696e7473 cf0102030405060708"  # id, layer, version
+            "b030303131323233333434353536366666 a57374616c65"  # segment, state
+            "cd2000 64"  # bytes, points
+            "94cb0000000000000000cb4034000000000000cb4034000000000000cb4044000000000000"  # box
+            "05 06 07 c2 90"  # hits, last use, load, not ahead, no holders
+        ),
+    ),
+    (
+        CLIENT,
+        layout.CLIENT_ROW_BYTES,
+        (
+            "6c000000 da78a8a6 dc0010"
+            "cf0102030405060708 4d ff 09 a376c3a9 a7707974686f6e33"  # session, pid, uid, gid, client, command
+            "03 cd1000 09 06"  # cells, bytes, requests, last request
+            "92cb3ff8000000000000cbc004000000000000 cb3fe0000000000000"  # pose, heading
+            "95a6737175617265cb3ff0000000000000cb4000000000000000cb4044000000000000cb4044800000000000"
+            "00 00 00"
+        ),
+    ),
+    (
+        LIVE,
+        layout.LIVE_ROW_BYTES,
+        (
+            "58000000 b5aa7ca9 dc0018"
+            "a66c6964c3a472 a22f6d cb3fe0000000000000 a36d6170"  # name, path, resolution, frame
+            "01 02 03 04 05 06 07 08 09 0a 0b 0c"
+            "91ad782e6368756e6b3a20746f726e 91a7302f66726f6e74"  # damaged, mappers
+            "a96469736b2066756c6c cf4000000000000000 0d 91920e0f 01 01"  # problem, change, readers, counts
+        ),
+    ),
+]
 
 
 def test_header() -> None:
@@ -81,16 +112,19 @@ def test_header() -> None:
     assert layout.unpack_header(packed) == layout.plan(TWO, LOAD)
 
 
-def test_a_header_of_layout_1_0_is_read() -> None:
-    """It ends with the counters; no histograms, no clients."""
-    old = bytes.fromhex(
-        "53484d5354415401 0100 0000 04030201 40000000 02000000 a0000000 80010000 00400000"
-        "80810000 40000000 00820000 00900000 00010000 00000200 fedf4f8f" + GOLDEN_FIRST + GOLDEN_SECOND
-    )
-    header = layout.unpack_header(old + bytes(64))
-    assert header == layout.Header(TWO, 384, 16384, 33152, 64, 33280, 36864, 256, 131072)
-    state = bytes.fromhex(GOLDEN_STATE)[:64]
-    assert layout.unpack_state(state, extended=False) == State(3, 5, 7, 2, 1, (11, -13))
+@pytest.mark.parametrize(
+    ("version", "what"),
+    [
+        ((1, 0), "statistics 1.0 of an older daemon"),
+        ((1, 5), "statistics 1.5 of an older daemon"),
+        ((3, 1), "statistics 3.1 of a newer daemon"),
+    ],
+)
+def test_another_major_version_is_named(version: tuple[int, int], what: str) -> None:
+    other = bytes.fromhex(GOLDEN_START)[:8] + struct.pack("<HH", *version) + bytes(500)
+    with pytest.raises(SegmentCorrupt, match=rf"{what}: this program reads 2\.x") as refused:
+        layout.unpack_header(other)
+    assert refused.value.hint == f"update the {'program' if version > (2,) else 'daemon'}, and restart it"
 
 
 def test_state() -> None:
@@ -101,59 +135,34 @@ def test_state() -> None:
     assert seen._replace(histograms=tuple(seen.histograms)) == state
 
 
-def test_client() -> None:
-    assert pack_client(CLIENT) == bytes.fromhex(GOLDEN_CLIENT)
-    assert unpack_client(bytes.fromhex(GOLDEN_CLIENT)) == CLIENT
-    assert unpack_client(pack_client(None)) is None
-    bare = ClientRow(1, 0, -1, 0, 0, 0, 0, "ä" * 30, "c" * 20)
-    assert unpack_client(pack_client(bare)) == bare._replace(client="ä" * 24, command="c" * 16)
-    far = bare._replace(client="", command="", uid=2**32 - 2)  # a user id may have all 32 bits
-    assert unpack_client(pack_client(far)) == far
-    for at in range(256):
-        torn = bytearray.fromhex(GOLDEN_CLIENT)
-        torn[at] ^= 1
-        with pytest.raises(SegmentCorrupt):
-            unpack_client(bytes(torn))
+def framed(elements: list[object]) -> bytes:
+    """Return a row as the page has it."""
+    data = pack(elements)
+    length = struct.pack("<I", len(data))
+    return length + struct.pack("<I", zlib.crc32(length + data)) + data
 
 
-def test_live_map() -> None:
-    assert pack_live(LIVE) == bytes.fromhex(GOLDEN_LIVE)
-    assert unpack_live(bytes.fromhex(GOLDEN_LIVE)) == LIVE
-    assert unpack_live(bytes(512)) is None
-    assert unpack_live(pack_live(LIVE._replace(problem="ä" * 200))) == LIVE._replace(problem="ä" * 128)
-    assert LIVE.states == {"loading": 4, "clean": 0, "dirty": 5, "saving": 6}
-    for at in range(512):
-        torn = bytearray.fromhex(GOLDEN_LIVE)
+@pytest.mark.parametrize(("row", "size", "golden"), ROWS, ids=["cell", "client", "live"])
+def test_rows(row: Any, size: int, golden: str) -> None:
+    data = bytes.fromhex(golden)
+    elements = msgspec.to_builtins(row)
+    assert pack_row(row, size) == data
+    assert data[8:] == pack(elements)
+    assert unpack_row(type(row), memoryview(data + b"left from a longer row")) == row
+    assert unpack_row(type(row), memoryview(FREE_ROW + data[8:])) is None
+    for at in range(len(data)):
+        torn = bytearray(data)
         torn[at] ^= 1
         with pytest.raises(SegmentCorrupt):
-            unpack_live(bytes(torn))
+            unpack_row(type(row), memoryview(bytes(torn)))
+    assert unpack_row(type(row), memoryview(framed([*elements, "later"]))) == row
+    with pytest.raises(SegmentCorrupt, match="does not decode"):
+        unpack_row(type(row), memoryview(framed(elements[1:])))
 
 
 def test_identity() -> None:
     assert layout.pack_identity(2, b"pid\x001\x00", 64) == bytes.fromhex(GOLDEN_IDENTITY)
     assert layout.unpack_identity(bytes.fromhex(GOLDEN_IDENTITY) + bytes(42)) == (2, b"pid\x001\x00")
-
-
-def test_row() -> None:
-    assert pack_cell(ROW) == bytes.fromhex(GOLDEN_ROW)
-    assert unpack_cell(memoryview(bytes.fromhex(GOLDEN_ROW))) == ROW
-
-
-def test_a_row_of_what_nobody_has_asked_for_yet() -> None:
-    """Its flag is the third bit; a reader of layout 1.3 takes it for any resident one."""
-    packed = pack_cell(dataclasses.replace(ROW, state="resident", ahead=True))
-    assert packed[96:98] == bytes([1, 4])
-    row = unpack_cell(memoryview(packed))
-    assert row is not None
-    assert (row.state, row.ahead, row.id_cut, row.layer_cut) == ("resident", True, False, False)
-
-
-def test_a_torn_row_is_noticed() -> None:
-    for at in range(256):
-        torn = bytearray.fromhex(GOLDEN_ROW)
-        torn[at] ^= 1
-        with pytest.raises(SegmentCorrupt):
-            unpack_cell(memoryview(bytes(torn)))
 
 
 def test_a_torn_state_is_noticed() -> None:
@@ -176,44 +185,38 @@ def test_states_never_written_are_left_out() -> None:
     assert layout.unpack_identity(bytes(64)) is None
 
 
-def test_long_ids_keep_their_end_and_say_so() -> None:
-    row = unpack_cell(
-        memoryview(pack_cell(CellRow("ä" * 200 + "end", "l" * 90, 1, "0" * 16, "zombie", 1, 1, ROW.box)))
-    )
-    assert row is not None
-    assert row.id_cut
-    assert row.layer_cut
-    assert row.id == "ä" * 50 + "end"
-    assert row.layer == "l" * 40
-
-
 @pytest.mark.parametrize(
-    "layer", ["ndt(leaf=2.0,min_points=6,regularization=0.01)", "l" * 135, "ä" * 67, "l" * 40]
+    ("row", "size", "shown"),
+    [
+        (
+            msgspec.structs.replace(CELL, id="ä" * 200 + "end", layer="l" * 90),
+            layout.CELL_ROW_BYTES,
+            {"id": "…" + "ä" * 48 + "end", "layer": "l" * 60 + "…"},
+        ),
+        (msgspec.structs.replace(CELL, layer="ä" * 60), layout.CELL_ROW_BYTES, {"layer": "ä" * 60}),
+        (msgspec.structs.replace(CELL, id="\udcff.pcd"), layout.CELL_ROW_BYTES, {"id": "\\udcff.pcd"}),
+        (
+            msgspec.structs.replace(CLIENT, client="ä" * 200, uid=2**32 - 2, pid=2**31 - 1),
+            layout.CLIENT_ROW_BYTES,
+            {"client": "ä" * 65 + "…"},
+        ),
+        (
+            msgspec.structs.replace(LIVE, damaged=("x" * 100,) * 64, damaged_count=99, mappers=("m" * 60,)),
+            layout.LIVE_ROW_BYTES,
+            {"damaged": (), "mappers": ()},
+        ),
+        (
+            msgspec.structs.replace(LIVE, path="/" + "d" * 3000, problem="p" * 3000),
+            layout.LIVE_ROW_BYTES,
+            {"damaged": (), "mappers": (), "path": "…" + "d" * 200, "problem": "p" * 752 + "…"},
+        ),
+    ],
 )
-def test_a_long_layer_is_whole_where_the_row_has_room(layer: str) -> None:
-    """What its field lacks lies behind the id."""
-    row = unpack_cell(
-        memoryview(pack_cell(CellRow("20_0.pcd", layer, 1, "0" * 16, "resident", 1, 1, ROW.box)))
-    )
-    assert row is not None
-    assert (row.id, row.layer, row.layer_cut, row.whole_layer) == ("20_0.pcd", layer, False, layer)
-    wide = unpack_cell(
-        memoryview(pack_cell(CellRow("x" * 100, layer, 1, "0" * 16, "resident", 1, 1, ROW.box)))
-    )
-    assert wide is not None
-    assert wide.id == "x" * 100
-    assert wide.layer_cut == (len(layer.encode()) > 44)
-    assert wide.whole_layer == layer or (
-        wide.whole_layer == wide.layer + "…" and layer.startswith(wide.layer)
-    )
-
-
-def test_ids_that_are_no_utf8_survive() -> None:
-    row = unpack_cell(
-        memoryview(pack_cell(CellRow("\udcff.pcd", "points", 1, "", "resident", 1, 1, ROW.box)))
-    )
-    assert row is not None
-    assert row.id == "\udcff.pcd"
+def test_what_is_too_long_is_cut(row: Any, size: int, shown: dict[str, object]) -> None:
+    """A cell keeps the end of its id, a live map the numbers of what is not listed."""
+    data = pack_row(row, size)
+    assert len(data) <= size
+    assert unpack_row(type(row), memoryview(data)) == msgspec.structs.replace(row, **shown)
 
 
 def test_every_counter_fits_its_description() -> None:

@@ -8,11 +8,12 @@ import re
 from collections.abc import Iterator
 
 import pytest
+from msgspec.structs import replace
 
+from shmmap.protocol.rows import LiveMapRow
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, OBJECTS_READ, PUBLISHED
 from shmmap.statistics.identity import DaemonIdentity, pid_namespace, start_time_ticks
-from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.prometheus import exposition
 from shmmap.statistics.reader import read_statistics
 from shmmap.statistics.snapshot import Snapshot
@@ -113,10 +114,10 @@ def test_histograms_are_cumulative(found: Snapshot) -> None:
 
 
 def test_live_maps(found: Snapshot) -> None:
-    lidar = LiveRow("lidar", "", 5, 100, 4096, 1, 2, 1, 3, 512, 9, 3, 777, 11, 7, 1 << 20, 0, 2, 40)
+    lidar = LiveMapRow("lidar", "/m", 0.1, "map", 5, 100, 4096, 1, 2, 1, 9, 3, 777, 11, 7, 1 << 20)
     types, before = parse(exposition(found, "unit"))
     assert not [name for name in types if "_live_" in name and name != "shmmap_live_restarts_total"]
-    found.__dict__["live"] = [lidar, lidar._replace(name="radar", problem="full", damaged=2)]
+    found.__dict__["live"] = [lidar, replace(lidar, name="radar", problem="full", damaged_count=2)]
     types, samples = parse(exposition(found, "unit"))
     assert {key: samples[key] for key in before} == before
     told = {key[0].removeprefix("shmmap_live_"): n for key, n in samples.items() if key[1] == "lidar"}

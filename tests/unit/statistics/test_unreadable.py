@@ -10,6 +10,7 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from shmmap.errors import NotPermitted, SegmentCorrupt
@@ -117,7 +118,7 @@ def test_half_written_blocks_and_rows_are_survived(shm: ShmDirectory, writer: St
     data[older : older + 20] = os.urandom(20)
     data[identity_at : identity_at + 10] = os.urandom(10)  # block 0 was never written
     data[table_at] |= 1
-    data[rows_at + 256 + 3] ^= 0xFF
+    data[rows_at + 256 + 13] ^= 0xFF
     Path(shm.path, "shmmap.torn.statistics").write_bytes(data)
     seen = read_statistics("torn", shm.path)
     assert seen.counters["requests"] == 1
@@ -142,7 +143,7 @@ def test_readers_see_whole_states_while_the_writer_writes(
             writer.set("requests", count)
             writer.set("replies", 2 * count)
             for key in range(3):
-                writer.cell_changed(key, replace(row(key), hits=count))
+                writer.cell_changed(key, msgspec.structs.replace(row(key), hits=count))
             writer.update_identity(replace(identity, epoch=count))
             writer.beat()
 

@@ -14,11 +14,9 @@ import pytest
 
 from shmmap.errors import CannotStart
 from shmmap.segment.directory import ShmDirectory
-from shmmap.statistics.cell_rows import CELL_ROW_BYTES
-from shmmap.statistics.client_rows import CLIENT_ROW_BYTES
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.layout import plan
+from shmmap.statistics.layout import CELL_ROW_BYTES, CLIENT_ROW_BYTES, plan
 from shmmap.statistics.reader import read_statistics
 from shmmap.statistics.writer import StatisticsWriter
 from tests.unit.statistics.conftest import client, row
@@ -94,9 +92,9 @@ def test_what_cannot_be_written_is_written_as_soon_as_it_can(
         layout.state_offset + 100,
         layout.state_offset + layout.state_bytes + 100,
         layout.table_offset,
-        layout.clients_offset + CLIENT_ROW_BYTES + 100,
+        layout.clients_offset + CLIENT_ROW_BYTES + 20,
         layout.rows_offset,
-        layout.rows_offset + 3 * CELL_ROW_BYTES + 100,
+        layout.rows_offset + 3 * CELL_ROW_BYTES + 20,
     ]
     writer.show_clients([client(0)])
     for number in range(3):

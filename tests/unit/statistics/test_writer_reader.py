@@ -9,14 +9,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
+
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import bucket_of
 from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter
-from tests.unit.statistics.conftest import client, row
+from tests.unit.statistics.conftest import client, live_map, row
 
 
 def test_everything_comes_back(shm: ShmDirectory, writer: StatisticsWriter, identity: DaemonIdentity) -> None:
@@ -77,7 +78,7 @@ def test_clients_come_and_go(shm: ShmDirectory, writer: StatisticsWriter) -> Non
         writer.show_clients([client(number) for number in range(count)])
         writer.beat()
         assert read_statistics("unit", shm.path).clients == [client(n) for n in range(min(count, 256))]
-    changed = [client(number)._replace(requests=7) for number in range(2)]
+    changed = [msgspec.structs.replace(client(number), requests=7) for number in range(2)]
     writer.show_clients(changed)
     writer.beat()
     assert read_statistics("unit", shm.path).clients == changed
@@ -117,18 +118,18 @@ def test_a_beat_writes_a_bounded_number_of_rows(shm: ShmDirectory, writer: Stati
 def test_live_maps_take_memory_only_where_there_are_any(shm: ShmDirectory, writer: StatisticsWriter) -> None:
     assert read_statistics("unit", shm.path).live == []
     before = writer.size_bytes
-    rows = [LiveRow(f"map{number}", "", *range(number, number + 17)) for number in range(9)]
+    rows = [live_map(number) for number in range(9)]
     for _ in range(2):
         writer.show_live_maps(rows)
         assert read_statistics("unit", shm.path).live == rows
-        assert writer.size_bytes == before + 2 * 4096
-        rows[3] = rows[3]._replace(problem="disk full", chunks=77)
-    writer.show_live_maps([rows[0]._replace(name=f"map{number}") for number in range(65)])
+        assert writer.size_bytes == before + 3 * 4096
+        rows[3] = msgspec.structs.replace(rows[3], problem="disk full", chunks=77)
+    writer.show_live_maps([live_map(number) for number in range(65)])
     assert len(read_statistics("unit", shm.path).live) == 64
 
 
 def test_live_maps_that_find_no_memory_are_shown_later(shm: ShmDirectory, writer: StatisticsWriter) -> None:
-    row = LiveRow("lidar", "", *range(17))
+    row = live_map(1)
     writer.reserve = lambda _nbytes: False
     writer.show_live_maps([row])
     assert read_statistics("unit", shm.path).live == []

@@ -318,8 +318,8 @@ class Client {
     if (!socket_.is_open()) throw *first;
     hello_ = next_request();
     auto message = begun("hello", *hello_, 4);
-    message.number(1);
-    message.number(4);
+    message.number(detail::protocol_major);
+    message.number(detail::protocol_minor);
     message.text(options_.name);
     message.number(welcome_.session);
     socket_.send(message.data());

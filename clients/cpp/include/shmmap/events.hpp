@@ -70,7 +70,7 @@ inline constexpr std::array<KindOfEvent, 17> kinds_of_events{{
     {"failed", {"id", "layer", "code", "message", "retry_s"}},
     {"retried", {"id", "layer", "code"}},
     {"pressure", {"id", "layer", "code", "refused", "budget_bytes", "used_bytes", "pinned_bytes", "zombie_bytes"}},
-    {"late", {"session", "pid", "client", "cells", "id", "layer"}},
+    {"prefetch_miss", {"session", "pid", "client", "cells", "id", "layer"}},
     {"reload", {"map_version", "changed", "added", "removed", "told", "error"}},
     {"long_turn", {"kind", "cpu_ns"}},
     {"joined", {"session", "pid", "uid", "client"}},

@@ -26,6 +26,7 @@
 #include <utility>
 #include <vector>
 
+#include <shmmap/detail/message_pack.hpp>
 #include <shmmap/detail/segments.hpp>
 #include <shmmap/detail/socket.hpp>
 #include <shmmap/errors.hpp>
@@ -73,7 +74,7 @@ struct Histogram {
 
 /// One segment that the daemon keeps.
 struct KeptCell {
-  std::string id, layer, segment;  ///< the end of a long id, the start of a layer too long for the row
+  std::string id, layer, segment;  ///< too long ones are cut, and have an ellipsis there
   enum class State { resident = 1, stale, retired } state = State::resident;
   std::uint64_t version = 0, bytes = 0, points = 0, hits = 0;
   double min_x = 0.0, min_y = 0.0, max_x = 0.0, max_y = 0.0;
@@ -84,7 +85,8 @@ struct KeptCell {
 /// One client of the daemon.
 struct ListedClient {
   std::uint64_t session = 0, cells = 0, bytes = 0, requests = 0;
-  std::uint32_t pid = 0, uid = 0;
+  std::uint32_t pid = 0;
+  std::int64_t uid = -1, gid = -1;  ///< -1: not known
   std::string client, command;
   std::int64_t last_request_monotonic_ns = 0;
   std::optional<std::array<double, 2>> pose = std::nullopt;  ///< metres
@@ -93,10 +95,9 @@ struct ListedClient {
 
 /// One live map.
 struct KeptLiveMap {
-  std::string name, problem;
-  std::int64_t chunks = 0, active = 0, bytes = 0, loading = 0, dirty = 0, saving = 0, evicting = 0,
-               evicting_bytes = 0, waiting_bytes = 0, files = 0, file_bytes = 0, scans = 0, durable = 0,
-               budget_bytes = 0, damaged = 0, mappers = 0, change = 0;
+  std::string name, path, problem;
+  std::int64_t chunks = 0, active = 0, bytes = 0, loading = 0, dirty = 0, saving = 0, waiting_bytes = 0, files = 0,
+               file_bytes = 0, scans = 0, durable = 0, budget_bytes = 0, damaged = 0, mappers = 0, change = 0;
 };
 
 /// All of it as of one moment.
@@ -179,7 +180,10 @@ inline StatisticsHeader read_statistics_header(const StatisticsFile& file) {
   const std::string start = file.bytes(0, 128);
   const auto u32 = [&start](std::size_t at) { return read_at<std::uint32_t>(raw(start), at); };
   if (start.compare(0, 8, std::string_view("SHMSTAT\1", 8)) != 0) damaged(file.path(), "it is no statistics segment");
-  if (read_at<std::uint16_t>(raw(start), 8) != 1) damaged(file.path(), "it has another layout");
+  if (const auto major = read_at<std::uint16_t>(raw(start), 8); major != 2)
+    throw SegmentError("segment_corrupt", "statistics " + std::to_string(major) + "." +
+                                              std::to_string(read_at<std::uint16_t>(raw(start), 10)) + " of " +
+                                              (major < 2 ? "an older" : "a newer") + " daemon: this program reads 2.x");
   if (u32(12) != 0x01020304U) damaged(file.path(), "it has another byte order");
   const std::uint64_t descriptions = u32(16), count = u32(20), row = u32(24), histograms = u32(64);
   StatisticsHeader header;
@@ -279,10 +283,10 @@ class StatisticsReader {
   }
 
   std::pair<std::uint64_t, std::uint64_t> read_state(Statistics& found) const {
-    const auto ends = [this](const std::string& one) {
+    const auto ends = [](const std::string& one) {
       const std::uint64_t counters = 40 + 8 * std::uint64_t{at<std::uint32_t>(one, 32)};
       const std::uint64_t histograms = counters + 16 + 8 * std::uint64_t{at<std::uint32_t>(one, counters + 12)};
-      return std::pair(counters, header_->buckets != 0 ? histograms : counters);
+      return std::pair(counters, histograms);
     };
     const auto state = newest(header_->state, header_->state_bytes, [&ends](const std::string& one) {
       try {
@@ -303,7 +307,6 @@ class StatisticsReader {
     for (std::size_t number = 0; number < count; ++number)
       found.counters[number].value = at<std::int64_t>(state, 40 + 8 * number);
     const auto counters = ends(state).first;
-    if (header_->buckets == 0) return {at<std::uint32_t>(state, 24), 0};
     found.histograms = header_->histograms;
     const std::uint64_t each = 1 + header_->buckets, values = at<std::uint32_t>(state, counters + 12);
     for (std::size_t number = 0; number < found.histograms.size() && (number + 1) * each <= values; ++number) {
@@ -343,41 +346,46 @@ class StatisticsReader {
     return letter == 'T' || letter == 't' ? DaemonState::stopped : by_beat;
   }
 
-  /// The first `count` rows of a table; free rows, and those just being changed, are left out.
+  /// Up to `count` rows of a table, decoded; those that are free, being changed, or damaged are left out.
   template <typename Read>
-  void each_row(std::uint64_t offset, std::uint64_t count, std::uint64_t row_bytes, std::uint64_t checked,
-                const Read& read) const {
-    if (offset == 0 || row_bytes < checked + 4 || offset > file_.size()) return;
+  void each_row(std::uint64_t offset, std::uint64_t count, std::uint64_t row_bytes, const Read& read) const {
+    if (offset == 0 || row_bytes < 8 || offset > file_.size()) return;
     const std::string rows = file_.bytes(offset, std::min(count, (file_.size() - offset) / row_bytes) * row_bytes);
     for (std::size_t at_row = 0; at_row + row_bytes <= rows.size(); at_row += row_bytes) {
-      const unsigned char* row = detail::raw(rows) + at_row;
-      if (detail::crc32(row, checked) == detail::read_at<std::uint32_t>(row, checked)) read(row);
+      const auto length = at<std::uint32_t>(rows, at_row);
+      if (length == 0 || length > row_bytes - 8) continue;
+      const std::string_view body = std::string_view(rows).substr(at_row + 8, length);
+      if (detail::crc32(rows.substr(at_row, 4).append(body), 4 + length) != at<std::uint32_t>(rows, at_row + 4)) continue;
+      detail::Reader reader(body);
+      try {
+        detail::Row row(reader);
+        read(row);
+      } catch (const ProtocolMismatch&) {
+        continue;
+      }
     }
   }
 
   void read_cells(Statistics& found, std::uint64_t used) const {
-    using detail::read_at;
     for (int left = table_attempts; left > 0; --left) {  // as of one moment, if the daemon lets us
       const auto before = at<std::uint64_t>(file_.bytes(header_->table, 8), 0);
       found.cells.clear();
-      each_row(header_->rows, std::min(used, header_->max_rows), header_->row_bytes, 252, [&](const unsigned char* row) {
-        if (row[96] < 1 || row[96] > 3) return;
+      each_row(header_->rows, std::min(used, header_->max_rows), header_->row_bytes, [&found](detail::Row& row) {
         KeptCell cell;
-        cell.version = read_at<std::uint64_t>(row, 0), cell.bytes = read_at<std::uint64_t>(row, 8);
-        cell.points = read_at<std::uint64_t>(row, 16);
-        cell.min_x = read_at<double>(row, 24), cell.min_y = read_at<double>(row, 32);
-        cell.max_x = read_at<double>(row, 40), cell.max_y = read_at<double>(row, 48);
-        cell.hits = read_at<std::uint64_t>(row, 56);
-        cell.last_use_monotonic_ns = read_at<std::int64_t>(row, 64), cell.load_ns = read_at<std::int64_t>(row, 72);
-        cell.segment = detail::fixed_text(row + 80, 16);
-        cell.state = static_cast<KeptCell::State>(row[96]);
-        cell.ahead = (row[97] & 4U) != 0;
-        const std::size_t layer_bytes = read_at<std::uint16_t>(row, 100);
-        const auto id_bytes = std::min<std::size_t>(read_at<std::uint16_t>(row, 98), 104);
-        cell.id = detail::fixed_text(row + 144, id_bytes);
-        cell.layer = detail::fixed_text(row + 104, std::min<std::size_t>(layer_bytes, 40));
-        if (layer_bytes > 40)  // its rest lies behind the id
-          cell.layer += detail::fixed_text(row + 144 + id_bytes, std::min<std::size_t>(layer_bytes - 40, 104 - id_bytes));
+        cell.id = row.get().text(), cell.layer = row.get().text();
+        cell.version = row.get().number();
+        cell.segment = row.get().text();
+        const auto state = row.get().text();
+        cell.state = state == "resident" ? KeptCell::State::resident
+                     : state == "stale"  ? KeptCell::State::stale
+                                         : KeptCell::State::retired;
+        cell.bytes = row.get().number(), cell.points = row.get().number();
+        detail::Row sides(row.get());
+        for (double* side : {&cell.min_x, &cell.min_y, &cell.max_x, &cell.max_y}) *side = sides.get().real();
+        sides.end();
+        cell.hits = row.get().number();
+        cell.last_use_monotonic_ns = row.get().integer(), cell.load_ns = row.get().integer();
+        cell.ahead = row.get().boolean();
         found.cells.push_back(std::move(cell));
       });
       if (before % 2 == 0 && before == at<std::uint64_t>(file_.bytes(header_->table, 8), 0)) return;
@@ -385,33 +393,40 @@ class StatisticsReader {
   }
 
   void read_clients(Statistics& found, std::uint64_t used) const {
-    using detail::read_at;
-    each_row(header_->clients, std::min(used, header_->max_clients), header_->client_bytes, 252,
-             [&](const unsigned char* row) {
+    each_row(header_->clients, std::min(used, header_->max_clients), header_->client_bytes, [&found](detail::Row& row) {
       ListedClient one;
-      one.session = read_at<std::uint64_t>(row, 0);
-      if (one.session == 0) return;
-      one.pid = read_at<std::uint32_t>(row, 8), one.uid = read_at<std::uint32_t>(row, 12);
-      one.cells = read_at<std::uint64_t>(row, 16), one.bytes = read_at<std::uint64_t>(row, 24);
-      one.requests = read_at<std::uint64_t>(row, 32);
-      one.last_request_monotonic_ns = read_at<std::int64_t>(row, 40);
-      if ((row[105] & 1U) != 0) one.pose = {read_at<double>(row, 48), read_at<double>(row, 56)};
-      if ((row[105] & 2U) != 0) one.heading = read_at<double>(row, 64);
-      one.client = detail::fixed_text(row + 112, 48), one.command = detail::fixed_text(row + 160, 16);
+      one.session = row.get().number();
+      one.pid = static_cast<std::uint32_t>(row.get().number());
+      one.uid = row.get().integer(), one.gid = row.get().integer();
+      one.client = row.get().text(), one.command = row.get().text();
+      one.cells = row.get().number(), one.bytes = row.get().number(), one.requests = row.get().number();
+      one.last_request_monotonic_ns = row.get().integer();
+      if (!row.get().nil()) {
+        detail::Row place(row.reader());
+        one.pose = {place.get().real(), place.get().real()};
+        place.end();
+      }
+      if (!row.get().nil()) one.heading = row.reader().real();
       found.clients.push_back(std::move(one));
     });
   }
 
   void read_live(Statistics& found) const {
-    each_row(header_->live, header_->max_live, header_->live_bytes, 508, [&](const unsigned char* row) {
-      if (row[0] == 0) return;
+    each_row(header_->live, header_->max_live, header_->live_bytes, [&found](detail::Row& row) {
       KeptLiveMap one;
-      one.name = detail::fixed_text(row, 64), one.problem = detail::fixed_text(row + 64, 256);
-      std::size_t place = 320;
-      for (auto* value : {&one.chunks, &one.active, &one.bytes, &one.loading, &one.dirty, &one.saving, &one.evicting,
-                          &one.evicting_bytes, &one.waiting_bytes, &one.files, &one.file_bytes, &one.scans,
-                          &one.durable, &one.budget_bytes, &one.damaged, &one.mappers, &one.change})
-        *value = detail::read_at<std::int64_t>(row, std::exchange(place, place + 8));
+      one.name = row.get().text(), one.path = row.get().text();
+      row.get().skip(1);  // the edge of a voxel
+      row.get().skip(1);  // the frame
+      for (auto* value : {&one.chunks, &one.active, &one.bytes, &one.loading, &one.dirty, &one.saving,
+                          &one.waiting_bytes, &one.files, &one.file_bytes, &one.scans, &one.durable, &one.budget_bytes})
+        *value = row.get().integer();
+      row.get().skip(1);  // names of what is damaged, and of mappers
+      row.get().skip(1);
+      one.problem = row.get().text();
+      one.change = row.get().integer();
+      row.get().skip(1);  // memory beside the chunks
+      row.get().skip(1);  // readers
+      one.damaged = row.get().integer(), one.mappers = row.get().integer();
       found.live_maps.push_back(std::move(one));
     });
   }

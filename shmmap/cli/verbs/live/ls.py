@@ -7,6 +7,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.screens.live_maps import live_as_json
 from shmmap.cli.screens.output import Column, format_bytes, print_hanging, print_json, print_line, print_table
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ __all__ = ["add_parser", "problems_of", "run"]
 _JSON = """\
   {"maps": [{"name", "path", "resolution": metres, "frame_id", "chunks": in memory, "active": known voxels
              in them, "bytes": their memory, "budget_bytes", "loading", "dirty": changed and not saved,
-             "saving", "evicting": 0, "evicting_bytes": 0, "beside_bytes": of lists of voxels and marks,
+             "saving", "beside_bytes": of lists of voxels and marks,
              "readers": [[session, thousandths of a processor]], the busiest,
              "waiting_bytes": of scans that wait, "files", "file_bytes", "scans": applied since the start,
              "durable": of these on the disk, "mappers": [uid/name], "damaged": [what], "problem",
@@ -61,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     with connect(args) as client:
         maps = client.live_maps()
     if args.json:
-        print_json({"maps": [_as_json(row) for row in maps]})
+        print_json({"maps": [live_as_json(row) for row in maps]})
         return 0
     if not maps:
         print_line("this daemon keeps no live maps: start it with --live NAME")
@@ -77,12 +78,6 @@ def problems_of(row: LiveMapRow) -> list[str]:
     """What is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
     return [*found, *row.damaged]
-
-
-def _as_json(row: LiveMapRow) -> dict[str, object]:
-    import msgspec
-
-    return msgspec.structs.asdict(row)
 
 
 def _as_text(row: LiveMapRow) -> list[str]:

@@ -264,10 +264,10 @@ class Readers:
                 row = self._row(key)
                 if row is not None and (not since or row.generation or message.saved):
                     rows.append(row)
-            if len(rows) > messages.MOST_CHUNK_ROWS:
+            if len(rows) > messages.MAX_CHUNK_ROWS:
                 break
             yield None
-        page = tuple(rows[: messages.MOST_CHUNK_ROWS])
+        page = tuple(rows[: messages.MAX_CHUNK_ROWS])
         return messages.LiveChunkPage(
             message.request, change, page, len(rows) > len(page), tuple(gone), known
         )

@@ -136,7 +136,7 @@ class ServedMap:
         above, below = fixed.occupancy.thresholds
         reply = messages.LiveOpened(
             message.request, live.files.map_id, fixed.resolution, fixed.frame_id, hit, miss, low, high, above,
-            below, self.readers.lists.path, live.memory.prefix, ask.session,
+            below, self.readers.lists.path, live.memory.prefix,
             probabilities=msgspec.structs.astuple(fixed.occupancy),
         )  # fmt: skip
         if not message.mapper:
@@ -148,7 +148,7 @@ class ServedMap:
             reply.mapper, reply.next_scan = active.mapper.number, self.mappers.next_scan(active)
             reply.applied = active.applied
             reply.marks_dir = self._marks.path
-            reply.most_marks_bytes = min(MOST_MARKS_BYTES, live.limits.budget_bytes // MARKS_PART)
+            reply.max_marks_bytes = min(MOST_MARKS_BYTES, live.limits.budget_bytes // MARKS_PART)
             self._answer(ask.ticket, reply)
 
         open_mapper = partial(self.mappers.open, ask.uid, message.mapper, ask.session)
@@ -320,18 +320,20 @@ class ServedMap:
             self._files_s = now_s + FILES_S
             self._file_bytes = sum(row.bytes for row in list(live.files.rows.values()))  # other threads save
         missing = (f"{key.text}: version {row.version} is missing" for key, row in live.files.missing.items())
-        damaged = (f"{name}: {why}" for name, why in list(live.files.damaged.items()))
+        quarantined = list(live.files.damaged.items())
+        damaged = (f"{name}: {why}" for name, why in quarantined)
         return messages.LiveMapRow(
             self.settings.name, self.settings.path, live.files.settings.resolution,
             live.files.settings.frame_id, chunks=len(live.chunks), active=residency.active,
             bytes=residency.chunk_bytes, loading=len(residency.chunks) - len(live.chunks),
-            dirty=residency.dirty, saving=residency.saving, evicting=0, evicting_bytes=0,
+            dirty=residency.dirty, saving=residency.saving,
             waiting_bytes=residency.waiting_bytes, files=len(live.files.rows), file_bytes=self._file_bytes,
             scans=self._scans, durable=self._durable, budget_bytes=live.limits.budget_bytes,
             damaged=tuple(islice(chain(missing, damaged), 64)),
             mappers=tuple(f"{one.mapper.uid}/{one.mapper.name}" for one in self.mappers.by_number.values()),
             problem=live.problem, change=self.changes.number, beside_bytes=residency.beside_bytes,
-            readers=self.readers.busiest,
+            readers=self.readers.busiest, damaged_count=len(live.files.missing) + len(quarantined),
+            mapper_count=len(self.mappers.by_number),
         )  # fmt: skip
 
     # --- the end --------------------------------------------------------------------------------

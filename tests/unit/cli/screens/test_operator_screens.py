@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
 import pytest
+from msgspec.structs import replace
 
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.cli.screens.live_maps import status_lines
@@ -16,13 +16,11 @@ from shmmap.cli.screens.map_scene import GLYPHS, Scene, html_page, svg, terminal
 from shmmap.cli.screens.prefetching import prefetch_as_json
 from shmmap.cli.screens.top_screen import budget_parts, screen
 from shmmap.client.live.chunk_reader import ChunkInfo
-from shmmap.statistics.cell_rows import CellRow
-from shmmap.statistics.client_rows import ClientRow, Window
+from shmmap.protocol.rows import CellRow, CellState, ClientRow, LiveMapRow, Window
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
 from shmmap.statistics.histogram import BUCKETS
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import State, plan
-from shmmap.statistics.live_rows import LiveRow
 from shmmap.statistics.snapshot import Snapshot
 
 MIB = 1 << 20
@@ -30,7 +28,7 @@ IDENTITY = DaemonIdentity(
     77, 1, 1, 5, "unit", "/run/x.sock", "/maps/city", 7, "/dev/shm", "/maps/", "1.2.3", 5 * 10**9
 )
 CLIENT = ClientRow(
-    3, 4242, 1000, 12, 5 * MIB, 1234, 9 * 10**9, "localization", "python3",
+    3, 4242, 1000, 1000, "localization", "python3", 12, 5 * MIB, 1234, 9 * 10**9,
     (50.0, 30.0), 0.5, Window("circle", 50.0, 30.0, 25.0, 25.0),
 )  # fmt: skip
 
@@ -104,7 +102,7 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
         "refused_over_budget": 123_456, "refused_quota": 654_321, "evictions": 10**6, "loads_failed": 99_999,
         "refused_over_budget_10min": 12, "zombies": 4096, "worker_crashes": 3, "misses": 10**9, "hits": 10**9,
     }  # fmt: skip
-    named = CLIENT._replace(client="a_perception_node_with_a_very_long_name", pose=(-1234.5, -9876.5))
+    named = replace(CLIENT, client="a_perception_node_with_a_very_long_name", pose=(-1234.5, -9876.5))
     shown = text(snapshot(crowded, [named]), width=width)
     assert max(map(len, shown.splitlines())) <= width
     for piece in (
@@ -116,7 +114,7 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
 
 DRIVING = FULL | counters(
     prefetch_budget_bytes=50 * MIB, ride_out_ns=10**10, last_outage_ns=2 * 10**9,
-    prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, cells_late=7, cells_late_1min=2,
+    prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, prefetch_misses=7, prefetch_misses_1min=2,
     bytes_loaded=105, bytes_used=100, budget_bytes=100 * MIB,
 )  # fmt: skip
 
@@ -140,12 +138,12 @@ def test_what_was_prefetched_and_what_of_it_was_used(width: int) -> None:
 
 def test_what_programs_are_told_of_prefetching() -> None:
     assert prefetch_as_json(DRIVING) == {
-        "ride_out_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "cells_late": 7,
+        "ride_out_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "prefetch_misses": 7,
         "prefetch_started": 120, "prefetch_used": 100, "prefetch_in_vain": 3, "prefetch_overtaken": 0,
         "bytes_prefetched": 0, "over_fetch": 1.05,
     }  # fmt: skip
     of_an_earlier_version = prefetch_as_json({"hits": 3})
-    assert (of_an_earlier_version["cells_late"], of_an_earlier_version["over_fetch"]) == (0, None)
+    assert (of_an_earlier_version["prefetch_misses"], of_an_earlier_version["over_fetch"]) == (0, None)
 
 
 def test_load_times_by_what_was_loaded() -> None:
@@ -163,13 +161,16 @@ def test_load_times_by_what_was_loaded() -> None:
     assert lines["of points"].split()[-4:] == ["5", "since", "the", "start"]
 
 
-LIVE = LiveRow(
-    "lidar", "", 12, 1_234_567, 4 * MIB, 0, 3, 1, 0, 0, 0, 40, 9 * MIB, 100, 93, 16 * MIB, 0, 1, 7
-)  # fmt: skip
-TROUBLED = LIVE._replace(
-    name="radar", problem="chunk 1_-2_0 cannot be saved: No space left on device", damaged=2,
+LIVE = LiveMapRow(
+    "lidar", "/live", 0.1, "map", 12, 1_234_567, 4 * MIB, 0, 3, 1, 0, 40, 9 * MIB, 100, 93, 16 * MIB
+)
+TROUBLED = replace(
+    LIVE,
+    name="radar",
+    problem="chunk 1_-2_0 cannot be saved: No space left on device",
+    damaged_count=2,
     waiting_bytes=MIB,
-)  # fmt: skip
+)
 
 
 def test_status_has_a_line_for_each_live_map_and_one_for_each_problem() -> None:
@@ -177,7 +178,7 @@ def test_status_has_a_line_for_each_live_map_and_one_for_each_problem() -> None:
     assert status_lines([LIVE], 0) == [
         ("live lidar", "12 chunks, 4.0 MiB of 16.0 MiB, 1,234,567 known voxels, 4 not saved")
     ]
-    assert status_lines([LIVE._replace(dirty=0, saving=0)], 0)[0][1].endswith(", all saved")
+    assert status_lines([replace(LIVE, dirty=0, saving=0)], 0)[0][1].endswith(", all saved")
     (_, memory), *problems = status_lines([TROUBLED], 3)
     assert memory.startswith("12 chunks, 4.0 MiB of 16.0 MiB")
     assert [text.partition(":")[0] for _, text in problems] == [
@@ -209,7 +210,7 @@ def test_live_maps_on_the_screen(width: int) -> None:
 
 
 def test_a_name_cannot_draw_on_the_screen() -> None:
-    hostile = CLIENT._replace(client="\x1b[2J\x1b]0;owned\x07")
+    hostile = replace(CLIENT, client="\x1b[2J\x1b]0;owned\x07")
     for width in (80, 120):
         shown = text(snapshot(FULL, [hostile, CLIENT]), width=width)
         assert all(line.isprintable() for line in shown.splitlines())
@@ -218,13 +219,13 @@ def test_a_name_cannot_draw_on_the_screen() -> None:
 
 
 def test_more_clients_than_lines_are_counted() -> None:
-    many = [CLIENT._replace(session=n) for n in range(30)]
+    many = [replace(CLIENT, session=n) for n in range(30)]
     shown = text(snapshot(FULL | {"sessions": 300}, many), max_clients=5)
     assert shown.count("localization") == 5
     assert "and 295 more" in shown
 
 
-def cell(name: str, x: float, y: float, state: str) -> CellRow:
+def cell(name: str, x: float, y: float, state: CellState) -> CellRow:
     return CellRow(name, "points", 1, "0" * 16, state, 4096, 10, (x, y, x + 20, y + 20), 3, 5, 7)
 
 
@@ -257,7 +258,7 @@ def test_any_terminal_will_do(size: tuple[int, int]) -> None:
     grid = terminal_rows(SCENE, *size)
     assert len(grid) <= size[1]
     assert all(len(row) == len(grid[0]) <= size[0] for row in grid)
-    square = CLIENT._replace(window=Window("box", 1e6, 0.0, 5.0, 900.0), pose=(1e9, 0.0))
+    square = replace(CLIENT, window=Window("box", 1e6, 0.0, 5.0, 900.0), pose=(1e9, 0.0))
     empty = Scene((0.0, 0.0, 1.0, 1.0), [], [], [square], 0, "", "")
     assert terminal_rows(empty, *size)
 
@@ -270,13 +271,13 @@ def test_the_picture_is_xml_with_tooltips() -> None:
     assert any("80_0.pcd" in title and "retired" in title and "resident" in title for title in titles)
     assert any("localization, pid 4242" in title for title in titles)
     assert sum("on disk" in title for title in titles) == 15 - 3
-    boxed = CLIENT._replace(window=Window("square", 50.0, 30.0, 25.0, 25.0), heading=None)
+    boxed = replace(CLIENT, window=Window("square", 50.0, 30.0, 25.0, 25.0), heading=None)
     assert 'rect class="window"' in svg(Scene(**{**vars(SCENE), "clients": [boxed]}))
 
 
 def test_cells_fetched_ahead_are_marked_until_somebody_asks() -> None:
-    ahead = dataclasses.replace(cell("0_0.pcd", 0, 0, "resident"), ahead=True)
-    both = dataclasses.replace(cell("80_0.pcd", 80, 0, "resident"), ahead=True, layer="ndt(leaf=2.0)")
+    ahead = replace(cell("0_0.pcd", 0, 0, "resident"), ahead=True)
+    both = replace(cell("80_0.pcd", 80, 0, "resident"), ahead=True, layer="ndt(leaf=2.0)")
     rows = [ahead, both, cell("80_0.pcd", 80, 0, "resident"), cell("40_0.pcd", 40, 0, "stale")]
     scene = Scene(**{**vars(SCENE), "rows": rows, "clients": []})
     grid = terminal_rows(scene, 50, 30)
@@ -291,8 +292,8 @@ def test_cells_fetched_ahead_are_marked_until_somebody_asks() -> None:
 
 
 def test_names_of_clients_on_one_another_stand_side_by_side() -> None:
-    beside = CLIENT._replace(client="perception")
-    far = CLIENT._replace(client="planning", pose=(10.0, 30.0))
+    beside = replace(CLIENT, client="perception")
+    far = replace(CLIENT, client="planning", pose=(10.0, 30.0))
     root = ElementTree.fromstring(svg(Scene(**{**vars(SCENE), "clients": [CLIENT, beside, far]})))
     texts = root.iter("{http://www.w3.org/2000/svg}text")
     labels = [node.text for node in texts if node.get("class") == "label"]

@@ -33,13 +33,13 @@ def test_what_is_wrong_with_live_maps(capsys: pytest.CaptureFixture[str], event:
 
 
 def test_cells_that_a_client_had_to_wait_for(capsys: pytest.CaptureFixture[str]) -> None:
-    late = e.Late(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
+    late = e.PrefetchMiss(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
     _print_text(late)
     said = " ".join(capsys.readouterr().out.split())
-    assert said.endswith("late planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points")
+    assert said.endswith("miss planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points")
     _print_json(late)
     told = json.loads(capsys.readouterr().out)
-    assert (told["event"], told["session"], told["cells"]) == ("late", "00000000000000ab", 4)
+    assert (told["event"], told["session"], told["cells"]) == ("prefetch_miss", "00000000000000ab", 4)
 
 
 @pytest.mark.parametrize("ahead", [False, True])

@@ -17,7 +17,7 @@ from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.geometry import Circle
-from shmmap.protocol.events import Late, decode_event
+from shmmap.protocol.events import PrefetchMiss, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent
 from tests.support import connections
 from tests.support.connections import says
@@ -35,9 +35,9 @@ def clients(count: int) -> list[Session]:
     return [sessions.open(connections.of(), f"client {number}", 0.0) for number in range(count)]
 
 
-def told(log: EventLog) -> list[Late]:
+def told(log: EventLog) -> list[PrefetchMiss]:
     events = [decode_event(raw) for _, raw in log._kept]
-    return [event for event in events if isinstance(event, Late)]
+    return [event for event in events if isinstance(event, PrefetchMiss)]
 
 
 def test_at_most_once_a_second(log: EventLog) -> None:
@@ -46,7 +46,9 @@ def test_at_most_once_a_second(log: EventLog) -> None:
     assert misses.note(one, "b.pcd", "ndt(leaf=2.0)")
     assert told(log) == [], "the answer to a request is not held up"
     misses.turn(10.0)
-    assert told(log) == [Late(1, 7, 5, one.slot, one.peer.pid, "client 0", 2, "b.pcd", "ndt(leaf=2.0)")]
+    assert told(log) == [
+        PrefetchMiss(1, 7, 5, one.slot, one.peer.pid, "client 0", 2, "b.pcd", "ndt(leaf=2.0)")
+    ]
     misses.note(one, "c.pcd", "points")
     misses.turn(10.0 + 0.9 * QUIET_S)
     assert len(told(log)) == 1
@@ -111,12 +113,12 @@ def test_who_moves_on_and_has_to_wait(inner: Inner, small_map: DividedMap) -> No
     one = inner(small_map.root)
     session = one.session("driver")
     ask(one, session, 1, -30.0)
-    assert (one.statistics.values["cells_late"], len(one.cache.events.prefetch_misses)) == (0, 0)
+    assert (one.statistics.values["prefetch_misses"], len(one.cache.events.prefetch_misses)) == (0, 0)
     ask(one, session, 2, -10.0)
-    assert one.statistics.values["cells_late"] == 2
+    assert one.statistics.values["prefetch_misses"] == 2
     ask(one, session, 3, -30.0)
     ask(one, session, 4, -10.0)
-    assert one.statistics.values["cells_late"] == 2
+    assert one.statistics.values["prefetch_misses"] == 2
     one.cache.events.prefetch_misses.turn(one.now_s())
     (event,) = told(one.event_log)
     assert (event.session, event.client, event.cells, event.layer) == (session.slot, "driver", 2, "points")

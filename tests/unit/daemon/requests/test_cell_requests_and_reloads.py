@@ -214,7 +214,7 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.ask(one.session(), Differential(3, EVERYWHERE, packed=packed))
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)
-    welcome = one.queries.welcome(one.session(), Hello(4, 1, 0))
+    welcome = one.queries.welcome(one.session(), Hello(4, 2, 0))
     assert (welcome.cells, welcome.bounds) == (0, None)
     one.run_until(lambda: one.ledger.used_bytes == one.ledger.overhead_bytes)
     one.reload()

@@ -20,7 +20,7 @@ from shmmap.daemon.telemetry.sampler import (
     SessionRows,
 )
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.statistics.client_rows import MAX_CLIENTS
+from shmmap.statistics.layout import MAX_CLIENTS
 from tests.support import connections
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon

@@ -98,6 +98,17 @@ class Reader {
     }
     bad("a number that is not below zero");
   }
+  /// A number that may be below zero.
+  std::int64_t integer() {
+    const unsigned tag = peek();
+    if (tag >= 0xe0) return static_cast<std::int8_t>(byte());
+    if (tag >= 0xd0 && tag <= 0xd3) {
+      byte();
+      const unsigned shift = 64 - 8 * (1U << (tag - 0xd0));
+      return static_cast<std::int64_t>(big_endian(1U << (tag - 0xd0)) << shift) >> shift;
+    }
+    return static_cast<std::int64_t>(number());
+  }
   double real() {
     const unsigned tag = peek();
     if (tag == 0xcb) {
@@ -108,12 +119,7 @@ class Reader {
       byte();
       return static_cast<double>(bits<float>(static_cast<std::uint32_t>(big_endian(4))));
     }
-    if (tag >= 0xe0) return static_cast<double>(static_cast<std::int8_t>(byte()));
-    if (tag >= 0xd0 && tag <= 0xd3) {
-      byte();
-      const unsigned shift = 64 - 8 * (1U << (tag - 0xd0));
-      return static_cast<double>(static_cast<std::int64_t>(big_endian(1U << (tag - 0xd0)) << shift) >> shift);
-    }
+    if (tag >= 0xe0 || (tag >= 0xd0 && tag <= 0xd3)) return static_cast<double>(integer());
     return static_cast<double>(number());
   }
   /// Whether nothing stands here; then it is read.

@@ -74,6 +74,8 @@ inline void write(Writer& to, const Held& held) {
   if (!held.layers.empty()) write(to, held.layers);
 }
 
+inline constexpr std::uint64_t protocol_major = 2, protocol_minor = 0;
+
 /// What the daemon says of itself.
 struct Welcome {
   std::uint64_t minor = 0, epoch = 0, session = 0;
@@ -82,8 +84,13 @@ struct Welcome {
 
 inline Welcome read_welcome(Row& row) {
   Welcome found;
-  if (row.get().number() != 1) throw ProtocolMismatch("protocol_mismatch", "the daemon speaks another protocol");
+  const auto major = row.get().number();
   found.minor = row.get().number();
+  if (major != protocol_major)
+    throw ProtocolMismatch("protocol_mismatch",
+                           "the daemon speaks protocol " + std::to_string(major) + "." + std::to_string(found.minor) +
+                               ", this client " + std::to_string(protocol_major) + "." + std::to_string(protocol_minor),
+                           major < protocol_major ? "update the daemon, and restart it" : "update this client");
   row.get().skip(1);  // its version
   found.instance = row.get().text();
   found.epoch = row.get().number();

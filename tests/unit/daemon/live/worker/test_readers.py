@@ -19,7 +19,7 @@ from shmmap.errors import BadRequest
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage
 from shmmap.protocol.codec import decode_reply, encode
-from shmmap.protocol.live import MOST_CHUNK_ROWS, LiveChunkPage, LiveChunks, SphereMessage
+from shmmap.protocol.live import MAX_CHUNK_ROWS, LiveChunkPage, LiveChunks, SphereMessage
 from shmmap.protocol.messages import ErrorReply
 from tests.support.served_map import Served
 
@@ -63,7 +63,7 @@ def test_more_chunks_than_go_into_one_answer(served: Served) -> None:
     after, pages = None, 0
     while True:
         one = page(served, saved=True, after=after)
-        assert len(one.rows) <= MOST_CHUNK_ROWS
+        assert len(one.rows) <= MAX_CHUNK_ROWS
         assert decode_reply(encode(one)) == one
         found += keys_of(one)
         pages += 1
@@ -104,13 +104,13 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
     for x in range(20_000):
         served.map.changes.gone(ChunkKey(-(1 << 24) + x, -(1 << 24), -(1 << 24)))
     row = Row(1 << 62, 1 << 40, 1 << 18, 1 << 18, 1 << 18, 1)
-    for x in range(MOST_CHUNK_ROWS):
+    for x in range(MAX_CHUNK_ROWS):
         on_disk(served, ChunkKey(-(1 << 24) + x, 0, -(1 << 24)), row)
     assert not page(served, since=since).since_known
     first = served.map.changes._gone[0][0]
     found = page(served, since=first, saved=True)
     assert found.since_known
-    assert len(found.rows) == MOST_CHUNK_ROWS
+    assert len(found.rows) == MAX_CHUNK_ROWS
     assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes where nobody has raised that"
 
 
@@ -240,7 +240,7 @@ def test_the_next_page_begins_where_the_last_one_ended(
     monkeypatch.setattr(readers, "touches", touched)
     page(served, saved=True, after=(1990, 0, 0))
     assert looked[0] == (1991, 0, 0)
-    assert len(looked) <= MOST_CHUNK_ROWS + readers.KEYS_A_STEP + 9
+    assert len(looked) <= MAX_CHUNK_ROWS + readers.KEYS_A_STEP + 9
 
 
 def test_what_changed_is_found_without_a_look_at_what_did_not(

@@ -83,7 +83,7 @@ def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[...
         seen.update(drive.ask(x, wait=0.0))
     one.turn()
     assert count(one, "misses") == misses
-    assert count(one, "cells_late") == 0
+    assert count(one, "prefetch_misses") == 0
     assert count(one, "prefetch_used") == len([r for r in one.ledger.residents() if r.hits]) - misses > 5
     assert len(seen) > 5
     assert one.ledger.prefetched_bytes == sum(r.nbytes for r in one.ledger.residents() if r.prefetched)
@@ -259,15 +259,15 @@ def test_a_client_that_moves_on_and_has_to_wait_is_late(prefetching: Callable[..
     one = prefetching(prefetch_share=1e-9)  # a way, but no memory for it
     drive = Drive(one)
     one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
-    assert count(one, "cells_late") == 0
+    assert count(one, "prefetch_misses") == 0
     one.offset_s += 2.0
     drive.ask(-330.0)
     one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
-    assert count(one, "cells_late") == 3
+    assert count(one, "prefetch_misses") == 3
     one.offset_s += 1.0
     drive.ask(300.0)
     one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
-    assert count(one, "cells_late") == 3
+    assert count(one, "prefetch_misses") == 3
     assert count(one, "prefetch_started") == 0
 
 
@@ -425,7 +425,11 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     for resident in one.cache.used:
         one.cache.rows.show(resident, "resident")
     assert shown_ahead(one) == loaded | {"0_0.pcd": False}
-    assert [count(one, name) for name in ("prefetch_started", "prefetch_used", "cells_late")] == [6, 1, 0]
+    assert [count(one, name) for name in ("prefetch_started", "prefetch_used", "prefetch_misses")] == [
+        6,
+        1,
+        0,
+    ]
     assert count(one, "bytes_loaded") == 8 * count(one, "bytes_used") // 3, (
         "of eight of one size three are used"
     )
