@@ -58,8 +58,11 @@ SECTIONS: Final = {
     "live_budget_bytes": "live maps",
 }
 """Headings in the help and in the example file, by the first setting below each."""
-DROPPED: Final = {"eviction": "what clients will need last is always evicted first"}
-"""Settings that there were, and what holds instead."""
+RENAMED: Final = {"ride_out_s": "outage_tolerance_s"}
+DROPPED: Final = {"eviction": "what clients will need last is always evicted first"} | dict.fromkeys(
+    RENAMED, ""
+)
+"""Settings that there were, and what holds instead; empty for one that is in `RENAMED`."""
 
 
 def _quota(text: str) -> float:
@@ -151,10 +154,10 @@ class DaemonConfig:
         ),
         parse=_quota,
     )
-    ride_out_s: float = setting(
+    outage_tolerance_s: float = setting(
         10.0,
-        "how long, in seconds, the map's files may be out of reach without a moving client's noticing: cells "
-        "are fetched that far ahead, of a published map onto the disk where memory has no room",
+        "prefetch far enough to bridge an outage of the map's storage of this many seconds, unnoticed by moving "
+        "clients; cells of a published map go to the disk where memory has no room",
         metavar="SECONDS",
         allowed=within(0, 3600, "seconds"),
     )
@@ -359,12 +362,15 @@ def trace_settings(
 def _no_setting(word: str, origin: str) -> ConfigError:
     """Refuse a name that is no setting, or no longer one."""
     if word in DROPPED:
+        new = RENAMED.get(word, "")
         called, hint = word, "delete this line"
         if origin == COMMAND_LINE:
-            called, hint = option_of(word), "leave it out"
+            called, new, hint = option_of(word), option_of(new), "leave it out"
         elif origin.startswith(_ENVIRONMENT):
-            hint = f"unset {origin}"
-        return ConfigError(f"{origin}: {called} is gone: {DROPPED[word]}", key=word, origin=origin, hint=hint)
+            new, hint = _ENVIRONMENT + new.upper(), f"unset {origin}"
+        why = DROPPED[word] or f"it is {new} now"
+        hint = hint if DROPPED[word] else f"write {new}"
+        return ConfigError(f"{origin}: {called} is gone: {why}", key=word, origin=origin, hint=hint)
     hint = near_hint(word, [*(row.called for row in ROWS.values()), "live"])
     return ConfigError(f"{origin}: unknown setting {word!r}", key=word, origin=origin, hint=hint)
 

@@ -139,7 +139,7 @@ class MapInMemory:
                 pool,
                 clock=time.monotonic,
                 prefetch_share=config.prefetch_share,
-                ride_out_s=config.ride_out_s,
+                outage_tolerance_s=config.outage_tolerance_s,
             )
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
             self.adoption.take_over(time.monotonic())

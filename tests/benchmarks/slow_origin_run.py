@@ -60,7 +60,7 @@ class Setting:
     """
 
     row: str
-    ride_out_s: float = 10.0
+    outage_tolerance_s: float = 10.0
     radius_m: float = 200.0
     step_m: float = 20.0
     loaders: int = 8
@@ -100,8 +100,10 @@ class _Simulation:
         if setting.row == "margin":
             return Margin(self.is_absent)
         if setting.row == "oracle":
-            return Truth(self.is_absent, setting.ride_out_s, self._future())
-        return Policy(self.is_absent, setting.ride_out_s, self.motion, self._area(*self.drive.at(0.0)))
+            return Truth(self.is_absent, setting.outage_tolerance_s, self._future())
+        return Policy(
+            self.is_absent, setting.outage_tolerance_s, self.motion, self._area(*self.drive.at(0.0))
+        )
 
     def _area(self, x: float, y: float) -> Circle:
         return Circle(x, y, self.setting.radius_m)

@@ -89,10 +89,10 @@ def test_a_drive_through_a_time_without_the_files(
     with MapWindow(one.endpoint, 6.0, name="driver") as window:
         assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=PATIENCE_S).complete
         fetched, waiting = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}, Patience()
-        while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --ride-out
+        while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --outage-tolerance
             pass
         told = shmmap.json("status")["ahead"]
-        assert (told["ride_out_s"], told["prefetch_started"] >= len(fetched)) == (10.0, True)
+        assert (told["outage_tolerance_s"], told["prefetch_started"] >= len(fetched)) == (10.0, True)
         assert (told["cells_late"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
         finding = prefetching(shmmap)
         assert (finding["state"], finding["fact"]) == (

@@ -35,9 +35,9 @@ _JSON = """\
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
-   "ahead": {"ride_out_s": setting, "origin_out": bool: no load succeeds, "last_outage_s", "cells_late": that
-             moving clients waited for, "prefetch_started", "prefetch_used", "prefetch_in_vain",
-             "prefetch_overtaken", "bytes_prefetched",
+   "ahead": {"outage_tolerance_s": setting, "origin_out": bool: no load succeeds, "last_outage_s",
+             "cells_late": that moving clients waited for, "prefetch_started", "prefetch_used",
+             "prefetch_in_vain", "prefetch_overtaken", "bytes_prefetched",
              "over_fetch": bytes loaded by bytes handed out at least once, or null},
    "published": null where the map is files, or
             {"version": number, "refused": number of a version that is offered and refused, or null,

@@ -234,7 +234,7 @@ class Sampler:
         """
         prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
         health = prefetcher.prefetch.health
-        statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
+        statistics.set("outage_tolerance_ns", int(prefetcher.outage_tolerance_s * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         statistics.set("origin_out", int(health.is_out))

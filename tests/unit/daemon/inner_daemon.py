@@ -77,7 +77,7 @@ class InnerDaemon:
         shm_dir: str = "",
         name: str = "inner",
         prefetch_share: float = 0.0,
-        ride_out_s: float = 10.0,
+        outage_tolerance_s: float = 10.0,
     ) -> None:
         prepare_process()
         self.shm_dir = shm_dir or tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
@@ -110,7 +110,7 @@ class InnerDaemon:
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(
             self.cache, self.map_switch, self.pool, clock=self.now_s, prefetch_share=prefetch_share,
-            ride_out_s=ride_out_s,
+            outage_tolerance_s=outage_tolerance_s,
         )  # fmt: skip
         self.loads = self.scheduler.loads
         self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.hear_of_freed)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.cli.parser import build_parser
-from shmmap.daemon.config import ROWS, DaemonConfig, load_config, option_of
+from shmmap.daemon.config import DROPPED, ROWS, DaemonConfig, load_config, option_of
 from shmmap.daemon.config_table import parse_bytes
 from shmmap.errors import ConfigError
 
@@ -129,7 +129,7 @@ def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None
 def test_the_command_line_has_the_options_that_errors_name() -> None:
     (verbs,) = (one for one in build_parser()._actions if isinstance(one, argparse._SubParsersAction))
     actions = {action.dest: action for action in verbs.choices["serve"]._actions}
-    assert set(actions) == {*(field.name for field in fields(DaemonConfig)), "config", "help", "eviction"}
+    assert set(actions) == {*(field.name for field in fields(DaemonConfig)), "config", "help", *DROPPED}
     for name in ROWS:
         assert option_of(name) in (*actions[name].option_strings, actions[name].metavar)
         assert actions[name].default is None, "the configuration file may say"
@@ -156,10 +156,33 @@ def test_a_setting_that_is_gone_is_refused_with_what_to_do(tmp_path: Path) -> No
     """Also one that says what always holds now."""
     file = tmp_path / "shmmap.toml"
     file.write_text('workers = 2\neviction = "time"\n')
+    renamed = tmp_path / "renamed.toml"
+    renamed.write_text("ride_out_s = 5\n")
     cases: list[tuple[dict[str, Any], dict[str, str], str, str, str]] = [
         ({}, {}, str(file), f"{file}:2: eviction is gone: what clients will need", "delete this line"),
         ({}, {"SHMMAP_EVICTION": "lru"}, "", "SHMMAP_EVICTION: eviction is gone", "unset SHMMAP_EVICTION"),
         ({"eviction": "distance"}, {}, "", "command line: --eviction is gone", "leave it out"),
+        (
+            {},
+            {},
+            str(renamed),
+            f"{renamed}:1: ride_out_s is gone: it is outage_tolerance_s now",
+            "write outage_tolerance_s",
+        ),
+        (
+            {},
+            {"SHMMAP_RIDE_OUT_S": "5"},
+            "",
+            "is gone: it is SHMMAP_OUTAGE_TOLERANCE_S now",
+            "write SHMMAP_OUTAGE_TOLERANCE_S",
+        ),
+        (
+            {"ride_out_s": "5"},
+            {},
+            "",
+            "--ride-out is gone: it is --outage-tolerance now",
+            "write --outage-tolerance",
+        ),
     ]
     for flags, environ, path, message, hint in cases:
         with pytest.raises(ConfigError) as failure:

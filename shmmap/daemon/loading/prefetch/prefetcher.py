@@ -47,7 +47,7 @@ class Prefetcher:
     ----------
     share
         Part of the budget that may be taken by what nobody has asked for yet; 0: nothing is fetched ahead.
-    ride_out_s
+    outage_tolerance_s
         See `Prefetch`.
 
     Attributes
@@ -60,14 +60,14 @@ class Prefetcher:
     """
 
     def __init__(
-        self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, ride_out_s: float
+        self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, outage_tolerance_s: float
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
         self._sessions = cache.reclaimer.sessions
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MOST_COLD)
         self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MOST_ENDED)
-        self.share, self.ride_out_s = share, ride_out_s
-        self.prefetch = Prefetch(self._is_absent, ride_out_s)
+        self.share, self.outage_tolerance_s = share, outage_tolerance_s
+        self.prefetch = Prefetch(self._is_absent, outage_tolerance_s)
         self._now_s = 0.0
         self._next_s = -math.inf
         self._full_until_s = self._followed_s = self._answered_s = -math.inf

@@ -111,7 +111,7 @@ def test_outages_of_the_storage(inner: Inner, small_map: DividedMap) -> None:
 
 
 def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
-    one = inner(small_map.root, prefetch_share=0.5, ride_out_s=2.4)
+    one = inner(small_map.root, prefetch_share=0.5, outage_tolerance_s=2.4)
     sampler, values = sampler_of(one), one.statistics.values
 
     def short(now_s: float) -> int:
@@ -119,7 +119,7 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
         return values["prefetch_short"]
 
     assert short(1000.0) == 0
-    assert (values["prefetch_budget_bytes"], values["ride_out_ns"]) == (32 << 20, 2_400_000_000)
+    assert (values["prefetch_budget_bytes"], values["outage_tolerance_ns"]) == (32 << 20, 2_400_000_000)
     one.ledger.prefetched_bytes = 32 << 20
     assert short(1001.0) == 1
     one.ledger.prefetched_bytes = 0

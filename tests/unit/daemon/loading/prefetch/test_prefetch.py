@@ -20,7 +20,7 @@ from shmmap.protocol.messages import Intent
 from shmmap.segment.layout import SourceStamp
 
 RADIUS_M = 50.0
-RIDE_OUT_S = 10.0
+OUTAGE_TOLERANCE_S = 10.0
 
 
 @cache
@@ -40,11 +40,11 @@ def street(columns: int = 80, version: int = 1) -> Catalogue:
 class Daemon:
     """What a scheduler keeps of cells: which are there, which are under way, which are not to be tried."""
 
-    def __init__(self, ride_out_s: float = RIDE_OUT_S) -> None:
+    def __init__(self, outage_tolerance_s: float = OUTAGE_TOLERANCE_S) -> None:
         self.present: set[tuple[int, str]] = set()
         self.loading: set[tuple[int, str]] = set()
         self.failed: set[tuple[int, str]] = set()
-        self.prefetch = Prefetch(self.is_absent, ride_out_s)
+        self.prefetch = Prefetch(self.is_absent, outage_tolerance_s)
         self.catalogue = street()
 
     def is_absent(self, index: int, layer: str) -> bool:
@@ -92,7 +92,7 @@ def test_in_order_of_time_each_once() -> None:
     times = [wish.needed_in_s for wish in found]
     assert times == sorted(times)
     assert len({wish.cell for wish in found}) == len(found) > 50
-    assert times[-1] > RIDE_OUT_S, "what is needed after the longest outage is wished for, too"
+    assert times[-1] > OUTAGE_TOLERANCE_S, "what is needed after the longest outage is wished for, too"
     assert daemon.next(1.0) is None
     assert not daemon.prefetch.more
 
@@ -168,7 +168,7 @@ def test_what_has_failed_is_passed_over_and_wished_for_later() -> None:
 
 def test_a_long_pass_begins_again_too() -> None:
     """Where loads take longer than a pass, what failed at its beginning is not forgotten."""
-    daemon = Daemon(ride_out_s=60.0)
+    daemon = Daemon(outage_tolerance_s=60.0)
     daemon.client("a")
     first = daemon.next(1.0)
     assert first is not None
@@ -211,7 +211,7 @@ def test_without_a_route_outages_are_prepared_for_after_the_first() -> None:
     daemon = Daemon()
     daemon.client("a", route=False)
     before = daemon.prefetch.look_ahead
-    assert before.straight_s == before.sides_s < RIDE_OUT_S < before.way_s
+    assert before.straight_s == before.sides_s < OUTAGE_TOLERANCE_S < before.way_s
     failing(daemon)
     daemon.next(10.0)
     daemon.next(18.0)
@@ -332,7 +332,7 @@ def test_one_call_looks_at_little() -> None:
         calls += 1
         if not daemon.prefetch.more:
             break
-    assert calls >= 40 * RIDE_OUT_S * 10.0 / 10.0 / LOOKS_AT_ONCE
+    assert calls >= 40 * OUTAGE_TOLERANCE_S * 10.0 / 10.0 / LOOKS_AT_ONCE
 
 
 steps = st.lists(
