@@ -36,8 +36,7 @@ from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.map_origin import MapOrigin
 from shmmap.origin.sidecar import default_cache_directory
 from shmmap.origin.single_pcd import is_served_whole
-from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.processes.start_child import how_ended, start_child
+from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
 

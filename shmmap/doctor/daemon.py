@@ -11,8 +11,8 @@ import time
 from typing import Final
 
 import shmmap
-from shmmap.daemon.host.groups import account_name
 from shmmap.daemon.pins.probe import probe_pins
+from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient, answering_at
 from shmmap.errors import CannotStart, ShmmapError

@@ -26,7 +26,7 @@ from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare import work
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.source import Source
 
 __all__ = ["CellPoints", "main"]

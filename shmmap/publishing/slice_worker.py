@@ -30,7 +30,7 @@ from shmmap.origin.remote.published_object import CellIdentity, ObjectName, writ
 from shmmap.origin.remote.published_source import stamp_of, unpack_source
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from shmmap.prepare.work import CellTask, Ready, decode_task, encode
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import CellSent, NotSent, decode_slice_settings
 from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, Sender, make_and_send, run_worker

@@ -40,7 +40,7 @@ from shmmap.origin.remote.store import Store
 from shmmap.prepare.work import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.publishing.known_objects import KnownObjects
 from shmmap.publishing.messages import (
     CellSent,

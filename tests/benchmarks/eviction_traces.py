@@ -205,7 +205,7 @@ def hits(name: str, part: int, memory_cells: int, column: str) -> float:
     for step, windows in enumerate(work.windows):
         now_s = step * STEP_M / SPEED_MPS
         for motion, way, route in zip(motions, work.trace.ways, routes, strict=True):
-            motion.told(Intent(float(way[step, 0]), float(way[step, 1]), route=route), now_s)
+            motion.update(Intent(float(way[step, 0]), float(way[step, 1]), route=route), now_s)
         needed = set(np.concatenate(windows).tolist())
         absent = []
         for old, window in zip(inside, windows, strict=True):

@@ -136,7 +136,7 @@ class _Simulation:
             share = travelled / float(self.drive.travelled_m[-1]) * float(self.route_m[-1])
             first, last = np.searchsorted(self.route_m, [share, share + TRAJECTORY_M])
             route = tuple(self.route[max(0, first - 1) : last + 1])
-        self.motion.told(Intent(x, y, route=route), self.now_s)
+        self.motion.update(Intent(x, y, route=route), self.now_s)
         return x, y
 
     def ask(self) -> None:

@@ -49,7 +49,7 @@ from tests.benchmarks.slow_origin_run import ROWS, Setting, simulate
 
 MEANS_S = (0.05, 0.15, 0.4)
 MEMORY_CELLS = {10.0: 1000, 60.0: 2400}
-"""By the length of the outage to be bridged: the window has 356 cells, and what lies a minute ahead twice as many."""
+"""By the outage to be bridged, seconds: the window has 356 cells, what lies a minute ahead twice as many."""
 UTILISATION = 0.8
 PICTURE = "10 s / 120 s"
 """Outages of the drives that are drawn."""

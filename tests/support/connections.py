@@ -14,4 +14,4 @@ __all__ = ["of"]
 
 def of(peer: Peer | None = None, reply: Callable[[bytes], None] | None = None) -> Connection:
     """Return what a session knows of its connection: whose it is, and where replies go."""
-    return cast("Connection", SimpleNamespace(peer=peer or Peer(), session=None, reply=reply))
+    return cast("Connection", SimpleNamespace(peer=peer or Peer(), slot=0, reply=reply))

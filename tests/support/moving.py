@@ -11,6 +11,5 @@ __all__ = ["says"]
 
 def says(session: Session, intent: Intent, now_s: float) -> None:
     """Do what the daemon does when a request with an intent comes."""
-    session.intent = session.told = intent
-    session.says_where, session.last_request_s = True, now_s
-    session.sessions.moved[session] = None
+    session.state_intent(intent)
+    session.last_request_s = now_s

@@ -25,7 +25,7 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.first_compile import compile_in_child, is_compiled
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import receive_packet
+from shmmap.processes.start_child import receive_packet
 
 __all__ = ["main"]
 

@@ -13,8 +13,7 @@ from typing import Final, TypeAlias
 from shmmap import __version__
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.logfmt import log
-from shmmap.processes.packets import receive_packet
-from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, start_child
+from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, receive_packet, start_child
 
 __all__ = ["RESTART", "Early", "PreparedParent", "fork_early"]
 

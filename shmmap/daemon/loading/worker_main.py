@@ -35,7 +35,7 @@ from shmmap.layers.sources import CellSource, read_segment
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.origin.opened_directories import OpenedDirectories
-from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import LOADER_SLOT, lock_slot

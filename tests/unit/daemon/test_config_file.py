@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.config import DaemonConfig, trace_settings
-from shmmap.daemon.config_file import installed_config_file, read_settings_file
+from shmmap.daemon.config import DaemonConfig, installed_config_file, read_settings_file, trace_settings
 from shmmap.errors import ConfigError
 
 

@@ -10,7 +10,7 @@ import pytest
 
 PROGRAM = """\
 import os, signal, sys, time, weakref
-from shmmap.processes.lost_interrupts import keep_interrupts
+from shmmap.cli.program import keep_interrupts
 
 class Thing:
     def __del__(self):
@@ -56,7 +56,7 @@ def test_what_was_ignored_comes_again(where: str, what: str, times: str) -> None
     assert done.stderr == ""
 
 
-def test_other_exceptions_are_told_as_before() -> None:
+def test_other_exceptions_are_reported_as_before() -> None:
     program = PROGRAM.replace("signal.raise_signal(number)", "raise ValueError('odd')").replace("30", "0")
     done = subprocess.run(
         [sys.executable, "-c", program, "finalizer"], capture_output=True, text=True, timeout=60

@@ -9,8 +9,7 @@ import tracemalloc
 
 import pytest
 
-from shmmap.processes.packets import MAX_PACKET_BYTES, packet_buffer, receive_packet
-from shmmap.processes.start_child import channel
+from shmmap.processes.start_child import MAX_PACKET_BYTES, channel, packet_buffer, receive_packet
 
 
 def test_a_descriptor_comes_with_its_packet_and_is_not_inherited() -> None:

@@ -20,7 +20,7 @@ from shmmap.daemon.loading.prefetch.prefetch import URGENT_S, Prefetch
 from shmmap.daemon.loading.prefetch.way_ahead import WayAhead
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
-from shmmap.daemon.transport.sessions import MOVES_AT_ONCE, Session
+from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
 
 __all__ = ["Prefetcher"]
 
@@ -111,7 +111,7 @@ class Prefetcher:
     @property
     def next_s(self) -> float:
         """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
-        many = len(self._sessions.moved) > MOVES_AT_ONCE
+        many = len(self._sessions.moved) > MOVES_PER_STEP
         if self.cold or many or (self.ended and self.prefetch.ways):
             return -math.inf
         next_s = self._next_s if self.prefetch.ways else math.inf

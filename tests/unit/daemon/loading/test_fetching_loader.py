@@ -28,7 +28,7 @@ from shmmap.layers.derive import CellJob
 from shmmap.layers.source_reader import FILES
 from shmmap.layers.sources import CellSource
 from shmmap.layers.spec import LayerSpec
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.source import Source

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.host import inotify
-from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch, directories_of
+from shmmap.daemon.map.file_watch import MAX_DELAY_S, SETTLE_S, FileWatch, directories_of
 from shmmap.errors import CannotStart
 
 
@@ -47,7 +47,7 @@ def test_it_is_due_once_the_files_were_left_alone(watch: FileWatch, tmp_path: Pa
 
 def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: FileWatch, tmp_path: Path) -> None:
     now_s = 100.0
-    while now_s < 100.0 + MOST_S:
+    while now_s < 100.0 + MAX_DELAY_S:
         (tmp_path / "a.pcd").write_bytes(b"a")
         watch.drain(now_s)
         assert not watch.due(now_s)

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.transport.inbox import (
-    MOST_BYTES,
-    MOST_OF_A_PROCESS,
-    MOST_REMEMBERED,
+    MAX_PER_PROCESS,
+    MAX_PROCESS_BYTES,
+    MAX_REMEMBERED,
     FairQueue,
 )
 
@@ -75,18 +75,18 @@ def test_connections_of_a_process_take_turns() -> None:
 
 def test_limits() -> None:
     turns: FairQueue[int] = FairQueue()
-    assert sum(turns.add("p", n % 5, n, 1) for n in range(2000)) == MOST_OF_A_PROCESS
-    assert turns.add("q", 0, 0, 2 * MOST_BYTES)  # a single one always may
+    assert sum(turns.add("p", n % 5, n, 1) for n in range(2000)) == MAX_PER_PROCESS
+    assert turns.add("q", 0, 0, 2 * MAX_PROCESS_BYTES)  # a single one always may
     assert not turns.add("q", 1, 0, 1)
-    assert len(turns) == MOST_OF_A_PROCESS + 1
+    assert len(turns) == MAX_PER_PROCESS + 1
 
 
 def test_nobody_is_remembered_for_ever() -> None:
     turns: FairQueue[str] = FairQueue()
-    for number in range(3 * MOST_REMEMBERED):
+    for number in range(3 * MAX_REMEMBERED):
         turns.add(number, 0, "x", 1)
         serve(turns, 1.0)
-    assert len(turns._lines) <= MOST_REMEMBERED
+    assert len(turns._lines) <= MAX_REMEMBERED
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2), st.floats(0.001, 1.0), st.booleans())))
@@ -127,7 +127,7 @@ def test_the_quiet_one_waits_for_each_loud_one_once(loud: int) -> None:
 
 def test_what_must_be_answered_is_never_refused() -> None:
     turns: FairQueue[str] = FairQueue()
-    for _ in range(MOST_OF_A_PROCESS):
+    for _ in range(MAX_PER_PROCESS):
         assert turns.add("p", "c", "loud", 0)
     assert not turns.add("p", "c", "more", 0)
     assert turns.add("p", "c", "answer", 0, always=True)
@@ -167,7 +167,7 @@ def test_what_has_begun_is_remembered_however_many_come() -> None:
     turns.add("p", "a", "long", 5)
     assert turns.take() == ("p", "long")
     turns.served("p", 100.0, "long")
-    for number in range(MOST_REMEMBERED + 10):
+    for number in range(MAX_REMEMBERED + 10):
         turns.add(number, 0, "other", 1)
         assert serve(turns, 0.0) == "other"
     assert turns.take() == ("p", "long")

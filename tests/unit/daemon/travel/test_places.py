@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import (
-    MOST_PLACES,
+    MAX_PLACES,
     NOWHERE,
     SLOWEST_MPS,
     merged_places,
@@ -38,7 +38,7 @@ def moving(
 ) -> Motion:
     """A client that says where it is and how fast it moves."""
     motion = Motion()
-    motion.told(Intent(x, y, vx, vy, route=route), now_s)
+    motion.update(Intent(x, y, vx, vy, route=route), now_s)
     return motion
 
 
@@ -154,7 +154,7 @@ def test_few_places_stand_for_all(clients: list[tuple[float, float, float]], dat
         tables.append(places_of(moving(x, y, speed, 0.0, *route), REACH_M))
     crowd = tables * 20
     merged = merged_places(crowd)
-    assert 0 < len(merged) <= MOST_PLACES
+    assert 0 < len(merged) <= MAX_PLACES
     assert np.isinf(merged[:, 4]).any(), "from somewhere anything may be reached"
     assert np.isfinite(until_needed(box(3e5, 3e5), merged, 0.0)).all()
 
@@ -166,4 +166,4 @@ def test_a_crowd_with_routes() -> None:
         for n in range(4096)
     ]
     merged = merged_places(tables)
-    assert MOST_PLACES // 8 < len(merged) <= MOST_PLACES
+    assert MAX_PLACES // 8 < len(merged) <= MAX_PLACES

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.travel.route import BEHIND_M, FARTHEST_M, MOST_VERTICES, OFF_ROUTE_M, Route
+from shmmap.daemon.travel.motion import BEHIND_M, FARTHEST_M, MAX_VERTICES, OFF_ROUTE_M, Route
 
 coordinates = st.floats(-1e5, 1e5)
 hostile = st.floats(allow_nan=False, allow_infinity=False)
@@ -117,7 +117,7 @@ def town(corners: int, radius: float) -> list[tuple[float, float]]:
 
 def test_of_many_vertices_those_are_kept_that_tell_where_it_bends() -> None:
     vertices = town(100, 6.0)[:4096]
-    assert len(vertices) > 7 * MOST_VERTICES
+    assert len(vertices) > 7 * MAX_VERTICES
     route = Route(vertices)
     kept = route.at(np.linspace(0.0, route.length_m, 20_000))
     away = [float(np.hypot(*(kept - vertex).T).min()) for vertex in vertices]

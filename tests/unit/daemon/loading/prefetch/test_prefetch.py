@@ -57,7 +57,7 @@ class Daemon:
         motion = Motion()
         for second in (0, 1):
             vertices = ((-20.0, y), (1300.0, y)) if route else ()
-            motion.told(Intent(10.0 * (second - 1), y, route=vertices), float(second))
+            motion.update(Intent(10.0 * (second - 1), y, route=vertices), float(second))
         self.prefetch.ways[name] = WayAhead(motion, Circle(0.0, y, RADIUS_M), layers)
         return motion
 
@@ -160,7 +160,7 @@ def test_what_has_failed_is_passed_over_and_wished_for_later() -> None:
     assert first.cell not in {wish.cell for wish in daemon.wishes(1.0)}
     daemon.failed.clear()
     assert daemon.next(1.0 + 0.5 * PASS_S) is None
-    motion.told(Intent(10.0, 0.0, route=((-20.0, 0.0), (1300.0, 0.0))), 2.0)
+    motion.update(Intent(10.0, 0.0, route=((-20.0, 0.0), (1300.0, 0.0))), 2.0)
     again = daemon.next(1.0 + PASS_S)
     assert again is not None
     assert again.cell == first.cell
@@ -280,7 +280,7 @@ def test_after_a_jump_nothing_of_the_way_before_is_wished_for() -> None:
     motion = daemon.client("a")
     assert len(daemon.wishes(1.0, 3)) == 3
     for second in (1.5, 2.5):
-        motion.told(Intent(1000.0 + 10.0 * second, 0.0), second)
+        motion.update(Intent(1000.0 + 10.0 * second, 0.0), second)
     daemon.prefetch.ways["a"].asks(Circle(1025.0, 0.0, RADIUS_M), ("points",))
     wishes = daemon.wishes(2.5)
     assert wishes
@@ -301,7 +301,7 @@ def test_who_stands_wishes_for_nothing() -> None:
     daemon = Daemon()
     motion = Motion()
     for second in range(5):
-        motion.told(Intent(0.0, 0.0), float(second))
+        motion.update(Intent(0.0, 0.0), float(second))
     daemon.prefetch.ways["a"] = WayAhead(motion, Circle(0.0, 0.0, RADIUS_M), ("points",))
     assert daemon.next(5.0) is None
     assert daemon.prefetch.next_s(5.0) == math.inf
@@ -377,7 +377,7 @@ def test_whatever_happens_a_wish_is_for_what_is_absent(
                 what, (motion.x, motion.y + 10 * later_s)
             )
             route = ((-20.0, 0.0), (1300.0, 0.0)) if number % 2 == 0 else ()
-            motion.told(Intent(x, y, route=route), now_s)
+            motion.update(Intent(x, y, route=route), now_s)
             way = daemon.prefetch.ways["ab"[number % 2]]
             way.asks(Circle(x, y, RADIUS_M), ("points",))
     wish = daemon.next(now_s + PASS_S)
