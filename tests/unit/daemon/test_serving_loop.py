@@ -14,7 +14,6 @@ import pytest
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.serving_loop import LONG_TURN_NS, TURN_NS
-from shmmap.protocol import messages as m
 from shmmap.protocol.events import LongTurn, Recent, decode_event
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.whole_daemon import WholeDaemon

@@ -25,17 +25,7 @@ def serve(turns: FairQueue[str], cost_s: float) -> str | None:
     return turn[1]
 
 
-def test_a_quiet_process_is_served_next() -> None:
-    turns: FairQueue[str] = FairQueue()
-    for number in range(50):
-        turns.add("loud", number % 5, "loud", 10)
-    assert serve(turns, 1.0) == "loud"
-    turns.add("quiet", 0, "quiet", 10)
-    turns.add("other", 0, "other", 10)
-    assert [serve(turns, 1.0) for _ in range(4)] == ["quiet", "other", "loud", "loud"]
-
-
-def test_who_asks_for_what_is_expensive_waits_longer() -> None:
+def test_expensive_requests_wait_longer() -> None:
     turns: FairQueue[str] = FairQueue()
     served: Counter[str] = Counter()
     for _ in range(300):
@@ -81,7 +71,7 @@ def test_limits() -> None:
     assert len(turns) == MAX_PER_PROCESS + 1
 
 
-def test_nobody_is_remembered_for_ever() -> None:
+def test_idle_processes_are_forgotten() -> None:
     turns: FairQueue[str] = FairQueue()
     for number in range(3 * MAX_REMEMBERED):
         turns.add(number, 0, "x", 1)
@@ -132,7 +122,7 @@ def test_what_must_be_answered_is_never_refused() -> None:
     assert not turns.add("p", "c", "more", 0)
     assert turns.add("p", "c", "answer", 0, always=True)
     assert turns.add("q", "d", "quiet", 0)
-    assert "quiet" in [serve(turns, 1.0) for _ in range(3)], "nobody waits for a loud process's answers"
+    assert "quiet" in [serve(turns, 1.0) for _ in range(3)], "no process waits for a loud one's answers"
 
 
 def test_what_comes_for_a_process_while_it_is_served() -> None:
