@@ -3,22 +3,25 @@
 
 from __future__ import annotations
 
+import _signal as signal  # type: ignore[import-not-found]  # `signal` takes 2 ms to import
 import argparse
 import errno
 import os
 import re
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
+from types import FrameType
 from typing import Any, Final, NoReturn
 
 from shmmap.errors import CannotWrite, InternalError, ShmmapError
-from shmmap.processes.lost_interrupts import keep_interrupts
 
 __all__ = ["Parser", "add_allow_empty", "complain", "exit_code_of", "join_negative_values", "nothing_found"]
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_LATER_S: Final = 0.005
+"""By then the callback that an interrupt came in is over."""
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 
@@ -176,3 +179,26 @@ def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, nam
     """
     complain(name, message, hint)
     return 0 if args.allow_empty else 1
+
+
+def keep_interrupts() -> None:
+    """Have ends that Python ignores (`KeyboardInterrupt`, `SystemExit`) signalled again, in this process.
+
+    In a weak reference's callback or a finalizer Python prints "Exception ignored in", and goes on: of those
+    sent while modules are imported, one in ten (https://github.com/python/cpython/issues/95959).
+    """
+    before = sys.unraisablehook
+
+    def ignored(what: Any) -> None:
+        if not issubclass(what.exc_type, KeyboardInterrupt | SystemExit):
+            before(what)
+            return
+        number = signal.SIGINT if issubclass(what.exc_type, KeyboardInterrupt) else signal.SIGTERM
+
+        def again(_alarm: int, _frame: FrameType | None) -> None:
+            signal.raise_signal(number)
+
+        signal.signal(signal.SIGALRM, again)
+        signal.setitimer(signal.ITIMER_REAL, _LATER_S)
+
+    sys.unraisablehook = ignored

@@ -12,14 +12,15 @@ import signal
 import socket
 import time
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import nowhere
 from shmmap.daemon.events.publisher import EventPublisher, events_path
-from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.host.instance import InstanceLock, make_runtime_dir, take_away
+from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
     KEEP_SIGNAL,
@@ -43,11 +44,10 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager import ActivatedSocket, ServiceManager, status_line
-from shmmap.daemon.serving_loop import Chore, ServingLoop
-from shmmap.daemon.telemetry.published_gauges import PublishedGauges, VersionInService
-from shmmap.daemon.telemetry.sampler import Sampler
+from shmmap.daemon.serving_loop import BackgroundTask, ServingLoop
+from shmmap.daemon.telemetry.sampler import PublishedGauges, Sampler, VersionInService
+from shmmap.daemon.transport.connection import Connections, Listener
 from shmmap.daemon.transport.inbox import Inbox
-from shmmap.daemon.transport.listener import Connections, Listener
 from shmmap.daemon.transport.socket_file import SocketFile
 from shmmap.errors import ShmmapError
 from shmmap.failpoints import step
@@ -63,9 +63,9 @@ if TYPE_CHECKING:
 __all__ = ["Elsewhere", "Service"]
 
 LOOK_S: Final = 1.0
-"""How often it is looked whether sockets have their files."""
+"""How often to check that sockets have their files."""
 LAST_WORDS_S: Final = 0.2
-"""How long the end may take to deliver what was sent last."""
+"""How long the end may take to deliver the last messages."""
 
 
 class Elsewhere(VersionInService, Protocol):
@@ -73,21 +73,21 @@ class Elsewhere(VersionInService, Protocol):
 
     @property
     def link(self) -> OriginLink:
-        """Says whether it is in reach, and has another version."""
+        """Its link: whether it is in reach, and has another version."""
 
     @property
     def keeper(self) -> ObjectKeeper | None:
-        """Keeps objects of cells on the disk ahead; None where nothing is kept."""
+        """What keeps objects of cells on the disk ahead; None where nothing is kept."""
 
     def note_served(self, view: CatalogueView) -> None:
         """Remember which version of the map is served now."""
 
     def try_again(self) -> None:
-        """Have fetched again what of the list of cells could not be had."""
+        """Fetch again what of the list of cells could not be had."""
 
 
 class Service:
-    """What clients and the service manager talk to.
+    """The daemon as clients and the service manager see it.
 
     Raises
     ------
@@ -133,7 +133,7 @@ class Service:
         self._inbox = Inbox(statistics)
         cells = CellRequests(
             cache, scheduler, quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
-            due=self._inbox.due, clock=time.monotonic,
+            due=self._inbox.add_work, clock=time.monotonic,
         )  # fmt: skip
         sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
@@ -152,20 +152,6 @@ class Service:
         paging.follow()
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, lambda: self._collect_reload(change), "map")
-        origin_watch: Chore | None = None
-        disk_ahead: Chore | None = None
-        if elsewhere is not None:
-            from shmmap.daemon.loading.outages import OriginWatch
-
-            origin_watch = one = OriginWatch(
-                elsewhere.link, scheduler, elsewhere.try_again, self._take_another
-            )
-            watched.watch(elsewhere.link.fd, one.collect, "map")
-            if elsewhere.keeper is not None:
-                from shmmap.daemon.loading.outages import DiskAhead
-
-                disk_ahead = ahead = DiskAhead(cache, scheduler, elsewhere.keeper)
-                watched.watch(elsewhere.keeper.fd, ahead.collect, "memory")
         defects = Defects(statistics)
         dispatch = Dispatch(
             handshake,
@@ -177,16 +163,15 @@ class Service:
             cache.survey,
             sampler,
             defects,
-            self._inbox.due,
+            self._inbox.add_work,
         )
-        chores: deque[tuple[str, Chore]] = deque()
-        chores += [("usage", cache.survey), ("map", memory.map_switch), ("map", paging)]
-        chores += [("memory", scheduler.prefetcher)]
-        chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
-        if origin_watch is not None:
-            chores.append(("map", origin_watch))
-        if disk_ahead is not None:
-            chores.append(("memory", disk_ahead))
+        tasks: deque[tuple[str, BackgroundTask]] = deque([
+            ("usage", cache.survey), ("map", memory.map_switch), ("map", paging),
+            ("memory", scheduler.prefetcher), ("statistics", sampler), ("memory", cache.evictor),
+            ("answers", live),
+        ])  # fmt: skip
+        if elsewhere is not None:
+            tasks += self._tasks_of(elsewhere)
         self._handshake = handshake
         self._loop = ServingLoop(
             watched,
@@ -196,24 +181,39 @@ class Service:
             cells,
             cache,
             scheduler,
-            chores,
+            tasks,
             statistics,
             defects,
             memory.event_log,
         )
 
+    def _tasks_of(self, elsewhere: Elsewhere) -> Iterator[tuple[str, BackgroundTask]]:
+        """Yield the background tasks that an origin elsewhere needs."""
+        from shmmap.daemon.loading.outages import OriginWatch
+
+        cache, scheduler, watched = self._memory.cache, self._memory.scheduler, self._memory.watched
+        origin_watch = OriginWatch(elsewhere.link, scheduler, elsewhere.try_again, self._take_another)
+        watched.watch(elsewhere.link.fd, origin_watch.collect, "map")
+        yield "map", origin_watch
+        if elsewhere.keeper is not None:
+            from shmmap.daemon.loading.outages import DiskAhead
+
+            disk_ahead = DiskAhead(cache, scheduler, elsewhere.keeper)
+            watched.watch(elsewhere.keeper.fd, disk_ahead.collect, "memory")
+            yield "memory", disk_ahead
+
     def run(self, started_s: float) -> None:
-        """Bind, say READY, answer requests until told to stop."""
+        """Bind, report READY, answer requests until a signal or an operator stops the daemon."""
         memory, watched = self._memory, self._memory.watched
         try:
             self._watch_map()
-            with contextlib.closing(ServingSignals()) as heard:
+            with contextlib.closing(ServingSignals()) as signals:
                 self._signals.raise_if_stopped()
-                watched.watch(heard.fd, lambda: self._on_signals(heard))
+                watched.watch(signals.fd, lambda: self._on_signals(signals))
                 self._listen()
                 memory.statistics.set("starting", 0)
                 memory.statistics.beat()
-                self._tell_epoch("started")
+                self._publish_epoch("started")
                 self._live.tell()
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
@@ -237,7 +237,7 @@ class Service:
         requests = SocketFile(self._socket_path, self._gid, passed)
         listener = Listener(
             requests.socket, memory.watched, self._connections, memory.statistics, b"ROUTER", b"DEALER",
-            MAX_REQUEST_BYTES, self._inbox.hear, self._handshake.hung_up,
+            MAX_REQUEST_BYTES, self._inbox.receive, self._handshake.hung_up,
         )  # fmt: skip
         self._sockets.append((requests, listener))
         step("daemon.bind")
@@ -250,8 +250,8 @@ class Service:
             one.begin()
         memory.event_log.send = publisher.send
 
-    def _look_after_sockets(self, now_s: float) -> None:
-        """Make the files of sockets again that another program removed; connections stay as they are."""
+    def _restore_sockets(self, now_s: float) -> None:
+        """Make files of sockets again that another program removed; connections stay as they are."""
         if now_s < self._look_s:
             return
         self._look_s = now_s + LOOK_S
@@ -277,7 +277,7 @@ class Service:
     def _end(self) -> None:
         keep = self._signals.keep
         self._manager.stopping("keeping memory for the next start" if keep else "freeing memory")
-        self._tell_epoch("stopping")
+        self._publish_epoch("stopping")
         self._memory.event_log.send = nowhere
         self._connections.deliver(LAST_WORDS_S)
         for file, _listener in self._sockets:
@@ -288,23 +288,23 @@ class Service:
         for file, _listener in self._sockets:
             file.remove()
 
-    def _tell_epoch(self, what: str) -> None:
+    def _publish_epoch(self, what: str) -> None:
         cache = self._memory.cache
         self._memory.event_log.publish(
             Epoch, what, cache.catalogue.map_version, len(cache.catalogue), cache.ledger.resident_count
         )
 
     def _beat(self) -> None:
-        """A few times a second, from the loop itself: whoever is hung does not beat."""
+        """Do what is due a few times a second, from the loop itself: a daemon that hangs does not beat."""
         memory, now_s = self._memory, time.monotonic()
         self._manager.beat(now_s, self._status)
         self._handshake.look_after_departed()
-        if not any(self._connections):  # nobody can leave who would make room
+        if not any(self._connections):  # none can end and make room
             self._connections.try_again()
         self._pins.keep(now_s)
         self._operators.answer_overdue(now_s)
         self._live.beat(now_s)
-        self._look_after_sockets(now_s)
+        self._restore_sockets(now_s)
         if self._file_watch is not None and self._file_watch.due(now_s):
             self._reload()
         if self._elsewhere is not None:
@@ -341,11 +341,11 @@ class Service:
         return directories_of(self._config.map_path, self._config.metadata, id_prefix)
 
     def _take_another(self) -> None:
-        """Take another version of the map: it is there."""
+        """Have another version of the map taken: there is one."""
         self._reloader.ask(lambda _result: None)
 
     def _reload(self) -> None:
-        """Read the map again because of a signal or a change; the service manager waits for the end."""
+        """Have the map read again for a signal or a change; the service manager waits for the end."""
         self._manager.reloading()
         self._reloader.ask(self._reloaded)
 
@@ -359,8 +359,8 @@ class Service:
 
     # --- signals ----------------------------------------------------------------------------------
 
-    def _on_signals(self, heard: ServingSignals) -> None:
-        for number in heard.take():
+    def _on_signals(self, signals: ServingSignals) -> None:
+        for number in signals.take():
             if number == RELOAD_SIGNAL and not self._signals.hangup_stops:
                 self._reload()
             elif number in (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL) and not self._loop.stopping:
@@ -372,7 +372,7 @@ class Service:
                 self._loop.stop(answer=not keep)
 
     def _quick_exit(self, number: int, frame: object) -> None:
-        """A second signal: take the names away and go.
+        """Remove the names and exit: a second signal has come.
 
         It may come in the middle of the first one's work, so it trusts the disk alone.
         """
@@ -390,8 +390,8 @@ class Service:
 def _settle_memory() -> None:
     """Give back what reading the map took; from now on memory is freed by counting references alone.
 
-    Nothing that the daemon drops refers to itself (a test sees to that), and to look for what does took 30 ms
-    of a turn: even what is new may be very much, where segments come as fast as others go.
+    Nothing that the daemon drops refers to itself (a test holds that), and a search for what does took 30 ms
+    of a turn: even new objects are many where segments come as fast as others go.
     """
     gc.collect()
     gc.disable()

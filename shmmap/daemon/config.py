@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import os
+import re
+import stat
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from shmmap.daemon.config_file import Setting, read_settings_file
 from shmmap.daemon.config_table import (
     LARGEST_BYTES,
     Allowed,
@@ -32,6 +35,11 @@ from shmmap.protocol.endpoint import (
 )
 from shmmap.segment.names import DEFAULT_SHM_DIR, check_instance
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 if TYPE_CHECKING:
     from shmmap.daemon.config_live import LiveSettings
 
@@ -39,13 +47,20 @@ __all__ = [
     "DROPPED",
     "ROWS",
     "SECTIONS",
+    "SYSTEM_CONFIG_FILE",
     "DaemonConfig",
+    "Setting",
     "example_file",
+    "installed_config_file",
     "load_config",
     "option_of",
+    "read_settings_file",
     "trace_settings",
 ]
 
+SYSTEM_CONFIG_FILE: Final = "/etc/shmmap/shmmap.toml"
+MAX_BYTES: Final = 1 << 20
+_KEY: Final = re.compile(r"""\s*(?:"([^"]+)"|'([^']+)'|([A-Za-z0-9_-]+))\s*[.=]|\s*\[+\s*([A-Za-z0-9_-]+)""")
 _ENVIRONMENT: Final = "SHMMAP_"
 COMMAND_LINE: Final = "command line"
 _NOT_SETTINGS: Final = "SHMMAP_TEST_"
@@ -58,8 +73,18 @@ SECTIONS: Final = {
     "live_budget_bytes": "live maps",
 }
 """Headings in the help and in the example file, by the first setting below each."""
-DROPPED: Final = {"eviction": "what clients will need last is always evicted first"}
-"""Settings that there were, and what holds instead."""
+RENAMED: Final = {"ride_out_s": "outage_tolerance_s"}
+DROPPED: Final = {"eviction": "what clients will need last is always evicted first"} | dict.fromkeys(
+    RENAMED, ""
+)
+"""Settings that there were, and what holds instead; empty for one that is in `RENAMED`."""
+
+
+class Setting(NamedTuple):
+    """A setting's value and where it comes from: ``FILE:LINE``, a variable, the flags, the default."""
+
+    value: Any
+    origin: str
 
 
 def _quota(text: str) -> float:
@@ -151,10 +176,10 @@ class DaemonConfig:
         ),
         parse=_quota,
     )
-    ride_out_s: float = setting(
+    outage_tolerance_s: float = setting(
         10.0,
-        "how long, in seconds, the map's files may be out of reach without a moving client's noticing: cells "
-        "are fetched that far ahead, of a published map onto the disk where memory has no room",
+        "prefetch far enough to bridge an outage of the map's storage of this many seconds, unnoticed by "
+        "moving clients; cells of a published map go to the disk where memory has no room",
         metavar="SECONDS",
         allowed=within(0, 3600, "seconds"),
     )
@@ -359,12 +384,15 @@ def trace_settings(
 def _no_setting(word: str, origin: str) -> ConfigError:
     """Refuse a name that is no setting, or no longer one."""
     if word in DROPPED:
+        new = RENAMED.get(word, "")
         called, hint = word, "delete this line"
         if origin == COMMAND_LINE:
-            called, hint = option_of(word), "leave it out"
+            called, new, hint = option_of(word), option_of(new), "leave it out"
         elif origin.startswith(_ENVIRONMENT):
-            hint = f"unset {origin}"
-        return ConfigError(f"{origin}: {called} is gone: {DROPPED[word]}", key=word, origin=origin, hint=hint)
+            new, hint = _ENVIRONMENT + new.upper(), f"unset {origin}"
+        why = DROPPED[word] or f"it is {new} now"
+        hint = hint if DROPPED[word] else f"write {new}"
+        return ConfigError(f"{origin}: {called} is gone: {why}", key=word, origin=origin, hint=hint)
     hint = near_hint(word, [*(row.called for row in ROWS.values()), "live"])
     return ConfigError(f"{origin}: unknown setting {word!r}", key=word, origin=origin, hint=hint)
 
@@ -389,6 +417,66 @@ def _instance_of(endpoint: str) -> str:
         return check_instance(os.path.basename(endpoint_path(endpoint)).removesuffix(".sock"))
     except (BadRequest, ConfigError):
         return DEFAULT_INSTANCE
+
+
+def installed_config_file(environ: Mapping[str, str] = os.environ) -> str:
+    """Return the file that the installed units read: the user's own, else the system's; or empty."""
+    own = environ.get("XDG_CONFIG_HOME", "") or os.path.join(environ.get("HOME", "/"), ".config")
+    places = [f"{own}/shmmap/shmmap.toml", SYSTEM_CONFIG_FILE]
+    return next((place for place in places if os.path.exists(place)), "")
+
+
+def read_settings_file(path: str) -> dict[str, Setting]:
+    """Read the settings of a file.
+
+    Raises
+    ------
+    ConfigError
+        It cannot be read, or is no TOML.
+    """
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_BYTES:
+            why = "not a regular file" if not stat.S_ISREG(status.st_mode) else "too large for settings"
+            raise ConfigError(f"{path}: {why}", origin=path, hint="`shmmap config init FILE` writes one")
+        text = Path(path).read_text(encoding="utf-8")
+        settings: dict[str, Any] = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{path}: it is nested too deeply", origin=path) from None
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: {error.strerror}", origin=path, hint="`shmmap config init FILE` writes one"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}", origin=path) from error
+    lines = _lines(text)
+    return {
+        name: Setting(value, f"{path}:{lines[name]}" if name in lines else path)
+        for name, value in settings.items()
+    }
+
+
+def _lines(text: str) -> dict[str, int]:
+    """First line of each key at the top level.
+
+    A line inside a string of several lines may look like one, but what comes before it is no TOML.
+    """
+    found: dict[str, int] = {}
+    lines = text.splitlines(keepends=True)
+    for number, line in enumerate(lines, start=1):
+        match = _KEY.match(line)
+        name = next(filter(None, match.groups()), "") if match else ""
+        if name and name not in found and _is_toml("".join(lines[: number - 1])):
+            found[name] = number
+    return found
+
+
+def _is_toml(text: str) -> bool:
+    try:
+        tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return False
+    return True
 
 
 _HEAD: Final = """\

@@ -29,6 +29,7 @@ SERVICE_STATE: Final = "/var/lib/shmmap/state"
 
 REAL_S: Final = 0.5
 
+_OCCUPANCY: Final = Occupancy()
 _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -60,12 +61,18 @@ class LiveSettings:
             f"1 to {MOST_FRAME_BYTES} bytes of UTF-8",
         ),
     )
-    hit: float = setting(0.7, "what one hit says, a probability above a half")
-    miss: float = setting(0.4, "what one miss says, a probability below a half")
-    clamp_min: float = setting(0.12, "no voxel is surer to be free than this probability says")
-    clamp_max: float = setting(0.97, "no voxel is surer to be occupied than this probability says")
-    occupied_above: float = setting(0.5, "voxels above this probability count as occupied")
-    free_below: float = setting(0.5, "voxels below this probability count as free")
+    hit: float = setting(_OCCUPANCY.hit, "what one hit says, a probability above a half")
+    miss: float = setting(_OCCUPANCY.miss, "what one miss says, a probability below a half")
+    clamp_min: float = setting(
+        _OCCUPANCY.clamp_min, "no voxel is surer to be free than this probability says"
+    )
+    clamp_max: float = setting(
+        _OCCUPANCY.clamp_max, "no voxel is surer to be occupied than this probability says"
+    )
+    occupied_above: float = setting(
+        _OCCUPANCY.occupied_above, "voxels above this probability count as occupied"
+    )
+    free_below: float = setting(_OCCUPANCY.free_below, "voxels below this probability count as free")
     radius: int = setting(
         1,
         "chunks (64 voxels a side) around each client that stay in memory, along each axis",
@@ -145,7 +152,7 @@ def live_settings(
 
 
 def _real(path: str) -> str:
-    """A path without links, as far as that is known at once: a directory may hang."""
+    """Return a path without links, as far as that is known at once: a directory may hang."""
     found = [os.path.normpath(path)]
     looking = threading.Thread(target=lambda: found.append(os.path.realpath(path)), daemon=True)
     looking.start()
@@ -187,9 +194,7 @@ def _from_table(name: str, table: Mapping[str, Any], origin: str) -> LiveSetting
 
 
 def live_directory(instance: str, name: str, environ: Mapping[str, str] = os.environ) -> str:
-    """Return where a live map is kept whose directory nobody named.
-
-    It is ``live/NAME`` in the state directory.
+    """Return the default directory of a live map: ``live/NAME`` in the state directory.
 
     Raises
     ------

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One life of the daemon: lock, open the map, serve, stop.
+"""One run of the daemon: lock, open the map, serve, stop.
 
 The order matters.  The lock comes first, because binding would steal a live socket; leftovers are
-taken over before anything is published; READY is said when requests are answered.  On the way out
-every name is taken away before the lock is.
+taken over before anything is published; READY is reported when requests are answered.  On the way out
+every name is removed before the lock is.
 
 **Stopping empties, restarting keeps warm.** SIGTERM and SIGINT stop the daemon and free all memory.
-SIGUSR1 stops it and leaves the segments to its next life, which adopts them
-(`shmmap.daemon.loading.adoption`), as it does after a crash, or when a defect ends the daemon; whoever
-waits for an answer gets it from the next life, too. A SIGTERM that follows a SIGUSR1 changes nothing
+SIGUSR1 stops it and leaves the segments to the next run, which adopts them
+(`shmmap.daemon.loading.adoption`), as it does after a crash, or when a defect ends the daemon; clients that
+wait for an answer get it from the next run, too. A SIGTERM that follows a SIGUSR1 changes nothing
 about that, so a service manager that sends SIGTERM anyway can announce a restart beforehand. systemd
 ends a unit in the same way for ``restart`` and ``stop``, but while it does so its job list says which it
 is; ``+`` gives the line the right to ask and to send, in a unit for one user ``systemctl --user`` has it
@@ -17,7 +17,7 @@ anyway::
     ExecStop=-+/bin/sh -c 'systemctl list-jobs --plain --no-legend | \
         grep -Eq "^ *[0-9]+ +%n +restart " && kill -USR1 $MAINPID'
 
-Elsewhere: ``kill -USR1`` before starting anew, ``docker run --stop-signal USR1``.
+Elsewhere: ``kill -USR1`` before the next start, ``docker run --stop-signal USR1``.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 LIVE_S: Final = 1.5
-"""How long points wait for live maps at the start: whatever is wrong with those, points are served."""
+"""How long points wait for live maps at the start: points are served whatever is wrong with those."""
 LIVE_ALONE_S: Final = 120.0
-"""How long the daemon waits for live maps where it serves nothing else: kernels are compiled, too."""
+"""How long the daemon waits for live maps where it serves nothing else: kernels are compiled meanwhile."""
 SWITCH_S: Final = 0.0005
 """How long a thread that reads the map again may keep the serving loop waiting for the interpreter."""
 
@@ -103,7 +103,7 @@ def run(config: DaemonConfig) -> int:
     InstanceBusy
         Another daemon has this instance.
     CannotStart
-        Something is full, not there yet, or in the way.
+        A required resource is unavailable: full, not there yet, or taken.
     """
     set_up_logging(getattr(logging, config.log_level.upper()))
     if not config.map_path and not config.live:
@@ -225,7 +225,7 @@ def _fetched_from(origin: PublishedOrigin) -> FetchedFrom:
 
 
 def _end_threads(origin: PublishedOrigin) -> None:
-    """End threads that ask the origin; one that still waits for it must not meet the interpreter's end."""
+    """End threads that ask the origin; one that still waits must not see the interpreter's end."""
     if not origin.close():
         atexit.register(_leave)
 
@@ -236,19 +236,19 @@ def _leave() -> None:
 
 
 def _refuse_taken(path: str, activated: ActivatedSocket | None) -> None:
-    """Refuse sockets that others have now, not once the map is read."""
+    """Refuse sockets that other programs have, before the map is read."""
     if activated is None:
         refuse_taken(path)
     refuse_taken(events_path(path))
 
 
 def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:
-    """Leave the segments to the next life, too, if a defect ended this one: it is like a crash."""
+    """Leave the segments to the next run, too, if a defect ended this one: it is like a crash."""
     memory.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
 
 
 def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay | NoLiveMaps:
-    """Have the live maps brought into memory."""
+    """Start the process that keeps the live maps, and wait for it a while."""
     if not config.live:
         return NoLiveMaps()
     mappers = Authorization(config.live_group, "live_group")
@@ -275,7 +275,7 @@ def _close_live(
 
 
 def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:
-    """Where this daemon listens: a socket that was passed to it decides."""
+    """Return where this daemon listens: a socket that was passed to it decides."""
     if activated is None:
         return config.socket()
     if config.endpoint and config.socket() != activated.path:

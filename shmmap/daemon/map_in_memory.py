@@ -39,7 +39,7 @@ __all__ = ["FetchedFrom", "MapInMemory"]
 
 
 class FetchedFrom(NamedTuple):
-    """Where loaders fetch cells: the words that say it to them, and how many each fetches at once."""
+    """Where loaders fetch cells: their arguments for it, and how many cells each fetches at once."""
 
     words: tuple[str, ...]
     places: int
@@ -48,7 +48,7 @@ class FetchedFrom(NamedTuple):
 class MapInMemory:
     """What has names in shared memory: the cache with its loaders, and the statistics.
 
-    Leftovers of an earlier life are taken over.  `close` takes the names away again.
+    Leftovers of a previous run are taken over.  `close` takes the names away again.
 
     Raises
     ------
@@ -93,9 +93,16 @@ class MapInMemory:
             ),
             limit_bytes=group_limit,
         )
+        ledger = Ledger(budget)
         try:
             self.statistics = StatisticsWriter(
-                directory, config.instance, self.identity, mode=mode, gid=gid, starting=True
+                directory,
+                config.instance,
+                self.identity,
+                mode=mode,
+                gid=gid,
+                starting=True,
+                reserve=ledger.add_overhead,
             )
         except OSError as error:
             said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
@@ -110,9 +117,7 @@ class MapInMemory:
             self.statistics.set("pin_source", list(PinSource).index(pins.source))
             self.statistics.set("last_reload_unix_ns", time.time_ns())
             self.statistics.set("map_problems", len(catalogue.problems))
-            ledger = Ledger(budget)
             ledger.overhead_bytes = self.statistics.size_bytes
-            self.statistics.reserve = ledger.add_overhead
             self.event_log = EventLog(epoch)
             self.sessions = Sessions()
             reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
@@ -139,7 +144,7 @@ class MapInMemory:
                 pool,
                 clock=time.monotonic,
                 prefetch_share=config.prefetch_share,
-                ride_out_s=config.ride_out_s,
+                outage_tolerance_s=config.outage_tolerance_s,
             )
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
             self.adoption.take_over(time.monotonic())
@@ -158,7 +163,7 @@ class MapInMemory:
             undo.pop_all()
 
     def close(self, *, keep: bool) -> None:
-        """End the loaders, and take every name away or leave those of the segments to the next life."""
+        """End the loaders, and remove every name, or leave those of the segments to the next run."""
         self.scheduler.pool.close()
         self.adoption.close(keep=keep)
         self.cache.close(keep=keep)

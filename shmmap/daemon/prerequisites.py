@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has to be in place before the daemon can serve."""
+"""What has to be in place before the daemon can serve: limits, groups, and a way to see what is in use."""
 
 from __future__ import annotations
 
 import ctypes
+import grp
 import importlib
 import os
+import pwd
 import resource
 from typing import Final
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.host.groups import account_name, group_id
 from shmmap.daemon.pins.probe import PinSource, probe_pins
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.errors import ConfigError
@@ -20,9 +21,11 @@ from shmmap.segment.process_limits import file_size_limit
 
 __all__ = [
     "access_of_segments",
+    "account_name",
     "check_file_size_limit",
     "choose_pins",
     "give_back_large_tables",
+    "group_id",
     "import_ahead",
     "raise_descriptor_limit",
 ]
@@ -32,13 +35,13 @@ _LARGE_BYTES: Final = 1 << 20
 
 
 def raise_descriptor_limit() -> None:
-    """A session takes two descriptors; the customary limit of 1024 would end at 500 clients."""
+    """Take as many descriptors as allowed: a session takes two, and the customary limit is 1024."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def give_back_large_tables() -> None:
-    """Let large memory go back to the kernel when it is freed.
+    """Return large memory to the kernel when it is freed.
 
     After the first table of a large map, glibc would keep what others leave: 30 MB of a million cells.
     """
@@ -53,7 +56,7 @@ def import_ahead() -> None:
 
 
 def access_of_segments(config: DaemonConfig) -> tuple[int, int]:
-    """Group id and mode of what readers open; -1 and owner-only without a group.
+    """Return group id and mode of what readers open; -1 and owner-only without a group.
 
     Raises
     ------
@@ -74,7 +77,7 @@ def access_of_segments(config: DaemonConfig) -> tuple[int, int]:
 
 
 def check_file_size_limit(budget_bytes: int) -> None:
-    """Say which segments a limit on the size of files will refuse."""
+    """Warn of segments that a limit on the size of files will refuse."""
     limit = file_size_limit()
     if limit is not None and limit < budget_bytes:
         log.warning(
@@ -84,11 +87,35 @@ def check_file_size_limit(budget_bytes: int) -> None:
 
 
 def choose_pins(directory: ShmDirectory) -> PinWatch:
-    """Find out how well this machine tells who uses a segment, and say so."""
+    """Find out how this machine shows that a segment is in use, and log it."""
     support = probe_pins(directory)
     if support.source is not PinSource.LEASES:
         log.warning("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor")
-    log.info("use of segments is detected", by=support.source.value)
+    log.info("in-use detection", by=support.source.value)
     return PinWatch(
         directory, support.source, events=support.close_events and support.source is not PinSource.SESSIONS
     )
+
+
+def account_name(uid: int) -> str:
+    """Return a user's name, or the number of one without."""
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return str(uid)
+
+
+def group_id(name: str, key: str) -> int:
+    """Return the id of a group given by name or number; ``key`` is the setting it comes from.
+
+    Raises
+    ------
+    ConfigError
+        There is no such group.
+    """
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError:
+        if name.isdigit():
+            return int(name)
+        raise ConfigError(f"there is no group {name!r}", key=key, hint=f"groupadd --system {name}") from None

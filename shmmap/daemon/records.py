@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every room of the daemon may name: a key, a segment in memory, a retired one, a load, a failure."""
+"""Records that all packages of the daemon share: keys, segments in memory and retired, loads, failures."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from shmmap.segment.version import Stamp
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired", "failure_code"]
 
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
-"""Failures for lack of memory: they pass when somebody lets go."""
+"""Failures for lack of memory: they pass when clients release cells."""
 
 
 def failure_code(error: OSError) -> str:
-    """Code of a load that failed for want of a segment's file."""
+    """Return the code of a load that failed because its segment's file could not be made."""
     return "no_space" if is_full(error) else "load_failed"
 
 
@@ -32,10 +32,10 @@ class Key(NamedTuple):
 class Resident:
     """A published segment and what the daemon knows of its use.
 
-    ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
-    their checksums: until then nobody is handed it.  ``prefetched`` is true for one that was fetched before
-    anybody asked for it, until somebody does.  ``handle`` and ``stale_handle`` are encoded once, for all
-    replies; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
+    ``checked`` is false for one of a previous run of the daemon until its bytes were compared with
+    their checksums: until then it is not handed out.  ``prefetched`` is true for one that was fetched ahead,
+    until a client asks for it.  ``handle`` and ``stale_handle`` are encoded once, for all
+    replies; ``sessions`` are the slots of sessions that hold it; ``place`` is where it stands
     among all segments of its size; ``deferred_s`` how long it was deferred when it was last found in use.
     """
 
@@ -63,9 +63,9 @@ class Resident:
 class Retired:
     """A segment out of service; ``resident`` says what it was.
 
-    ``probe_after_s`` is when its use is next worth a look, ``condemned`` that nobody had it open
+    ``probe_after_s`` is when its use is next worth a look, ``condemned`` that no process had it open
     at the last look, ``interval_s`` how long the last wait between two looks was; before ``tick_over_s``
-    somebody may be just opening it.
+    a client may be just opening it.
     """
 
     resident: Resident
@@ -79,14 +79,14 @@ class Retired:
 class Load:
     """A load that is queued or under way; ``reserved`` bytes are promised to it meanwhile.
 
-    ``adopted`` is a segment of an earlier life that only has to be checked, ``unless`` the state of a file
-    that could not be loaded: in that state it is not tried again.  ``wanted`` says that somebody asked for
+    ``adopted`` is a segment of a previous run that only has to be checked, ``unless`` the state of a file
+    that could not be loaded: in that state it is not tried again.  ``wanted`` says that a client asked for
     it, ``sources`` and ``version`` what the catalogue knew of its file and its neighbours', and which version
     that makes, when a worker was given the job.  ``computed`` says that it is a layer that is computed, which
-    may take long.  ``payer`` is whose turn was used for it, ``charged_s`` the loader's time that it was taken
-    to need, ``spent_s`` the time that it did, and ``took_s`` how long it took, fetching included; ``losses``
-    counts loaders that were lost without its doing.
-    ``prefetch`` says that nobody has asked for it yet, ``unread`` that what it reads could not be read.
+    may take long.  ``payer`` is the asker whose turn was used for it, ``charged_s`` the loader's time that it
+    was expected to need, ``spent_s`` the time that it did, ``took_s`` how long it took, fetching included;
+    ``losses`` counts loaders that were lost through no fault of its own.
+    ``prefetch`` says that no client has asked for it yet, ``unread`` that what it reads could not be read.
     """
 
     key: Key
@@ -117,7 +117,7 @@ class Failure:
     """Why the last load of a key failed, and when asking again is worth another try.
 
     ``stamp`` is the state of the file that it failed for: another state is tried at once.  None, if it is
-    not known or nobody should look (its file system may be what hangs).
+    not known or must not be looked up (its file system may be what hangs).
     """
 
     code: str

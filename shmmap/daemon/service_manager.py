@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 STATUS_EVERY_S: Final = 2.0
-"""Each status line wakes those who listen to the service manager: not at every beat."""
+"""Each status line wakes programs that listen to the service manager: not at every beat."""
 
 
 def notify(*lines: str) -> None:
@@ -54,7 +54,7 @@ def notify(*lines: str) -> None:
 
 
 def watchdog_interval_s(environ: Mapping[str, str]) -> float:
-    """Return the seconds between two signs of life; infinite where the service manager wants none.
+    """Return the seconds between two watchdog messages; infinite where the service manager wants none.
 
     A third of ``WATCHDOG_USEC``: sd_watchdog_enabled(3) recommends half of it at most, and one may
     be late.
@@ -78,18 +78,18 @@ def status_line(
 
 
 class ServiceManager:
-    """Speaks to the service manager; says nothing where there is none.
+    """Reports to the service manager, if there is one.
 
     Parameters
     ----------
     environ
         Of this process: ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` count.
-    tell
+    send
         Sends lines ``KEY=value``.
     """
 
-    def __init__(self, environ: Mapping[str, str] = os.environ, tell: Callable[..., None] = notify) -> None:
-        self._tell = tell
+    def __init__(self, environ: Mapping[str, str] = os.environ, send: Callable[..., None] = notify) -> None:
+        self._send = send
         self._feed_every_s = watchdog_interval_s(environ)
         self._feed_at_s = 0.0 if math.isfinite(self._feed_every_s) else math.inf
         self._status = ""
@@ -98,40 +98,40 @@ class ServiceManager:
 
     def ready(self, status: str) -> None:
         """Report that serving starts."""
-        self._tell("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
+        self._send("READY=1", f"STATUS={status}", f"MAINPID={os.getpid()}")
 
     def beat(self, now_s: float, status: Callable[[], str]) -> None:
         """Feed the watchdog and send a new status line; the serving loop calls it a few times a second."""
         if now_s >= self._feed_at_s:
             self._feed_at_s = now_s + self._feed_every_s
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
         if not self._reloads and now_s - self._status_s >= STATUS_EVERY_S:
             self._status_s = now_s
             line = status()
             if line != self._status:
                 self._status = line
-                self._tell(f"STATUS={line}")
+                self._send(f"STATUS={line}")
 
     def reloading(self) -> None:
         """Report that the map is being read again; each call is followed by one of `reloaded`."""
         self._reloads += 1
         now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-        self._tell("RELOADING=1", f"MONOTONIC_USEC={now_us}", "STATUS=reading the map again")
+        self._send("RELOADING=1", f"MONOTONIC_USEC={now_us}", "STATUS=reading the map again")
 
     def reloaded(self, outcome: str) -> None:
         """Report that the map was read again, or could not be; ready once no other reload runs."""
         self._reloads -= 1
         self._status = ""
         if not self._reloads:
-            self._tell("READY=1", f"STATUS={outcome}")
+            self._send("READY=1", f"STATUS={outcome}")
 
     def stopping(self, why: str) -> None:
         """Report that serving ends."""
-        self._tell("STOPPING=1", f"STATUS={why}")
+        self._send("STOPPING=1", f"STATUS={why}")
 
     def failed(self, message: str) -> None:
         """Report that serving cannot start; the message stays visible in ``systemctl status``."""
-        self._tell(f"STATUS={message}")
+        self._send(f"STATUS={message}")
 
 
 EXTEND_EVERY_S: Final = 20.0
@@ -149,7 +149,7 @@ class MoreTime:
 
     Parameters
     ----------
-    tell
+    send
         Sends lines ``KEY=value``.
     what
         What takes so long, for the status line.
@@ -157,8 +157,8 @@ class MoreTime:
         How often.
     """
 
-    def __init__(self, tell: Callable[..., None], what: str, every_s: float = EXTEND_EVERY_S) -> None:
-        self._tell = tell
+    def __init__(self, send: Callable[..., None], what: str, every_s: float = EXTEND_EVERY_S) -> None:
+        self._send = send
         self._what = what
         self._every_s = every_s
         self._over = threading.Event()
@@ -167,7 +167,7 @@ class MoreTime:
     def __enter__(self) -> MoreTime:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         try:
-            self._thread.start()  # signals are for who reads the map: a stop must interrupt that
+            self._thread.start()  # signals are for the thread that reads the map: a stop must interrupt it
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return self
@@ -181,7 +181,7 @@ class MoreTime:
     def _ask(self) -> None:
         end_s = time.monotonic() + MAX_START_S
         while not self._over.wait(self._every_s) and time.monotonic() < end_s:
-            self._tell(f"STATUS={self._what}", f"EXTEND_TIMEOUT_USEC={int(EXTEND_S * 1e6)}")
+            self._send(f"STATUS={self._what}", f"EXTEND_TIMEOUT_USEC={int(EXTEND_S * 1e6)}")
 
 
 FIRST_FD: Final = 3  # SD_LISTEN_FDS_START

@@ -33,8 +33,7 @@ from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.map_directory import MapDirectory, is_served_whole, open_map
 from shmmap.origin.map_layout import absolute_path
 from shmmap.origin.map_report import LINK_NAME, read_report
-from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.processes.start_child import how_ended, start_child
+from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 
 __all__ = ["DividedCloud", "find_origin"]
 

@@ -11,7 +11,7 @@ import time
 from itertools import islice
 from typing import Final
 
-from shmmap.daemon.host.groups import account_name
+from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.finding import Finding, fail, ok, warn
 from shmmap.doctor.patient import Patient
 from shmmap.doctor.verdicts import outage_so_far

@@ -122,12 +122,12 @@ def check_prefetching(patient: Patient) -> Finding:
             "see to its disk or network; `shmmap tail` says why loads fail",
         )
     outage_s = count.get("last_outage_ns", 0) * 1e-9
-    if misses and outage_s > count.get("ride_out_ns", 0) * 1e-9:
+    if misses and outage_s > count.get("outage_tolerance_ns", 0) * 1e-9:
         return warn(
             name,
             f"{waited}; the map's storage was out of reach for {format_duration(outage_s)}, longer than"
-            " --ride-out",
-            f"raise --ride-out ({math.ceil(outage_s)})",
+            " --outage-tolerance",
+            f"raise --outage-tolerance ({math.ceil(outage_s)})",
         )
     asked = count.get("hits_10min", 0) + count.get("misses_10min", 0)
     if misses <= MAX_MISS_SHARE * asked:

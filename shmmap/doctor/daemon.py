@@ -10,8 +10,8 @@ import resource
 import time
 from typing import Final
 
-from shmmap.daemon.host.groups import account_name
 from shmmap.daemon.pins.probe import probe_pins
+from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient, answering_at
 from shmmap.errors import CannotStart, ShmmapError

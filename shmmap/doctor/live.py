@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
-from shmmap.daemon.host.groups import account_name
+from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.access import drop_ins, group_name, groups_of
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.memory import mount_of

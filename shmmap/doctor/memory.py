@@ -9,8 +9,8 @@ import stat
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
-from shmmap.daemon.host.groups import account_name
 from shmmap.daemon.host.memory import room_in_group
+from shmmap.daemon.prerequisites import account_name
 from shmmap.disk_budget import OBJECTS, DiskBudget, why_not_private
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Machine, Patient

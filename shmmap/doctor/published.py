@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping
 from typing import Final
 
-from shmmap.daemon.host.groups import account_name
+from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.finding import Finding, fail, ok, skip, warn
 from shmmap.doctor.patient import Patient
 from shmmap.doctor.signed_map import refused_offer

@@ -19,8 +19,7 @@ import msgspec
 
 from shmmap.errors import InternalError
 from shmmap.layers.sources import Neighbour
-from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.processes.start_child import how_ended, start_child
+from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_child
 from shmmap.segment.version import Source
 
 __all__ = [

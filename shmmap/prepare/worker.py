@@ -24,7 +24,7 @@ from shmmap.layers.sources import FILES, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare.task_pool import CellDone, CellTask, LayerDone, Ready, decode_task, encode
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.version import Source
 
 __all__ = ["CellPoints", "main"]

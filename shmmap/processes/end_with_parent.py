@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that lives no longer than the one it works for.
+"""A process that ends with the one it works for.
 
 ``python -m shmmap.processes.end_with_parent PARENT COMMAND...`` runs a command that gets SIGTERM when process
 PARENT ends, however it ends.

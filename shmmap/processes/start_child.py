@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting a child: a process of its own or a fork of this one, with a channel of packets to it."""
+"""Starting a child: a process of its own or a fork of this one, with a channel of packets to it.
+
+Packets are received into one buffer that is there already: `socket.recv_fds` makes a new one of the largest
+packet's size for each, half a mebibyte that the kernel maps, and unmaps again.
+"""
 
 from __future__ import annotations
 
+import array
 import contextlib
 import os
 import resource
@@ -13,11 +18,23 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from typing import NoReturn
+from typing import Final, NoReturn
 
-from shmmap.processes.packets import MAX_PACKET_BYTES
+__all__ = [
+    "MAX_PACKET_BYTES",
+    "ForkedProcess",
+    "channel",
+    "fork_child",
+    "how_ended",
+    "packet_buffer",
+    "receive_packet",
+    "start_child",
+]
 
-__all__ = ["ForkedProcess", "channel", "fork_child", "how_ended", "start_child"]
+MAX_PACKET_BYTES: Final = 1 << 19
+"""A job may name its cell and 65 neighbours by paths of 4095 bytes each."""
+
+_ONE_DESCRIPTOR: Final = socket.CMSG_LEN(array.array("i").itemsize)
 
 
 def channel() -> tuple[socket.socket, socket.socket]:
@@ -26,6 +43,40 @@ def channel() -> tuple[socket.socket, socket.socket]:
     for end in (ours, theirs):
         end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, MAX_PACKET_BYTES)
     return ours, theirs
+
+
+def packet_buffer() -> bytearray:
+    """Return a buffer that takes the largest packet; what was never written to costs no memory."""
+    return bytearray(MAX_PACKET_BYTES)
+
+
+def receive_packet(channel: socket.socket, buffer: bytearray, *, wait: bool = True) -> tuple[memoryview, int]:
+    """Receive one packet, and the descriptor that came with it.
+
+    Parameters
+    ----------
+    wait
+        False: `BlockingIOError` where there is none, whatever else the channel waits for.
+
+    Returns
+    -------
+    data
+        The packet, valid until the next one is received into ``buffer``; empty when the other end is closed.
+    fd
+        The descriptor, closed on exec; -1 for none.
+
+    Raises
+    ------
+    OSError
+        As `socket.socket.recvmsg`.
+    """
+    flags = socket.MSG_CMSG_CLOEXEC if wait else socket.MSG_CMSG_CLOEXEC | socket.MSG_DONTWAIT
+    count, control, _flags, _address = channel.recvmsg_into([buffer], _ONE_DESCRIPTOR, flags)
+    fd = -1
+    for level, kind, data in control:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS) and len(data) >= 4:
+            (fd,) = array.array("i", data[:4])
+    return memoryview(buffer)[:count], fd
 
 
 def start_child(
@@ -41,7 +92,7 @@ def start_child(
     module
         It has the kernel end it with its parent, see `shmmap.processes.end_with_parent`.
     *arguments
-        What else it is told.
+        Further arguments.
     new_session
         Whether keys pressed at the parent's terminal are kept from it.
 
@@ -79,12 +130,12 @@ class ForkedProcess:
         self.pid = pid
 
     def kill(self) -> None:
-        """End it."""
+        """Kill it."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
     def wait(self, timeout: float) -> int:
-        """Return its exit code; `subprocess.TimeoutExpired` if it has not ended in so many seconds."""
+        """Return its exit code; `subprocess.TimeoutExpired` if it has not ended in time."""
         pidfd = os.pidfd_open(self.pid)
         try:
             if not select.select([pidfd], [], [], timeout)[0]:
@@ -158,7 +209,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 
 def how_ended(code: int) -> str:
-    """What a process's exit code says, for people."""
+    """Describe a process's exit code for people."""
     if code >= 0:
         return f"exit code {code}"
     try:

@@ -23,10 +23,9 @@ import msgspec
 from shmmap.errors import InternalError, MapDataError, ShmmapError
 from shmmap.layers.build import make_layer
 from shmmap.layers.contract import Box
-from shmmap.layers.sources import CellJob
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
-from shmmap.layers.sources import FILES, CellJob, CellSource, SourceReader
+from shmmap.layers.sources import FILES, CellJob, CellSource, Files, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.origin.remote.opened_store import open_store
 from shmmap.origin.remote.published_index import MILLIMETRES
@@ -42,7 +41,7 @@ from shmmap.origin.remote.store import Store
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.publishing.messages import (
     CellSent,
     KnownObjects,

@@ -171,7 +171,7 @@ COUNTERS: Final = (
         "What keeps cells from being fetched ahead: 0 nothing, 1 their share is full, 2 the budget is",
     ),
     Counter(
-        "ride_out_ns", "gauge", "ns", "For so long the map's files may be out of reach unnoticed (setting)"
+        "outage_tolerance_ns", "gauge", "ns", "Outage of the map's storage that prefetching bridges (setting)"
     ),
     Counter("origin_out", "gauge", "", "1 while no load succeeds: the map's files are out of reach"),
     Counter("origin_outages", "counter", "", "Times that no load succeeded"),

@@ -134,14 +134,14 @@ class StatisticsWriter:
         Access of the segment; ``gid`` -1 leaves the group alone.
     starting
         The daemon does not listen yet: the gauge of that name is 1 until it is set to 0.
+    reserve
+        Asked with a number of bytes before the segment grows (64 KiB at a time); where it answers
+        False, the rows that found no room are counted in ``rows_missing`` and tried again later.
 
     Attributes
     ----------
     values : dict of int
         Counters by name (`shmmap.statistics.counters`); may be changed in place.
-    reserve : callable
-        Asked with a number of bytes before the segment grows (64 KiB at a time); where it answers
-        False, the rows that found no room are counted in ``rows_missing`` and tried again later.
 
     Raises
     ------
@@ -160,10 +160,11 @@ class StatisticsWriter:
         mode: int = 0o400,
         gid: int = -1,
         starting: bool = False,
+        reserve: Callable[[int], bool] = _always,
     ) -> None:
         self.values: dict[str, int] = dict.fromkeys(COUNTER_NAMES, 0)
         self.values["starting"] = int(starting)
-        self.reserve: Callable[[int], bool] = _always
+        self._reserve = reserve
         self.name = statistics_name(instance)
         self._instance = instance
         self._directory = directory
@@ -396,7 +397,7 @@ class StatisticsWriter:
 
     def _allocate(self, start: int, nbytes: int) -> bool:
         """Have memory where nothing is yet, if the budget and the file system allow."""
-        if not self.reserve(nbytes):
+        if not self._reserve(nbytes):
             return False
         try:
             os.posix_fallocate(self._fd, start, nbytes)

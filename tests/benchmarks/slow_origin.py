@@ -169,7 +169,7 @@ def beside(client: shmmap.Client, over: threading.Event, run: Run) -> None:
 def drive(origin: Origin, kind: str, args: argparse.Namespace) -> Run:
     """One daemon, its vehicle, and a client beside it."""
     share = "0" if kind == "nothing ahead" else "0.5"
-    options = [*origin.options, "--budget", "256M", "--ride-out", str(args.ride_out)]
+    options = [*origin.options, "--budget", "256M", "--outage-tolerance", str(args.outage_tolerance)]
     one = DaemonProcess(origin.map_path, *options, "--prefetch-share", share, environment=origin.environment)
     run, over = Run(), threading.Event()
     with ExitStack() as stack:
@@ -207,7 +207,7 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument("--bucket", action="store_true", help="an S3 server behind a slow link")
     parser.add_argument("--speed", type=float, default=12.0, help="of the vehicle, m/s")
-    parser.add_argument("--ride-out", type=float, default=10.0, help="the daemon's setting")
+    parser.add_argument("--outage-tolerance", type=float, default=10.0, help="the daemon's setting")
     parser.add_argument("--only", choices=KINDS, help="one of the three")
     args = parser.parse_args()
     if args.seconds * args.speed > 4 * 2400.0:

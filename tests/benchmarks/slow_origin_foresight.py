@@ -101,12 +101,12 @@ class Truth(Nothing):
     def __init__(
         self,
         is_absent: IsAbsent,
-        ride_out_s: float,
+        outage_tolerance_s: float,
         future: tuple[NDArray[np.float64], NDArray[np.intp]],
     ) -> None:
         super().__init__()
         self._is_absent = is_absent
-        self._policy = Prefetch(is_absent, ride_out_s)
+        self._policy = Prefetch(is_absent, outage_tolerance_s)
         self._policy.health = self.health
         self._times_s, self._cells = future
 
@@ -130,9 +130,9 @@ class Truth(Nothing):
 class Policy(Nothing):
     """The daemon's own."""
 
-    def __init__(self, is_absent: IsAbsent, ride_out_s: float, motion: Motion, area: Circle) -> None:
+    def __init__(self, is_absent: IsAbsent, outage_tolerance_s: float, motion: Motion, area: Circle) -> None:
         super().__init__()
-        self._prefetch = Prefetch(is_absent, ride_out_s)
+        self._prefetch = Prefetch(is_absent, outage_tolerance_s)
         self._prefetch.health = self.health
         self._way = WayAhead(motion, area, ("points",))
         self._prefetch.ways["client"] = self._way

@@ -59,7 +59,7 @@ class Setting:
     """
 
     row: str
-    ride_out_s: float = 10.0
+    outage_tolerance_s: float = 10.0
     radius_m: float = 200.0
     step_m: float = 20.0
     loaders: int = 8
@@ -99,8 +99,10 @@ class _Simulation:
         if setting.row == "margin":
             return Margin(self.is_absent)
         if setting.row == "oracle":
-            return Truth(self.is_absent, setting.ride_out_s, self._future())
-        return Policy(self.is_absent, setting.ride_out_s, self.motion, self._area(*self.drive.at(0.0)))
+            return Truth(self.is_absent, setting.outage_tolerance_s, self._future())
+        return Policy(
+            self.is_absent, setting.outage_tolerance_s, self.motion, self._area(*self.drive.at(0.0))
+        )
 
     def _area(self, x: float, y: float) -> Circle:
         return Circle(x, y, self.setting.radius_m)
@@ -133,7 +135,7 @@ class _Simulation:
             share = travelled / float(self.drive.travelled_m[-1]) * float(self.route_m[-1])
             first, last = np.searchsorted(self.route_m, [share, share + TRAJECTORY_M])
             route = tuple(self.route[max(0, first - 1) : last + 1])
-        self.motion.told(Intent(x, y, route=route), self.now_s)
+        self.motion.update(Intent(x, y, route=route), self.now_s)
         return x, y
 
     def ask(self) -> None:

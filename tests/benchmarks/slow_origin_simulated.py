@@ -47,7 +47,7 @@ from tests.benchmarks.slow_origin_run import ROWS, Setting, simulate
 
 MEANS_S = (0.05, 0.15, 0.4)
 MEMORY_CELLS = {10.0: 1000, 60.0: 2400}
-"""By the time to be ridden out: the window has 356 cells, and what lies a minute ahead twice as many."""
+"""By the outage to be bridged, seconds: the window has 356 cells, what lies a minute ahead twice as many."""
 UTILISATION = 0.8
 
 
@@ -72,9 +72,11 @@ _held = _Held([], [])
 
 
 def setting_of(case: Case) -> Setting:
-    """Return what is told and how much memory there is; what is to be ridden out is the outage's length."""
-    ride_out_s = OUTAGES[case.outages].length_s or 10.0
-    return Setting(case.row, ride_out_s=ride_out_s, memory_cells=MEMORY_CELLS[ride_out_s])
+    """Return what is told and how much memory there is; what is to be bridged is the outage's length."""
+    outage_tolerance_s = OUTAGES[case.outages].length_s or 10.0
+    return Setting(
+        case.row, outage_tolerance_s=outage_tolerance_s, memory_cells=MEMORY_CELLS[outage_tolerance_s]
+    )
 
 
 def counts_of(case: Case) -> Counts:

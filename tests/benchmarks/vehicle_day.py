@@ -7,7 +7,7 @@ The map is 20 km wide, of cells of 20 m with about 40 000 points; its objects ar
 (`tests.support.made_map`).  A vehicle drives through a city (`city_drive`: 40 km, red lights, at most 15 m/s)
 and asks for a circle of 200 m every 20 m.  Two daemons: one gets only the vehicle's positions, one also its
 route (the next kilometres of it).  Each has 2 GiB of memory for cells and 8 GiB of disk, empty at the start,
-and bridges outages of 20 s (`--ride-out`).  The link: an answer takes a log-normal time (mean 0.2 s,
+and bridges outages of 20 s (`--outage-tolerance`).  The link: an answer takes a log-normal time (mean 0.2 s,
 sigma 0.8), all share 100 Mbit/s, and by chance, every four minutes on average, nothing passes for 2 to 20 s.
 
 The hour is driven in ``--minutes``: the vehicle is 60 / minutes times as fast, the link as much wider, and
@@ -50,7 +50,7 @@ POINTS: Final = 40_000
 RADIUS_M: Final = 200.0
 STEP_M: Final = 20.0
 LEAVE_OUT_S: Final = 30.0
-RIDE_OUT_S: Final = 20.0
+OUTAGE_TOLERANCE_S: Final = 20.0
 HOUR_S: Final = 3600.0
 BLOCKS: Final = 120
 STRETCH_M: Final = 1000.0
@@ -142,7 +142,7 @@ def outages(seed: int, factor: float, length_s: float) -> list[tuple[float, floa
     found: list[tuple[float, float]] = []
     at_s = LEAVE_OUT_S
     while (at_s := at_s + float(rng.exponential(240.0 / factor))) < length_s:
-        out_s = float(np.exp(rng.uniform(np.log(2.0), np.log(RIDE_OUT_S))))
+        out_s = float(np.exp(rng.uniform(np.log(2.0), np.log(OUTAGE_TOLERANCE_S))))
         found.append((at_s, at_s + out_s))
         at_s += out_s
     return found
@@ -214,7 +214,7 @@ def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> 
         served = stack.enter_context(serve_made_map(CELLS, POINTS))
         plan = Plan(served.port, args.mbit * factor, 0.0, args.mean, args.seed)
         link = stack.enter_context(slow_link(plan))
-        options = ["--budget", "2G", "--cache-size", "8G", "--ride-out", str(RIDE_OUT_S)]
+        options = ["--budget", "2G", "--cache-size", "8G", "--outage-tolerance", str(OUTAGE_TOLERANCE_S)]
         cache = folder / kind
         one = DaemonProcess(link.endpoint, *options, "--workers", "2", "--cache-dir", str(cache))
         stack.enter_context(one)

@@ -237,7 +237,7 @@ def test_another_account_is_told_what_it_cannot_see(
         "from shmmap.cli.entry import main\n"
         "import shmmap.cli.verbs.doctor, shmmap.doctor.checks, shmmap.client.client\n"
         "import shmmap.client.discovery\n"
-        "import shmmap.client.event_stream, shmmap.daemon.config_file, msgspec, shmmap.service.program\n"
+        "import shmmap.client.event_stream, shmmap.daemon.config, msgspec, shmmap.service.program\n"
         f"os.setgroups([]); os.setgid({STRANGER}); os.setuid({STRANGER})\n"
         "sys.exit(main(sys.argv[1:]))"
     )

@@ -88,10 +88,10 @@ def test_a_drive_through_a_time_without_the_files(
     with MapWindow(one.endpoint, 6.0, name="driver") as window:
         assert window.move_to(-150, 0, vx=5.0, route=EAST, wait=TIMEOUT_S).complete
         fetched, waiting = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}, Deadline()
-        while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --ride-out
+        while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --outage-tolerance
             pass
         told = shmmap.json("status")["ahead"]
-        assert (told["ride_out_s"], told["prefetch_started"] >= len(fetched)) == (10.0, True)
+        assert (told["outage_tolerance_s"], told["prefetch_started"] >= len(fetched)) == (10.0, True)
         assert (told["prefetch_misses"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
         finding = prefetching(shmmap)
         assert (finding["state"], finding["fact"]) == (
@@ -121,7 +121,9 @@ def test_a_drive_through_a_time_without_the_files(
         assert "origin out of reach for" in " ".join(shmmap("top").split())
 
         x, waiting = -60, Deadline()
-        while waiting(not shmmap.json("status")["counters"]["prefetch_misses"]):  # beyond what was fetched in time
+        while waiting(
+            not shmmap.json("status")["counters"]["prefetch_misses"]
+        ):  # beyond what was fetched in time
             x = min(x + 20, 100)
             window.move_to(x, 0, vx=5.0, route=EAST)
         for stream in streams:

@@ -14,7 +14,7 @@ from shmmap.protocol.messages import Intent
 
 def of(peer: Peer | None = None, reply: Callable[[bytes], None] | None = None) -> Connection:
     """Return what a session knows of its connection: whose it is, and where replies go."""
-    return cast("Connection", SimpleNamespace(peer=peer or Peer(), session=None, reply=reply))
+    return cast("Connection", SimpleNamespace(peer=peer or Peer(), slot=0, reply=reply))
 
 
 # Clients that say where they are, without sockets
@@ -22,6 +22,5 @@ def of(peer: Peer | None = None, reply: Callable[[bytes], None] | None = None) -
 
 def says(session: Session, intent: Intent, now_s: float) -> None:
     """Do what the daemon does when a request with an intent comes."""
-    session.intent = session.told = intent
-    session.says_where, session.last_request_s = True, now_s
-    session.sessions.moved[session] = None
+    session.state_intent(intent)
+    session.last_request_s = now_s

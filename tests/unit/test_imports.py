@@ -75,8 +75,8 @@ PARTS = {
     "service": BASE | {"origin", "daemon.config"},
     "doctor": BASE | {
         "client", "formats", "origin", "protocol", "segment", "service", "statistics",
-        "daemon.config", "daemon.config_file", "daemon.config_live", "daemon.prerequisites",
-        "daemon.pins.probe", "daemon.service_manager", "daemon.host.groups", "daemon.host.memory",
+        "daemon.config", "daemon.config_live", "daemon.prerequisites",
+        "daemon.pins.probe", "daemon.service_manager", "daemon.host.memory",
     },
     "simulation": BASE | {"dividing", "formats", "origin"},
     "testing": BASE | {"formats", "layers", "origin", "segment", "protocol", "client", "statistics"},
@@ -86,17 +86,17 @@ PARTS = {
     },
     "cli": BASE | {
         "client", "demo", "dividing", "doctor", "formats", "layers", "origin", "prepare", "protocol",
-        "publishing", "segment", "service", "statistics", "daemon.config", "daemon.config_file",
+        "publishing", "segment", "service", "statistics", "daemon.config",
         "daemon.config_live", "daemon.config_table", "daemon.live.disk",
         "daemon.main", "daemon.prerequisites", "daemon.pins.probe", "daemon.service_manager",
     },
 }  # fmt: skip
 """What stands below what; a dotted name allows that module or package alone."""
 ROOMS = [
-    {"__main__"}, {"main"}, {"prerequisites"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
-    {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel"},
+    {"__main__"}, {"main"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
+    {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel", "prerequisites"},
     {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"},
-    {"config_file", "config_table", "records"},
+    {"config_table", "records"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 

@@ -32,7 +32,7 @@ def prefetch_as_json(counters: Mapping[str, int]) -> dict[str, object]:
     """Return the setting, the storage's outages and the counters of prefetching, for programs."""
     ratio = over_fetch(counters)
     return {
-        "ride_out_s": counters.get("ride_out_ns", 0) * 1e-9,
+        "outage_tolerance_s": counters.get("outage_tolerance_ns", 0) * 1e-9,
         "origin_out": bool(counters.get("origin_out", 0)),
         "last_outage_s": round(counters.get("last_outage_ns", 0) * 1e-9, 3),
         **{name: counters.get(name, 0) for name in COUNTS},

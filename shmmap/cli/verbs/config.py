@@ -73,8 +73,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run_check(args: argparse.Namespace) -> int:
     """Look for what would keep the daemon from starting."""
-    from shmmap.daemon.config import load_config
-    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.daemon.prerequisites import access_of_segments
     from shmmap.origin.remote.store import is_url
 
@@ -100,8 +99,7 @@ def run_show(args: argparse.Namespace) -> int:
     """Print every setting."""
     from dataclasses import asdict
 
-    from shmmap.daemon.config import ROWS, trace_settings
-    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.config import ROWS, installed_config_file, trace_settings
     from shmmap.daemon.config_live import LIVE_ROWS
 
     file = args.file or installed_config_file()

@@ -48,8 +48,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print every finding."""
     from shmmap.cli import daemon_address
-    from shmmap.daemon.config import load_config
-    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.doctor.checks import diagnose
     from shmmap.doctor.finding import worst
     from shmmap.doctor.patient import examine

@@ -35,7 +35,7 @@ _JSON = """\
    "beat_age_s": seconds since its last heartbeat,
    "pid", "uptime_s", "instance", "endpoint", "epoch": hex, "version", "map_path", "map_version": hex,
    "frame_id", "shm_dir", "counters": {name: integer; bytes where the name says so},
-   "ahead": {"ride_out_s": setting, "origin_out": bool: no load succeeds, "last_outage_s",
+   "ahead": {"outage_tolerance_s": setting, "origin_out": bool: no load succeeds, "last_outage_s",
              "prefetch_misses": cells that moving clients waited for, "prefetch_started",
              "prefetch_used", "prefetch_in_vain", "prefetch_overtaken", "bytes_prefetched",
              "over_fetch": bytes loaded by bytes handed out at least once, or null},

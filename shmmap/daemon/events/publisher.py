@@ -10,8 +10,7 @@ import socket
 from collections.abc import Callable
 from typing import Final
 
-from shmmap.daemon.transport.connection import Connection
-from shmmap.daemon.transport.listener import Connections, Listener
+from shmmap.daemon.transport.connection import Connection, Connections, Listener
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.statistics.writer import StatisticsWriter
 
@@ -57,14 +56,14 @@ class EventPublisher:
     def send(self, data: bytes) -> None:
         """Give an event to all who subscribed and keep up."""
         for one in self._subscribers:
-            one.tell(data, MOST_UNREAD_BYTES)
+            one.offer(data, MOST_UNREAD_BYTES)
 
     def _hear(self, connection: Connection, body: bytes, several: bool) -> None:
         if several or body not in (_SUBSCRIBE, b"\x00"):
             connection.cut("it subscribed to some of the events: only all can be subscribed to")
         elif body == _SUBSCRIBE:
             self._subscribers[connection] = None
-            connection.tell(self._beat(), MOST_UNREAD_BYTES)
+            connection.offer(self._beat(), MOST_UNREAD_BYTES)
         else:
             self._subscribers.pop(connection, None)
 

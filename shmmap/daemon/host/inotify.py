@@ -36,7 +36,7 @@ DIRECTORY: Final = 0x40000000
 OVERFLOW: Final = 0x4000
 """Events were lost: IN_Q_OVERFLOW."""
 ENDED: Final = 0x8000
-"""The watch has ended; what was watched is gone, or nobody wants to know any more: IN_IGNORED."""
+"""The watch has ended; what was watched is gone, or the watch was removed: IN_IGNORED."""
 _ONCE: Final = 0x80000000
 _EVENT: Final = struct.Struct("@iIII")
 _READ_BYTES: Final = 16 << 10
@@ -78,7 +78,7 @@ class Inotify:
         _libc.inotify_rm_watch(self.fd, watch)
 
     def read(self) -> list[Event]:
-        """Events that are there, a bounded number of them."""
+        """Return events that are there, a bounded number of them."""
         data = b""
         with contextlib.suppress(BlockingIOError):
             data = os.read(self.fd, _READ_BYTES)

@@ -64,14 +64,14 @@ _OTHERWISE: Final = "choose another --instance or --runtime-dir"
 
 
 class InstanceLock:
-    """An exclusive ``flock`` on a file, held for the daemon's life and removed with it.
+    """An exclusive ``flock`` on a file, held while the daemon runs and removed with it.
 
     Parameters
     ----------
     path
         It says the process id, for the message to a second daemon.
     check
-        Raises what else hinders the daemon, once the lock is held and before the file is changed.
+        Raises an error if anything else hinders the daemon; called with the lock held, the file unchanged.
 
     Raises
     ------
@@ -104,7 +104,7 @@ class InstanceLock:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             except OSError as error:
                 raise name_taken("the lock file", path, error, otherwise=_OTHERWISE) from error
-            if os.fstat(fd).st_uid not in (os.geteuid(), 0):  # who made it could hold it for ever
+            if os.fstat(fd).st_uid not in (os.geteuid(), 0):  # its owner could hold it without end
                 os.close(fd)
                 raise name_taken("the lock file", path, None, otherwise=_OTHERWISE)
             try:

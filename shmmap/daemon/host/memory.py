@@ -1,21 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much memory the daemon may use: shared by cells, private to each loader, limited by the control group.
 
+Mounts (proc_pid_mountinfo(5)) say where control groups are, and which file system a path is on.
+
 Shared memory counts for the control group of the process that wrote it first, and stays charged when that
 process ends.  Beyond the limit there is no error: the kernel kills.  So the limit has to be known beforehand.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from shmmap.daemon.host.mounts import mounts
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
-__all__ = ["choose_budget", "loader_bytes", "memory_limit_bytes", "out_of_memory_kills", "room_in_group"]
+__all__ = [
+    "Mount",
+    "choose_budget",
+    "file_system_of",
+    "loader_bytes",
+    "memory_limit_bytes",
+    "mounts",
+    "out_of_memory_kills",
+    "room_in_group",
+]
 
 DEFAULT_CEILING_BYTES: Final = 4 << 30
 RESERVE_BYTES: Final = 256 << 20
@@ -70,7 +83,7 @@ def choose_budget(
     asked_bytes
         The explicit budget; 0 for the default.
     ours_bytes
-        What an earlier life of the daemon left in the directory: it is ours to keep or to free.
+        What a previous run of the daemon left in the directory: it is ours to keep or to free.
     beside_bytes
         What the default budget leaves of the file system to live maps.
     limit_bytes
@@ -182,3 +195,29 @@ def _lines(path: Path) -> list[str]:
         return path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:
         return []
+
+
+class Mount(NamedTuple):
+    """A mount: the type of its file system, the directory of it that is mounted, where, and its options."""
+
+    kind: str
+    root: str
+    point: str
+    options: list[str]
+
+
+def mounts(path: str = "/proc/self/mountinfo") -> Iterator[Mount]:
+    """Yield every mount of a process, in the order made; none where they cannot be read."""
+    with contextlib.suppress(OSError), open(path, encoding="utf-8", errors="surrogateescape") as file:
+        for line in file:
+            before, _, after = line.partition(" - ")
+            fields, (kind, _source, options) = before.split(), after.split()[:3]
+            point = re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), fields[4])
+            yield Mount(kind, fields[3], point, options.split(","))
+
+
+def file_system_of(path: str) -> str:
+    """Return the type of the file system a path is on, empty where that is not known."""
+    below = os.path.realpath(path) + "/"
+    around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
+    return max(reversed(around), key=lambda mount: len(mount.point)).kind if around else ""

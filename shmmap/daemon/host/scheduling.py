@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a warm request does not wait for a loader: short turns for who serves, and a lower weight for loaders.
+"""How a warm request does not wait for a loader: short time slices for the loop, a lower weight for loaders.
 
-On Linux 6.12 and later a thread of the ordinary policy may say how long its turns on a core are.  One
-with shorter turns than whoever runs there is let in as soon as it wakes; with equal ones it waits
-until that turn ends, which is 1 to 3 ms, and niceness does not change that.  Measured on two cores
+On Linux 6.12 and later a thread of the ordinary policy may choose its time slice.  One with a shorter slice
+than the thread that runs on the core preempts it as soon as it wakes; with equal ones it waits
+until that slice ends, which is 1 to 3 ms, and niceness does not change that.  Measured on two cores
 while layers are built: p99 of warm requests 0.3 ms instead of 0.5 to 1.2 ms, idle 0.1 ms.  Threads and
 processes inherit it.  Older kernels do not know it: nothing changes there.
 
@@ -37,7 +37,7 @@ _ATTRIBUTES: Final = struct.Struct("=IIQiIQQQ")  # struct sched_attr, first vers
 
 
 def take_slices(nanoseconds: int) -> bool:
-    """Ask for turns of this length for the calling thread and what it starts; 0 for the usual ones.
+    """Ask for time slices of this length for the calling thread and what it starts; 0 for the usual ones.
 
     Policy and niceness stay as they are; under another policy than the ordinary one nothing is asked.
     Returns whether the kernel agreed.
@@ -53,14 +53,14 @@ def take_slices(nanoseconds: int) -> bool:
 
 
 def slice_ns() -> int:
-    """Length of the calling thread's turns as the kernel tells it; 0 where it does not."""
+    """Return the calling thread's time slice as the kernel reports it; 0 where it does not."""
     numbers = _SYSCALLS.get(platform.machine())
     if numbers is None:
         return 0
-    told = ctypes.create_string_buffer(_ATTRIBUTES.size)
-    if ctypes.CDLL(None, use_errno=True).syscall(numbers[1], 0, told, _ATTRIBUTES.size, 0) != 0:
+    found = ctypes.create_string_buffer(_ATTRIBUTES.size)
+    if ctypes.CDLL(None, use_errno=True).syscall(numbers[1], 0, found, _ATTRIBUTES.size, 0) != 0:
         return 0
-    return int(_ATTRIBUTES.unpack(told.raw)[5])
+    return int(_ATTRIBUTES.unpack(found.raw)[5])
 
 
 def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") -> bool:
@@ -78,7 +78,7 @@ def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") 
         Directory with ``autogroup`` of this process.
     """
     if os.getsid(0) != os.getpid():
-        return True  # the group is somebody else's, too
+        return True  # the group is another process's, too
     try:
         fd = os.open(f"{proc}/autogroup", os.O_WRONLY | os.O_CLOEXEC)
         try:

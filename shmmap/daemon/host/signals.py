@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals: what each means to the daemon, and how it hears them while it starts and while it serves."""
+"""Signals: what each means to the daemon, and how it takes them while it starts and while it serves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = [
 
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1
-"""Ends the daemon and leaves the segments to its next life: see `shmmap.daemon.main`."""
+"""Ends the daemon and leaves the segments to the next run: see `shmmap.daemon.main`."""
 RELOAD_SIGNAL: Final = signal.SIGHUP
 _libc: Final = ctypes.CDLL(None)  # found now: it must be quick when signals pile up
 _ALL: Final = (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL)
@@ -68,7 +68,7 @@ class StartSignals:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep a stop for later while something takes a name and has nobody yet to take it away."""
+        """Hold a stop back while something takes a name that nothing would remove yet."""
         self._held = True
         try:
             yield
@@ -83,7 +83,7 @@ class StartSignals:
 
 
 class ServingSignals:
-    """Signals while the daemon serves: its loop hears them through a descriptor, handlers do nothing.
+    """Signals while the daemon serves: its loop reads them from a descriptor, handlers do nothing.
 
     Attributes
     ----------
@@ -113,14 +113,14 @@ class ServingSignals:
         return [signal.Signals(number) for number in sorted(numbers, key=lambda n: n != KEEP_SIGNAL)]
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop reading signals."""
         signal.set_wakeup_fd(self._before)
         self._ours.close()
         self._theirs.close()
 
 
 def ignore_signals() -> None:
-    """From here on nothing stops the process but its own end."""
+    """Ignore signals that stop the daemon: from here on it ends by itself."""
     numbers = (*STOP_SIGNALS, KEEP_SIGNAL)
     for number in numbers:  # the kernel first: Python complains of one that comes while its handler changes
         _libc.signal(number, 1)  # SIG_IGN

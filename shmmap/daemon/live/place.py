@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmmap.daemon.config_live import LiveSettings, live_directory
-from shmmap.daemon.host.mounts import mounts
+from shmmap.daemon.host.memory import mounts
 from shmmap.daemon.live.messages import Begin
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory

@@ -25,8 +25,7 @@ from shmmap.daemon.transport.sessions import Session
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, LiveInterrupted, ShmmapError, error_from_wire
 from shmmap.logfmt import log
-from shmmap.processes.packets import packet_buffer, receive_packet
-from shmmap.processes.start_child import start_child
+from shmmap.processes.start_child import packet_buffer, receive_packet, start_child
 from shmmap.protocol.codec import encode
 from shmmap.protocol.live import LiveList, LiveListed, LiveMapRow, LiveRequest
 

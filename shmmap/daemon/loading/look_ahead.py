@@ -301,7 +301,7 @@ class Prefetch:
     ----------
     is_absent
         Whether a layer of a cell, by index, is neither in memory nor being loaded, and may be tried.
-    ride_out_s
+    outage_tolerance_s
         For so long the origin may be away without anybody's noticing.
 
     Attributes
@@ -314,9 +314,9 @@ class Prefetch:
         Whether asking again at once may bring a wish, though the last time brought none.
     """
 
-    def __init__(self, is_absent: Callable[[int, str], bool], ride_out_s: float) -> None:
+    def __init__(self, is_absent: Callable[[int, str], bool], outage_tolerance_s: float) -> None:
         self._is_absent = is_absent
-        self._ride_out_s = ride_out_s
+        self._outage_tolerance_s = outage_tolerance_s
         self._catalogue: CatalogueView | None = None
         self.ways: dict[Hashable, WayAhead] = {}
         self.health = OriginHealth()
@@ -332,8 +332,8 @@ class Prefetch:
     def look_ahead(self) -> LookAhead:
         """How far ahead is looked: what comes into reach later is not wished for yet."""
         load_s = SLOW_LOADS * self.health.slow_s + SLACK_S
-        way_s = load_s + SPARE * self._ride_out_s + PASS_S + AFTER_S
-        straight_s = load_s + min(self._ride_out_s, self._away_s, GUESSED_S)
+        way_s = load_s + SPARE * self._outage_tolerance_s + PASS_S + AFTER_S
+        straight_s = load_s + min(self._outage_tolerance_s, self._away_s, GUESSED_S)
         return LookAhead(way_s, straight_s, load_s)
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:

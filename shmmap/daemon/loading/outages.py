@@ -85,7 +85,7 @@ class DiskAhead:
     def __init__(self, cache: CellCache, scheduler: Scheduler, keeper: ObjectKeeper) -> None:
         self._cache, self._scheduler, self._keeper = cache, scheduler, keeper
         prefetcher = scheduler.prefetcher
-        self._prefetch = Prefetch(self._is_lacking, prefetcher.ride_out_s)
+        self._prefetch = Prefetch(self._is_lacking, prefetcher.outage_tolerance_s)
         self._prefetch.health = prefetcher.prefetch.health
         self._map_version = 0
         self._rest: dict[tuple[int, str], float] = {}  # until when a layer of a cell is not looked at again

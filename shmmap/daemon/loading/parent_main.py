@@ -28,7 +28,7 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
 from shmmap.kernel_cache import compiled_mark
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import receive_packet
+from shmmap.processes.start_child import receive_packet
 from shmmap.version import __version__
 
 __all__ = [

@@ -19,7 +19,7 @@ from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch, WayAhead
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
-from shmmap.daemon.transport.sessions import MOVES_AT_ONCE, Session
+from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
 
 __all__ = ["Prefetcher"]
 
@@ -48,7 +48,7 @@ class Prefetcher:
     ----------
     share
         Part of the budget that may be taken by what nobody has asked for yet; 0: nothing is fetched ahead.
-    ride_out_s
+    outage_tolerance_s
         See `Prefetch`.
 
     Attributes
@@ -61,14 +61,14 @@ class Prefetcher:
     """
 
     def __init__(
-        self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, ride_out_s: float
+        self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, outage_tolerance_s: float
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
         self._sessions = cache.reclaimer.sessions
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MOST_COLD)
         self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MOST_ENDED)
-        self.share, self.ride_out_s = share, ride_out_s
-        self.prefetch = Prefetch(self._is_absent, ride_out_s)
+        self.share, self.outage_tolerance_s = share, outage_tolerance_s
+        self.prefetch = Prefetch(self._is_absent, outage_tolerance_s)
         self._now_s = 0.0
         self._next_s = -math.inf
         self._full_until_s = self._followed_s = self._answered_s = -math.inf
@@ -113,7 +113,7 @@ class Prefetcher:
     @property
     def next_s(self) -> float:
         """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
-        many = len(self._sessions.moved) > MOVES_AT_ONCE
+        many = len(self._sessions.moved) > MOVES_PER_STEP
         if self.cold or many or (self.ended and self.prefetch.ways):
             return -math.inf
         next_s = self._next_s if self.prefetch.ways else math.inf

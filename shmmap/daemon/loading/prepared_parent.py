@@ -12,8 +12,7 @@ from typing import Final, TypeAlias
 
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.logfmt import log
-from shmmap.processes.packets import receive_packet
-from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, start_child
+from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, receive_packet, start_child
 from shmmap.version import __version__
 
 __all__ = ["RESTART", "Early", "PreparedParent", "fork_early"]

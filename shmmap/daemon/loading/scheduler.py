@@ -89,7 +89,7 @@ class Scheduler:
     ----------
     clock
         The serving loop's clock, seconds.
-    prefetch_share, ride_out_s
+    prefetch_share, outage_tolerance_s
         See `Prefetcher`.
 
     Attributes
@@ -113,7 +113,7 @@ class Scheduler:
         *,
         clock: Callable[[], float],
         prefetch_share: float = 0.0,
-        ride_out_s: float = 0.0,
+        outage_tolerance_s: float = 0.0,
     ) -> None:
         self._cache, self._map_switch, self._statistics = cache, map_switch, cache.statistics
         self.loads = Loads(cache.ledger)
@@ -124,7 +124,9 @@ class Scheduler:
         self._doubtful: deque[Key] = deque()
         self._for_pages: dict[Load, None] = {}  # that wait until it is known which cells they look into
         self._job_numbers, self.unfinished = 0, False
-        self.prefetcher = Prefetcher(cache, self.loads, pool, share=prefetch_share, ride_out_s=ride_out_s)
+        self.prefetcher = Prefetcher(
+            cache, self.loads, pool, share=prefetch_share, outage_tolerance_s=outage_tolerance_s
+        )
         self.room = Room(cache, self.loads, pool, self.prefetcher)
         self.misplaced = MisplacedCells(cache)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)

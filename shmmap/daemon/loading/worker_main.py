@@ -33,7 +33,7 @@ from shmmap.layers.sources import FILES, CellJob, CellSource, Files, SourceReade
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
 from shmmap.origin.map_layout import OpenedDirectories
-from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import packet_buffer, receive_packet
 from shmmap.quantities import format_bytes
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import verify_file

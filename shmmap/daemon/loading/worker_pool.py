@@ -24,8 +24,7 @@ from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
-from shmmap.processes.packets import packet_buffer, receive_packet
-from shmmap.processes.start_child import channel
+from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.segment.directory import ShmDirectory
 
 __all__ = ["NOT_OPENED", "Opened", "Work", "Worker", "WorkerPool"]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading the map's catalogue again, beside the serving loop.
 
-Looking at every file of a large map takes seconds, so it happens in a thread; the loop is told
-through an event descriptor and then changes over in one step; what has changed is found out in the
+Looking at every file of a large map takes seconds, so it happens in a thread; an event descriptor
+wakes the loop, which then changes over in one step; what has changed is found out in the
 thread, too.  A state whose list of cells comes in pages may be held back until those have come that are
 needed; one that is loaded meanwhile takes its place.  Requests for another reload while
 one runs are answered by the next one, which sees everything that they could mean.
@@ -95,13 +95,13 @@ class Reloader:
             self._result = error
         except OSError as error:
             self._result = ShmmapError(f"{self._origin.path}: {error}")
-        except Exception as error:  # noqa: BLE001  else nobody would ever hear of this reload or a later one
+        except Exception as error:  # noqa: BLE001  else this reload and later ones would never be answered
             log.exception("reload failed", map=self._origin.path, cause="a defect in shmmap")
             self._result = InternalError(f"{self._origin.path}: {type(error).__name__}: {error}")
         os.eventfd_write(self.fd, 1)
 
     def collect(self, apply: Apply, failed: Callable[[ShmmapError], None]) -> None:
-        """Apply a finished load, answer who asked for it, start the next if somebody asked since."""
+        """Apply a finished load, answer its callers, start the next if one was asked for since."""
         os.eventfd_read(self.fd)
         if self._thread is not None:
             self._thread.join()
@@ -120,7 +120,7 @@ class Reloader:
             self._begin()
 
     def apply_held(self, apply: Apply) -> None:
-        """Apply what was loaded last, unless it is still held back, and answer who asked for it."""
+        """Apply what was loaded last, unless it is still held back, and answer its callers."""
         applied = apply(self._held) if self._held is not None else None
         if applied is None:
             return

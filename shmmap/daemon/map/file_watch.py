@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noticing by inotify(7) that the map's files change, so that nobody has to ask for a reload.
+"""Noticing by inotify(7) that the map's files change, so that the map is reloaded by itself.
 
-What a path names may change without anything in the directory: a link on the way, ``maps/current`` say, leads
+What a path names may change without anything in the directory: a link in it, ``maps/current`` say, leads
 somewhere else, or a directory above gets another name.  That is noticed, too.
 
 A change is acted upon once the files have been left alone for a moment, for a map is written file by
-file; however long that takes, not later than some seconds after it began.  The kernel tells only of
+file; however long that takes, not later than some seconds after it began.  The kernel reports only
 changes made on this machine: on NFS and the like, a reload has to be asked for.
 """
 
@@ -29,15 +29,15 @@ from shmmap.daemon.host.inotify import (
     SELF_MOVED,
     Inotify,
 )
-from shmmap.daemon.host.mounts import file_system_of
+from shmmap.daemon.host.memory import file_system_of
 from shmmap.errors import CannotStart
 from shmmap.logfmt import log
 
 __all__ = ["FileWatch", "directories_of"]
 
 SETTLE_S: Final = 0.5
-MOST_S: Final = 5.0
-MOST_LINKS: Final = 40
+MAX_DELAY_S: Final = 5.0
+MAX_LINKS: Final = 40
 """As many as the kernel follows."""
 LOOK_S: Final = 1.0
 """How often a directory that has vanished is looked for."""
@@ -59,7 +59,7 @@ def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
 
 
 def steps_to(path: str) -> dict[str, set[str]]:
-    """Return the real directories on the way to an absolute path, each with the links in it that lead on."""
+    """Return the real directories along an absolute path, each with the links in it that lead on."""
     steps: dict[str, set[str]] = {}
     names, here, links = path.split("/")[::-1], "/", 0
     while names:
@@ -78,7 +78,7 @@ def steps_to(path: str) -> dict[str, set[str]]:
             continue
         followed.add(name)
         links += 1
-        if links > MOST_LINKS:
+        if links > MAX_LINKS:
             break
         names += target.split("/")[::-1]
         here = "/" if target.startswith("/") else here
@@ -127,7 +127,7 @@ class FileWatch:
                     )  # fmt: skip
 
     def follow(self, directories: Iterable[str]) -> None:
-        """Watch these too, from when on that can be; watching one twice is the same as once."""
+        """Watch these too, as soon as they can be; watching one twice is the same as once."""
         for directory in directories:
             self._add(directory)
 
@@ -146,11 +146,11 @@ class FileWatch:
         return None
 
     def drain(self, now_s: float) -> None:
-        """Take note of what the kernel tells, a bounded number of events at a time."""
+        """Read what the kernel reports, a bounded number of events at a time."""
         for event in self._inotify.read():
             lost = event.mask & OVERFLOW
             if lost or event.mask & SELF_GONE or event.name in self._steps.get(event.watch, ()):
-                self._way_changed(now_s)
+                self._path_changed(now_s)
             if event.mask & ENDED:
                 self._steps.pop(event.watch, None)
             if event.watch not in self._paths:
@@ -163,8 +163,8 @@ class FileWatch:
             if not event.mask & ENDED and (event.mask & DIRECTORY or not event.mask & CREATED):
                 self._note(now_s)
 
-    def _way_changed(self, now_s: float) -> None:
-        """Another directory may have one of the paths: find out which, when it is there."""
+    def _path_changed(self, now_s: float) -> None:
+        """Watch the paths again when they are there: another directory may have one of them."""
         for watch in {**self._paths, **self._steps}:
             self._inotify.remove(watch)
         self._missing.update(self._paths.values())
@@ -179,7 +179,7 @@ class FileWatch:
         self._last_s = now_s
 
     def due(self, now_s: float) -> bool:
-        """Whether it is time to read the map again; says so once."""
+        """Return whether it is time to read the map again; True once per change."""
         if self._missing and now_s >= self._look_s:
             self._look_s = now_s + LOOK_S
             before = len(self._missing)
@@ -187,13 +187,13 @@ class FileWatch:
             if len(self._missing) < before and self._since_s is None:
                 self._note(now_s)
         since_s = self._since_s
-        if since_s is None or (now_s - self._last_s < SETTLE_S and now_s - since_s < MOST_S):
+        if since_s is None or (now_s - self._last_s < SETTLE_S and now_s - since_s < MAX_DELAY_S):
             return False
         self._since_s = None
         return True
 
     def close(self) -> None:
-        """Watch no more."""
+        """Stop watching."""
         self._inotify.close()
 
 

@@ -16,8 +16,7 @@ import msgspec
 from shmmap.daemon.map.object_keeper import ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
 from shmmap.daemon.map.published_view import PublishedView
-from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
-from shmmap.daemon.map.shard_pages import FEW_SHARDS, ShardPages
+from shmmap.daemon.map.shard_pages import FEW_SHARDS, THREADS, ShardFetcher, ShardPages
 from shmmap.errors import (
     CannotStart,
     CannotWrite,
@@ -309,7 +308,7 @@ class PublishedOrigin:
             digests = [root.shard_sha256(number) for number in range(len(root.keys))]
             self._tier.mark_index_used([bytes.fromhex(taken.current.root), *digests])
         log.info("version of the map", number=taken.version, map_version=f"{root.map_version:016x}")
-        view = PublishedView(root, taken.version, self._fetcher, known, most_bytes=self._catalogue_bytes)
+        view = PublishedView(root, taken.version, self._fetcher, known, max_bytes=self._catalogue_bytes)
         self._pages.add(view.pages)
         return view
 

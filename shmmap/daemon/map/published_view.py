@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.map.catalogue_view import Ready
-from shmmap.daemon.map.shard_fetcher import ShardFetcher
-from shmmap.daemon.map.shard_pages import ShardPages
+from shmmap.daemon.map.shard_pages import ShardFetcher, ShardPages
 from shmmap.errors import BadRequest
 from shmmap.geometry import Area
 from shmmap.layers.spec import layer_spec
@@ -61,11 +60,11 @@ class PublishedView:
     opened: Final = None
 
     def __init__(
-        self, root: Root, number: int, fetcher: ShardFetcher, known: Mapping[int, Shard], *, most_bytes: int
+        self, root: Root, number: int, fetcher: ShardFetcher, known: Mapping[int, Shard], *, max_bytes: int
     ) -> None:
         self.root = root
         self.number = number
-        self.pages: ShardPages = ShardPages(root, fetcher, known, most_bytes=most_bytes)
+        self.pages: ShardPages = ShardPages(root, fetcher, known, max_bytes=max_bytes)
         self.map_version = root.map_version
         self.id_prefix = root.id_prefix
         self.frame_id = root.frame_id
@@ -145,7 +144,7 @@ class PublishedView:
         return page.shard.id(row, self.id_prefix)
 
     def ids(self, indices: Indices) -> list[str]:
-        """Ids of several cells."""
+        """Return ids of cells."""
         return [self.id(index) for index in indices.tolist()]
 
     def box(self, index: int) -> tuple[float, float, float, float]:

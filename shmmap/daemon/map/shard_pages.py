@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shards of a published map as pages of its list of cells: which are here, and what they say."""
+"""The shards of a published map: fetched by threads, and seen as pages of its list of cells."""
 
 from __future__ import annotations
 
 import bisect
 import contextlib
+import heapq
 import os
+import threading
+import time
+import weakref
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -15,21 +19,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.map.catalogue_view import PageNews, Pages
-from shmmap.daemon.map.shard_fetcher import ShardFetcher
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, Offline, ShmmapError
 from shmmap.geometry import Area, distance_to_boxes
 from shmmap.large_tables import ShardedDict
-from shmmap.origin.remote.published_index import Root, Shard
+from shmmap.logfmt import log
+from shmmap.origin.remote.map_versions import read_shard_object
+from shmmap.origin.remote.published_index import Root, Shard, unpack_shard
+from shmmap.origin.remote.store import ObjectReader
 
-__all__ = ["FEW_SHARDS", "Page", "ShardPages"]
+__all__ = ["FEW_SHARDS", "THREADS", "Page", "ShardFetcher", "ShardPages"]
 
+THREADS: Final = 8
+END_S: Final = 0.5
+"""How long the end of the daemon waits for a thread that waits for the origin."""
 FEW_SHARDS: Final = 16
 """Up to this number, all shards are fetched at the start, and kept."""
 NAME_BYTES: Final = 150
 """What a cell's name takes in memory, and its entry in the table of names."""
 NAME_TABLES: Final = 64
 """Names are shared out among many dicts: one of all would stop the loop whenever it grows."""
-BACKGROUND_AT_ONCE: Final = 2
+BACKGROUND_FETCHES: Final = 2
 """Pages that nothing needs yet are fetched few at a time, so that pages an area needs have most of the link.
 With 8 at a time over 20 Mbit/s and 50 ms, those took twice as long."""
 BACKGROUND: Final = 1e15
@@ -85,6 +94,95 @@ def _shared_out(page: Page) -> list[dict[bytes, int]]:
     return tables
 
 
+class ShardFetcher:
+    """Fetches shards of published maps in a few threads, the most urgent first; verified and decoded.
+
+    Parameters
+    ----------
+    failed
+        Called, in a thread, when something could not be had.
+    """
+
+    def __init__(self, objects: ObjectReader, failed: Callable[[], None]) -> None:
+        self._objects = objects
+        self._failed = failed
+        self._condition = threading.Condition()
+        self._wanted: list[tuple[float, int, weakref.ref[ShardPages], Root, int]] = []
+        self._under_way: set[tuple[int, int]] = set()
+        self._threads: list[threading.Thread] = []
+        self._idle = 0
+        self._count = 0
+        self._closed = False
+
+    def want(self, pages: ShardPages, root: Root, number: int, priority: float) -> None:
+        """Have a shard delivered, unless it is being fetched; those with the lowest priority come first.
+
+        One that is wanted again with a lower priority may be delivered twice.
+        """
+        with self._condition:
+            if (id(pages), number) in self._under_way:
+                return
+            self._count += 1
+            heapq.heappush(self._wanted, (priority, self._count, weakref.ref(pages), root, number))
+            self._condition.notify()
+            if self._idle < len(self._wanted) and len(self._threads) < THREADS:
+                thread = threading.Thread(target=self._run, name="shards", daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError:  # there are as many threads as there may be
+                    return
+                self._threads.append(thread)
+
+    def _run(self) -> None:
+        while (taken := self._take()) is not None:
+            reference, root, number = taken
+            pages = reference()
+            if pages is None:  # its version is no longer served
+                continue
+            key = id(pages), number
+            with self._condition:
+                if key in self._under_way:
+                    continue
+                self._under_way.add(key)
+            shard = self._fetch(root, number)
+            with self._condition:
+                self._under_way.discard(key)
+            pages.deliver(number, shard)
+            del pages
+            if shard is None:
+                self._failed()
+
+    def _take(self) -> tuple[weakref.ref[ShardPages], Root, int] | None:
+        with self._condition:
+            self._idle += 1
+            while not self._wanted and not self._closed:
+                self._condition.wait()
+            self._idle -= 1
+            return None if self._closed else heapq.heappop(self._wanted)[2:]
+
+    def _fetch(self, root: Root, number: int) -> Shard | None:
+        name = f"shard {root.keys[number].tolist()}"
+        try:
+            return unpack_shard(read_shard_object(self._objects, root, number), root, number)
+        except Offline:
+            pass  # `OriginLink` says so, once
+        except ShmmapError as error:
+            log.error("part of the list of cells cannot be used", part=name, reason=error)
+        except Exception:  # noqa: BLE001  else it would never be tried again
+            log.exception("part of the list of cells cannot be used", part=name, cause="a defect in shmmap")
+        return None
+
+    def close(self) -> bool:
+        """End the threads; False if one still waits for the origin."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify_all()
+        until_s = time.monotonic() + END_S
+        for thread in self._threads:
+            thread.join(max(0.0, until_s - time.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)
+
+
 class ShardPages:
     """Pages of one version of a map; see `shmmap.daemon.map.catalogue_view.Pages`.
 
@@ -94,17 +192,17 @@ class ShardPages:
     ----------
     known
         Shards that are here from the beginning, by number.
-    most_bytes
+    max_bytes
         What pages may take of memory; those of a map of few shards are all kept.
     """
 
     def __init__(
-        self, root: Root, fetcher: ShardFetcher, known: Mapping[int, Shard], *, most_bytes: int
+        self, root: Root, fetcher: ShardFetcher, known: Mapping[int, Shard], *, max_bytes: int
     ) -> None:
         self.root = root
         self._fetcher = fetcher
         self._first: list[int] = root.first_indices.tolist()
-        self._most_bytes = most_bytes
+        self._max_bytes = max_bytes
         self._bytes = 0
         self._here: dict[int, Page] = {}  # least recently needed first
         self._wanted: dict[int, float] = {}
@@ -295,7 +393,7 @@ class ShardPages:
 
     def spare(self) -> int | None:
         """Return the page that was needed least recently, if they take more memory than they may."""
-        if self._bytes <= self._most_bytes or len(self) <= FEW_SHARDS:
+        if self._bytes <= self._max_bytes or len(self) <= FEW_SHARDS:
             return None
         return next(iter(self._here), None)
 
@@ -335,11 +433,11 @@ class ShardPages:
         None while others are needed.
         """
         is_needed = any(priority < BACKGROUND for priority in self._wanted.values())
-        if self._lost or is_needed or len(self._wanted) >= BACKGROUND_AT_ONCE or self.complete:
+        if self._lost or is_needed or len(self._wanted) >= BACKGROUND_FETCHES or self.complete:
             return
         counts = self.root.counts
         cell_bytes = self._bytes / self.known_cells if self.known_cells else 2.0 * NAME_BYTES
-        room = self._most_bytes - self._bytes if len(self) > FEW_SHARDS else np.inf
+        room = self._max_bytes - self._bytes if len(self) > FEW_SHARDS else np.inf
         room -= cell_bytes * sum(int(counts[number]) for number in self._wanted)
         if self._nearest is None:
             order = np.argsort(distance_to_boxes(*self._around, self._boxes), kind="stable")
@@ -353,5 +451,5 @@ class ShardPages:
                 return
             self._wanted[number] = BACKGROUND
             self._fetcher.want(self, self.root, number, BACKGROUND)
-            if len(self._wanted) >= BACKGROUND_AT_ONCE:
+            if len(self._wanted) >= BACKGROUND_FETCHES:
                 return

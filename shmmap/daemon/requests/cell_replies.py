@@ -141,7 +141,7 @@ class CellReplies:
         for number, residents in enumerate(parts(answer.residents, HELD_A_STEP)):
             if number:
                 yield
-                if session.connection.session is not session:
+                if not session.is_connected:
                     return
             session.hold(residents)
 

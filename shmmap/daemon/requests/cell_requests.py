@@ -429,5 +429,5 @@ def _note_area(session: Session, area: Area, layers: tuple[str, ...]) -> None:
     """A session asks for an area: in the middle of it is where it is, unless it says."""
     session.area, session.layers = area, layers
     if not session.says_where:
-        session.intent = session.told = messages.Intent(*area.center)
+        session.intent = session.new_intent = messages.Intent(*area.center)
     session.sessions.moved[session] = None

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from shmmap.daemon.cache.survey import Survey, Usage
-from shmmap.daemon.host.defects import Defects
+from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
@@ -19,7 +19,7 @@ from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS
 from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
-from shmmap.daemon.transport.inbox import Turn
+from shmmap.daemon.transport.inbox import WorkItem
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
 from shmmap.protocol import messages
@@ -50,23 +50,23 @@ class Dispatch:
     defects: Defects
     due: Callable[[Connection, Iterator[None]], None]
 
-    def handle(self, turn: Turn) -> Iterator[None]:
+    def handle(self, item: WorkItem) -> Iterator[None]:
         """Answer one request, or say why not; a step at a time where that takes long."""
-        data = turn.body
+        data = item.body
         request = 0
         try:
-            if turn.several_frames:
+            if item.is_multipart:
                 raise BadRequest("a request is one frame")
             message = decode_request(data)
             request = message.request
-            work = self._route(turn.connection, message, data)
+            work = self._route(item.connection, message, data)
             if work is not None:
                 yield from work
         except ShmmapError as error:
-            turn.connection.refuse(request or request_number(data), error)
+            item.connection.refuse(request or request_number(data), error)
         except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
-            self.defects.met()
-            turn.connection.refuse(request, InternalError("the daemon failed on this request"))
+            self.defects.record()
+            item.connection.refuse(request, InternalError("the daemon failed on this request"))
 
     def _route(self, connection: Connection, message: messages.Request, body: bytes) -> Iterator[None] | None:
         """Do what is asked for; what takes longer is returned."""
@@ -75,7 +75,7 @@ class Dispatch:
             entered = self.handshake.enter(connection, message, now_s)
             connection.reply(encode(self.queries.welcome(entered, message)))
             return None
-        session = connection.session
+        session = self.handshake.sessions.slots.get(connection.slot)
         if session is None:
             raise NoSession("this daemon does not know the session", hint="send hello first")
         session.requests += 1
@@ -83,9 +83,7 @@ class Dispatch:
         if isinstance(message, messages.Differential | messages.Area | messages.Selected):
             if message.intent is not None:
                 check_intent(message.intent)
-                session.intent = session.told = message.intent
-                session.says_where = True
-                session.sessions.moved[session] = None
+                session.state_intent(message.intent)
             if isinstance(message, messages.Differential):
                 return self.cells.differential(session, message)
             if isinstance(message, messages.Area):

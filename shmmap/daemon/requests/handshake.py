@@ -68,8 +68,8 @@ class Handshake:
                 f" daemon {PROTOCOL_VERSION[0]}.{PROTOCOL_VERSION[1]}",
                 hint=f"update the {older}, and restart it",
             )
-        if connection.session is not None:
-            return connection.session  # a repeated hello: its answer was late or lost
+        if (session := self.sessions.by_slot(connection.slot)) is not None:
+            return session  # a repeated hello: its answer was late or lost
         earlier = self.sessions.by_slot(message.session)
         if earlier is not None and earlier.peer == connection.peer:
             self.sessions.departed.pop(earlier.slot, None)
@@ -88,7 +88,7 @@ class Handshake:
 
     def hung_up(self, connection: Connection) -> None:
         """A connection has ended; its session ends when the kernel says that it maps nothing."""
-        if (session := connection.session) is None:
+        if (session := self.sessions.by_slot(connection.slot)) is None:
             return
         session.disconnect()
         self.cells.forget(session)

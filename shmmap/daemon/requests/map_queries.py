@@ -152,7 +152,7 @@ class MapQueries:
 
     def _answer_waiting(self, one: _Waiting, *, over: bool) -> None:
         connection = one.session.connection
-        if connection.session is not one.session:
+        if not one.session.is_connected:
             return
         try:
             page = self.page(one.message)

@@ -164,7 +164,7 @@ class PendingRequest:
             Meanwhile the session has ended.
         """
         yield
-        if self.session.connection.session is not self.session:
+        if not self.session.is_connected:
             raise NoSession("the session ended before the answer was ready", hint="send hello again")
         if cache.catalogue is not self.catalogue:
             raise MapChanged

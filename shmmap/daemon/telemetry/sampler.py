@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.events.log import EventLog
@@ -22,10 +22,23 @@ from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.geometry import Area, Box, Circle
 from shmmap.protocol.rows import ClientRow, Window
-from shmmap.statistics.counters import SPANS, WINDOWED
+from shmmap.statistics.counters import REFUSALS, SPANS, WINDOWED
 from shmmap.statistics.layout import MAX_CLIENTS
 
-__all__ = ["BEAT_S", "RecentCounts", "Sampler", "SessionRows", "client_row"]
+if TYPE_CHECKING:
+    from shmmap.origin.remote.object_tier import ObjectCounts
+    from shmmap.origin.remote.taken_version import TakenVersion
+    from shmmap.statistics.writer import StatisticsWriter
+
+__all__ = [
+    "BEAT_S",
+    "PublishedGauges",
+    "RecentCounts",
+    "Sampler",
+    "SessionRows",
+    "VersionInService",
+    "client_row",
+]
 
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
@@ -243,7 +256,7 @@ class Sampler:
         """
         prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
         health = prefetcher.prefetch.health
-        statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
+        statistics.set("outage_tolerance_ns", int(prefetcher.outage_tolerance_s * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         statistics.set("origin_out", int(health.is_out))
@@ -300,3 +313,57 @@ class Sampler:
             yield
             cache.statistics.restore(now_s)
             self.on_beat()
+
+
+class VersionInService(Protocol):
+    """A published map, as its version is served."""
+
+    @property
+    def in_service(self) -> TakenVersion | None:
+        """The version that is served; None: it is not known yet."""
+
+    @property
+    def refused_version(self) -> int:
+        """Number of the version that is offered and was refused; 0: none."""
+
+    @property
+    def expires_s(self) -> float | None:
+        """When the version's signature expires, Unix time; None if it is not signed."""
+
+    @property
+    def signed_s(self) -> float:
+        """When the version was signed, Unix time; 0: it is not."""
+
+    @property
+    def refusal(self) -> str:
+        """Why the offer is not taken, one of `REFUSALS`; empty if it is."""
+
+    @property
+    def counts(self) -> ObjectCounts:
+        """What was read of the index so far."""
+
+
+class PublishedGauges:
+    """What the statistics show of a published map: its version, and what the daemon itself has read of it.
+
+    Loaders report what they read in the messages that end their loads.
+    """
+
+    def __init__(self, statistics: StatisticsWriter) -> None:
+        self._statistics = statistics
+        self._counts: ObjectCounts | None = None
+
+    def look(self, origin: VersionInService) -> None:
+        """Show what is served, and what was read since the last time."""
+        statistics, counts = self._statistics, origin.counts
+        if counts != self._counts:
+            statistics.add_objects_read(counts if self._counts is None else counts.since(self._counts))
+            self._counts = counts
+        taken, expires_s = origin.in_service, origin.expires_s
+        if taken is not None:
+            statistics.set("published_version", taken.version)
+            statistics.set("published_taken_unix_ns", int(taken.taken_s * 1e9))
+        statistics.set("published_refused", origin.refused_version)
+        statistics.set("published_refusal", REFUSALS.index(origin.refusal))
+        statistics.set("published_expires_unix_ns", int((expires_s or 0.0) * 1e9))
+        statistics.set("published_signed_unix_ns", int(origin.signed_s * 1e9))

@@ -1,38 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One connection: whose it is, what comes on it, and what was sent and is not read."""
+"""Connections of clients: accepting them, what comes on each, and which are ended when there are too many.
+
+Nothing is ended while there are descriptors and memory enough.  Otherwise one process is chosen:
+
+- no descriptor to spare: the one with most connections, which keeps as many as an equal share;
+- too much memory: the one for which most is kept (half messages, waiting requests, unread replies); it
+  loses all its connections.
+
+A process that lost a connection wrongly connects again; what it maps is not touched.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import resource
 import socket
 import struct
-from collections import deque
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final, TypeAlias
 
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.daemon.transport.zmtp import GREETING, Incoming, framed
 from shmmap.errors import BadRequest, ProtocolMismatch, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 from shmmap.protocol.codec import encode
 from shmmap.protocol.messages import ErrorReply
+from shmmap.statistics.writer import StatisticsWriter
 
-if TYPE_CHECKING:
-    from shmmap.daemon.transport.listener import Listener
-    from shmmap.daemon.transport.sessions import Session
+__all__ = ["MEMORY_ALLOWANCE_BYTES", "Connection", "Connections", "Listener", "Peer"]
 
-__all__ = ["Connection", "Peer"]
-
-MOST_UNREAD_BYTES: Final = 16 << 20
-"""Of replies; whoever leaves more does not read them."""
+Socket: TypeAlias = socket.socket
+MAX_UNREAD_BYTES: Final = 16 << 20
+"""Of replies; a client that leaves more does not read them."""
 READ_BYTES: Final = 1 << 16
 """Taken off a connection per turn of the loop."""
-FRAMES_AT_ONCE: Final = 4
-MOST_WAITING: Final = 48
+FRAMES_PER_TURN: Final = 4
+MAX_WAITING: Final = 48
 """Requests of a connection that are taken off it and wait; about, for some come at once."""
 LIGHT_BYTES: Final = 1 << 12
 """What is kept for every client, and does not count."""
-TOO_MUCH: Final = "it made the daemon take too much memory"
+ACCEPTED_PER_TURN: Final = 16
+ENDED_PER_TURN: Final = 64
+MIN_RESERVE: Final = 48
+"""Descriptors kept for the daemon's own work: loaders, segments it looks at, the map."""
+MIN_SHARE: Final = 8
+"""A process with no more connections than this is never the culprit."""
+MEMORY_ALLOWANCE_BYTES: Final = 32 << 20
+"""What may be kept for all clients together."""
+_TOO_MUCH: Final = "it made the daemon take too much memory"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
@@ -52,8 +72,8 @@ class Connection:
     ----------
     open : bool
         Whether it is not closed yet.
-    session : Session or None
-        Who has said hello on it.
+    slot : int
+        That of the session on it; 0 before a hello.
     unsent_bytes : int
         What the kernel does not take, because the client does not read.
     waiting, waiting_bytes : int
@@ -62,13 +82,13 @@ class Connection:
         All memory that is kept for it, bytes.
     """
 
-    def __init__(self, connected: socket.socket, listener: Listener) -> None:
+    def __init__(self, connected: Socket, listener: Listener) -> None:
         # according to the kernel
         credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         pid, uid, gid = _CREDENTIALS.unpack(credentials)
         self.peer = Peer(uid, gid, pid)
         self.open = True
-        self.session: Session | None = None
+        self.slot = 0
         self.unsent_bytes = 0
         self.waiting = self.waiting_bytes = 0
         self.weight = 0
@@ -76,7 +96,7 @@ class Connection:
         self._socket = connected
         self._listener = listener
         self._watched = listener.watched
-        self._incoming = Incoming(listener.kind, listener.other, listener.most_bytes)
+        self._incoming = Incoming(listener.kind, listener.peer_kind, listener.max_bytes)
         self._unsent: deque[memoryview] = deque()
         self._cut = False
         self.fd = connected.fileno()
@@ -84,23 +104,23 @@ class Connection:
         self._send(GREETING)
 
     def reply(self, body: bytes) -> None:
-        """Send a reply; whoever leaves too much unread loses the connection, and the replies with it."""
+        """Send a reply; a client that leaves too much unread loses the connection, and the replies."""
         step("daemon.reply")
         self._send(framed(body))
         step("daemon.replied")
         self._listener.statistics.add("replies")
         self._listener.statistics.add("bytes_sent", len(body))
-        if self.unsent_bytes > MOST_UNREAD_BYTES:
+        if self.unsent_bytes > MAX_UNREAD_BYTES:
             self.cut(f"it left {self.unsent_bytes} bytes of replies unread")
 
     def refuse(self, request: int, error: ShmmapError) -> None:
-        """Say why a request is refused."""
+        """Reply with the reason for refusing a request."""
         self._listener.statistics.add("errors_returned")
         self.reply(encode(ErrorReply(request, error.code, error.message, error.hint)))
 
-    def tell(self, body: bytes, most_unread_bytes: int) -> None:
-        """Send a message; it is lost if that much is unread already."""
-        if self.unsent_bytes <= most_unread_bytes:
+    def offer(self, body: bytes, max_unread_bytes: int) -> None:
+        """Send a message, or drop it if more than that is unread already."""
+        if self.unsent_bytes <= max_unread_bytes:
             self._send(framed(body))
 
     def cut(self, reason: str = "") -> None:
@@ -111,16 +131,16 @@ class Connection:
             self._forget_unsent()
             self.reweigh()
             if reason:
-                log.warning("connections ended", pid=self.peer.pid, count=1, reason=reason)
+                _log_ended(self.peer.pid, 1, reason)
             with contextlib.suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def end(self) -> None:
-        """Close it now and tell its owner; only the loop itself may, between one thing and the next."""
+        """Close it and notify its owner; only between two steps of the loop."""
         if self.open:
             self.close()
             self._listener.connections.weigh(-self.weight)
-            self._listener.on_ended(self)
+            self._listener.on_disconnect(self)
             self._listener.connections.remove(self)
 
     def close(self) -> None:
@@ -131,51 +151,33 @@ class Connection:
         self._forget_unsent()
 
     def deliver(self, seconds: float) -> None:
-        """Wait at most so long until what was sent is read."""
+        """Wait until what was sent is read, at most for this long."""
         with contextlib.suppress(OSError):
             self._socket.settimeout(seconds)
             for data in self._unsent:
                 self._socket.sendall(data)
 
-    def _flush(self) -> None:
-        """Send what was not taken at once."""
-        while self._unsent:
-            data = self._unsent[0]
-            try:
-                taken = self._socket.send(data)
-            except BlockingIOError:
-                return
-            except OSError:  # the other end is closed: the loop is about to hear of it
-                self._forget_unsent()
-                break
-            self.unsent_bytes -= taken
-            if taken < len(data):
-                self._unsent[0] = data[taken:]
-                return
-            self._unsent.popleft()
-        self._watch()
-
-    def note_waiting(self, more: int, more_bytes: int) -> None:
-        """So many more of its requests wait: of too many, the kernel keeps the rest."""
+    def count_waiting(self, more: int, more_bytes: int) -> None:
+        """Count requests that wait; beyond a limit the kernel keeps the rest."""
         self.waiting += more
         self.waiting_bytes += more_bytes
-        reading = self.waiting < MOST_WAITING if self._reading else self.waiting <= MOST_WAITING // 2
+        reading = self.waiting < MAX_WAITING if self._reading else self.waiting <= MAX_WAITING // 2
         if self.open and reading != self._reading:
             self._reading = reading
             self._watch()
             if reading and self._incoming.more:
                 self._watched.call_again(self.fd)
 
-    def _watch(self) -> None:
-        self._watched.watch_for(self.fd, reading=self._reading, writing=bool(self._unsent))
-
     def reweigh(self) -> None:
-        """Tell the owner when more or less is kept than before."""
+        """Update how much is kept for it, here and in the sum of all."""
         weight = len(self._incoming) + self.unsent_bytes + self.waiting_bytes
         weight = weight if weight > LIGHT_BYTES else 0
         more, self.weight = weight - self.weight, weight
         if more and self.open:
             self._listener.connections.weigh(more)
+
+    def _watch(self) -> None:
+        self._watched.watch_for(self.fd, reading=self._reading, writing=bool(self._unsent))
 
     def _send(self, data: bytes) -> None:
         if self._cut or not self.open:
@@ -187,7 +189,7 @@ class Connection:
             except BlockingIOError:
                 pass
             except OSError:
-                return  # the other end is closed: the loop is about to hear of it
+                return  # the other end is closed: the loop is about to find out
             if taken == len(data):
                 return
         self._unsent.append(memoryview(data)[taken:])
@@ -195,8 +197,26 @@ class Connection:
         self._watch()
         self.reweigh()
 
+    def _flush(self) -> None:
+        """Send what was not taken at once."""
+        while self._unsent:
+            data = self._unsent[0]
+            try:
+                taken = self._socket.send(data)
+            except BlockingIOError:
+                return
+            except OSError:  # the other end is closed: the loop is about to find out
+                self._forget_unsent()
+                break
+            self.unsent_bytes -= taken
+            if taken < len(data):
+                self._unsent[0] = data[taken:]
+                return
+            self._unsent.popleft()
+        self._watch()
+
     def _ready(self) -> None:
-        """Something came, the client reads again, or the other end is closed."""
+        """Read, or send the rest; the descriptor is ready, or the other end is closed."""
         if self._cut:
             self.end()
             return
@@ -220,15 +240,152 @@ class Connection:
 
     def _take_messages(self) -> None:
         try:
-            for body, several in self._incoming.messages(FRAMES_AT_ONCE, self._send):
-                self._listener.hear(self, body, several)
+            for body, is_multipart in self._incoming.messages(FRAMES_PER_TURN, self._send):
+                self._listener.on_message(self, body, is_multipart)
             if self._incoming.more and self._reading:
                 self._watched.call_again(self.fd)
         except ProtocolMismatch:
             self.end()  # not one of our clients
         except BadRequest as error:
-            self.cut(f"{error.message}: {TOO_MUCH}")
+            self.cut(f"{error.message}: {_TOO_MUCH}")
 
     def _forget_unsent(self) -> None:
         self._unsent.clear()
         self.unsent_bytes = 0
+
+
+class Connections:
+    """All connections of the daemon, by process.
+
+    Attributes
+    ----------
+    nbytes : int
+        What is kept for them.
+    short : bool
+        There is no descriptor to spare.
+    """
+
+    def __init__(self) -> None:
+        self.nbytes = 0
+        self._of: defaultdict[int, dict[Connection, None]] = defaultdict(dict)
+        self.short = False
+        self._waiting: list[Callable[[], None]] = []
+
+    def __iter__(self) -> Iterator[Connection]:
+        return (one for mine in self._of.values() for one in mine)
+
+    def add(self, connection: Connection) -> None:
+        """Add one that was accepted."""
+        self._of[connection.peer.pid][connection] = None
+        # the kernel gives the lowest number that is free: all below are taken
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        self.short = connection.fd >= limit - max(MIN_RESERVE, limit // 16)
+
+    def remove(self, connection: Connection) -> None:
+        """Remove one that is closed."""
+        mine = self._of[connection.peer.pid]
+        del mine[connection]
+        if not mine:
+            del self._of[connection.peer.pid]
+        self.try_again()
+
+    def try_again(self) -> None:
+        """Have listeners that wait for room look whether there is some."""
+        self.short = False
+        waiting, self._waiting = self._waiting, []
+        for go_on in waiting:
+            go_on()
+
+    def has_room(self, go_on: Callable[[], None]) -> bool:
+        """Return whether one more may be accepted; if not, ``go_on`` is called when a connection has ended.
+
+        Connections are taken from the process that has most, those without a session first.
+        """
+        if not self.short:
+            return True
+        pid, mine = max(self._of.items(), key=lambda item: len(item[1]), default=(0, {}))
+        share = max(MIN_SHARE, sum(map(len, self._of.values())) // (2 * len(self._of) or 1))
+        if len(mine) <= share:
+            self._waiting.append(go_on)  # many processes with a few each: newcomers have to wait
+            return False
+        count = min(len(mine) - share, ENDED_PER_TURN)
+        _log_ended(pid, count, f"it had {len(mine)} connections")
+        for one in sorted(mine, key=lambda one: one.slot != 0)[:count]:
+            one.end()
+        return True
+
+    def weigh(self, more_bytes: int) -> None:
+        """Add to what is kept; too much costs the process that takes most its connections."""
+        self.nbytes += more_bytes
+        if more_bytes > 0 and self.nbytes > MEMORY_ALLOWANCE_BYTES:
+            pid, mine = max(self._of.items(), key=lambda item: sum(one.weight for one in item[1]))
+            _log_ended(pid, len(mine), _TOO_MUCH)
+            for one in mine:
+                one.cut()
+            ctypes.CDLL(None).malloc_trim(0)
+
+    def deliver(self, seconds: float) -> None:
+        """Wait at most this long for clients to read what was sent to them, and close all connections."""
+        end_s = time.monotonic() + seconds
+        for one in self:
+            one.deliver(max(0.0, end_s - time.monotonic()))
+            one.close()
+
+
+@dataclass(eq=False, slots=True)
+class Listener:
+    """A listening Unix socket and what its connections have in common.
+
+    Parameters
+    ----------
+    kind, peer_kind
+        Types of ZeroMQ socket here and at the clients.
+    max_bytes
+        The longest message that a client may send.
+    on_message
+        Called with a message's connection, its first frame, and whether it had more.
+    on_disconnect
+        Called with a connection that is closed.
+    """
+
+    socket: Socket
+    watched: WatchedDescriptors
+    connections: Connections
+    statistics: StatisticsWriter
+    kind: bytes
+    peer_kind: bytes
+    max_bytes: int
+    on_message: Callable[[Connection, bytes, bool], None]
+    on_disconnect: Callable[[Connection], None]
+
+    def move_to(self, other: Socket) -> None:
+        """Listen at another socket; connections stay, and those that wait are accepted."""
+        for _ in range(0, socket.SOMAXCONN, ACCEPTED_PER_TURN):
+            self._accept()
+        self.watched.unwatch(self.socket.fileno())
+        self.socket.close()
+        self.socket = other
+        self.begin()
+
+    def begin(self) -> None:
+        """Accept connections from now on."""
+        self.watched.watch(self.socket.fileno(), self._accept)
+
+    def _accept(self) -> None:
+        for _ in range(ACCEPTED_PER_TURN):
+            if not self.connections.has_room(self.begin):
+                self.watched.unwatch(self.socket.fileno())
+                return
+            try:
+                connected, _address = self.socket.accept()
+            except BlockingIOError:
+                return
+            except OSError:  # the machine has no descriptor left
+                self.connections.short = True
+                return
+            connected.setblocking(False)
+            self.connections.add(Connection(connected, self))
+
+
+def _log_ended(pid: int, count: int, reason: str) -> None:
+    log.warning("connections ended", pid=pid, count=count, reason=reason)

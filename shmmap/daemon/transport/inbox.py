@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that have come, and whose is served next: that of the process that used least of the loop's time.
+"""Requests that have come, and which is served next: one of the process that used least of the loop's time.
 
 Start-time fair queueing (Goyal, Vin, Cheng, SIGCOMM 1996) with equal weights: every process has a
-clock that runs while its requests are served; the one furthest behind goes first, and who was idle
-starts at the time that the service has come to, so that nobody saves up turns.  Within a process its
+clock that runs while its requests are served; the one furthest behind goes first.  A process that was idle
+starts at the time that the service has come to, so that idling saves nothing up.  Within a process its
 connections take turns.  What takes longer than one turn goes on in the next ones of its process, before
 anything else of it begins.  What is asked for beyond the limits here is refused, not stored.
 """
@@ -21,17 +21,17 @@ from shmmap.errors import Busy
 from shmmap.protocol.codec import request_number
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["MOST_BYTES", "MOST_OF_A_PROCESS", "FairQueue", "Inbox", "Turn"]
+__all__ = ["MAX_PER_PROCESS", "MAX_PROCESS_BYTES", "FairQueue", "Inbox", "WorkItem"]
 
 Item = TypeVar("Item")
 
-MOST_OF_A_PROCESS: Final = 1024
+MAX_PER_PROCESS: Final = 1024
 """Requests that may wait; of one connection fewer are taken off it at a time."""
-MOST_BYTES: Final = 8 << 20
+MAX_PROCESS_BYTES: Final = 8 << 20
 """Bytes of one process's waiting requests; a single one may always wait."""
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
 """A longer request that is refused unread is dropped: finding its number takes too long."""
-MOST_REMEMBERED: Final = 4096
+MAX_REMEMBERED: Final = 4096
 """Processes whose clocks are remembered; those forgotten when idle lose a debt of milliseconds."""
 
 
@@ -50,7 +50,7 @@ class _Line(Generic[Item]):
 
 
 class FairQueue(Generic[Item]):
-    """Requests that wait to be served; pure: time is what `served` is told."""
+    """Requests that wait to be served; pure: the caller of `served` measures time."""
 
     def __init__(self) -> None:
         self._lines: dict[Hashable, _Line[Item]] = {}
@@ -58,7 +58,7 @@ class FairQueue(Generic[Item]):
         self._clock_s = 0.0
         self._number = 0
         self._waiting = 0
-        self._taken: Hashable = None  # whose turn it is
+        self._taken: Hashable = None  # the process that is being served
 
     def __len__(self) -> int:
         return self._waiting
@@ -66,17 +66,17 @@ class FairQueue(Generic[Item]):
     def add(
         self, process: Hashable, connection: Hashable, item: Item, nbytes: int, *, always: bool = False
     ) -> bool:
-        """Let something wait; False if too much of its process does, unless ``always``."""
+        """Queue something; False if too much of its process waits, unless ``always``."""
         line = self._lines.get(process)
         if line is None:
-            if len(self._lines) >= MOST_REMEMBERED:
+            if len(self._lines) >= MAX_REMEMBERED:
                 self._forget_idle()
             line = self._lines[process] = _Line(self._clock_s)
         if not line.count and line.begun is None:
             line.clock_s = max(line.clock_s, self._clock_s)
             if process != self._taken:  # else `served` does it
                 self._line_up(process, line)
-        elif not always and (line.count >= MOST_OF_A_PROCESS or line.nbytes + nbytes > MOST_BYTES):
+        elif not always and (line.count >= MAX_PER_PROCESS or line.nbytes + nbytes > MAX_PROCESS_BYTES):
             return False
         line.connections.setdefault(connection, deque()).append((item, nbytes))
         line.count += 1
@@ -85,9 +85,9 @@ class FairQueue(Generic[Item]):
         return True
 
     def take(self) -> tuple[Hashable, Item] | None:
-        """Take the request to serve now, and whose it is; None when nothing waits.
+        """Take the request to serve now, and its process; None when nothing waits.
 
-        Tell `served` before the next one; meanwhile more may come.
+        Call `served` before the next one; meanwhile more may come.
         """
         if not self._ready:
             return None
@@ -108,7 +108,7 @@ class FairQueue(Generic[Item]):
         return process, item
 
     def served(self, process: Hashable, seconds: float, begun: Item | None = None) -> None:
-        """The turn just taken was this long; ``begun`` goes on in the process's next one."""
+        """Charge the turn just taken to its process; ``begun`` goes on in the process's next one."""
         line, self._taken = self._lines[process], None
         line.clock_s += seconds
         if begun is not None:
@@ -130,77 +130,78 @@ class FairQueue(Generic[Item]):
 
 
 @dataclass(eq=False, slots=True)
-class Turn:
-    """What is served next: a request as it came, or work that has begun or become due.
+class WorkItem:
+    """What is served in a turn: a request as it came, or work that has begun or become due.
 
     Attributes
     ----------
-    body, several_frames
+    body, is_multipart
         A request's first frame, and whether there were more.
     work
-        Does the rest, a bounded step at a time; None for a request that has just come.
-    asked
-        Whether it is a request that its connection is to be told of when it is over.
+        Does the rest, a bounded step at a time; None before a request is dispatched, and after the last step.
+    is_request
+        Whether it came on the connection, which counts what waits; else the daemon itself made it.
     """
 
     connection: Connection
     body: bytes = b""
-    several_frames: bool = False
+    is_multipart: bool = False
     work: Iterator[None] | None = None
-    asked: bool = True
+    is_request: bool = True
+    is_done: bool = False
 
     @property
     def process(self) -> Hashable:
-        """Whose turn it is: the process's; the connection's where the kernel does not tell which."""
+        """The process it is for; the connection where the kernel does not show the process."""
         return self.connection.peer.pid or self.connection
 
     @property
-    def over(self) -> bool:
-        """Whether nothing is left to do."""
-        return self.work is None
+    def is_new(self) -> bool:
+        """Whether it is a request that was not dispatched yet."""
+        return self.work is None and not self.is_done
 
-    def go_on(self) -> None:
-        """Do the next step; `work` is None after the last one, and if nobody waits for it any more."""
-        work, self.work = self.work, None
+    def run_step(self) -> None:
+        """Do the next step; done after the last one, and if the connection has ended."""
+        work, self.work, self.is_done = self.work, None, True
         if work is not None and self.connection.open:
             for _ in work:
-                self.work = work
+                self.work, self.is_done = work, False
                 break
 
 
 class Inbox:
-    """Requests heard and not yet served, and work that is due."""
+    """Requests received and not yet served, and work that is due."""
 
     def __init__(self, statistics: StatisticsWriter) -> None:
         self._statistics = statistics
-        self._queue: FairQueue[Turn] = FairQueue()
+        self._queue: FairQueue[WorkItem] = FairQueue()
 
     def __len__(self) -> int:
         return len(self._queue)
 
-    def hear(self, connection: Connection, body: bytes, several: bool) -> None:
-        """Let a request wait for its turn, or refuse it: its process may have so many waiting."""
+    def receive(self, connection: Connection, body: bytes, is_multipart: bool) -> None:
+        """Queue a request, or refuse it where too many of its process wait."""
         self._statistics.add("requests")
         self._statistics.add("bytes_received", len(body))
-        turn = Turn(connection, body, several)
-        if self._queue.add(turn.process, connection, turn, len(body)):
-            connection.note_waiting(1, len(body))
+        item = WorkItem(connection, body, is_multipart)
+        if self._queue.add(item.process, connection, item, len(body)):
+            connection.count_waiting(1, len(body))
         elif len(body) <= WORTH_AN_ANSWER_BYTES:
             error = Busy("too many requests of this process wait to be served", hint="wait for the replies")
             connection.refuse(request_number(body), error)
 
-    def due(self, connection: Connection, work: Iterator[None]) -> None:
-        """Have ``work`` done, a step a turn, when it is the turn of this connection's process."""
-        turn = Turn(connection, work=work, asked=False)
-        self._queue.add(turn.process, connection, turn, 0, always=True)
+    def add_work(self, connection: Connection, work: Iterator[None]) -> None:
+        """Queue ``work``, done a step a turn when this connection's process is served."""
+        item = WorkItem(connection, work=work, is_request=False)
+        self._queue.add(item.process, connection, item, 0, always=True)
 
-    def take(self) -> Turn | None:
-        """Take what is to be served now; tell `served` afterwards."""
+    def take(self) -> WorkItem | None:
+        """Take what is to be served now; call `served` afterwards."""
         return taken[1] if (taken := self._queue.take()) else None
 
-    def served(self, turn: Turn, seconds: float) -> None:
-        """What was taken has been served, or a step of it."""
-        if turn.asked and turn.over:
-            turn.connection.note_waiting(-1, -len(turn.body))
-            turn.connection.reweigh()
-        self._queue.served(turn.process, seconds, None if turn.over else turn)
+    def served(self, item: WorkItem, seconds: float) -> None:
+        """Record that a step of what was taken is done; it is queued again unless that was the last one."""
+        if item.is_request and item.is_done:
+            item.connection.count_waiting(-1, -len(item.body))
+            item.connection.reweigh()
+        self._queue.served(item.process, seconds, None if item.is_done else item)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who has said hello, and what each of them holds."""
+"""Sessions of clients, and what each of them holds."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from shmmap.protocol.messages import Holder, Intent
 from shmmap.quantities import format_bytes
 from shmmap.segment.pins import MAX_SLOT
 
-__all__ = ["MOVES_AT_ONCE", "Session", "Sessions"]
+__all__ = ["MOVES_PER_STEP", "Session", "Sessions"]
 
-MOVES_AT_ONCE: Final = 4
+MOVES_PER_STEP: Final = 4
 """Sessions whose paths are looked at at a time."""
 
 
@@ -35,12 +35,12 @@ class Session:
     """One client.
 
     ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
-    naming holders.  Safety never depends on it: what is in use, the kernel tells.  ``exclusive_bytes`` are
-    those that no other session holds.  ``says_where`` tells
-    an ``intent`` (where the client is and is going to be) that it stated from one that was guessed from
-    ``area``, the last one it asked for, in ``layers``.  ``motion`` is what is known of how it moves,
-    ``told`` what it does not know yet, and ``places`` where it will be.  ``asker`` is
-    whose turn its requests and loads count for: the process's, else the session's own.
+    naming holders.  Safety never depends on it: the kernel knows what is in use.  ``exclusive_bytes`` are
+    those that no other session holds.  ``says_where`` is true for an ``intent`` (where the client is and is
+    going to be) that it stated, false for one that was guessed from ``area``, the last one it asked for, in
+    ``layers``.  ``motion`` is what is known of how it moves, ``new_intent`` what it does not know yet, and
+    ``places`` where it will be.  Requests and loads of the session count for ``asker``: its process, else the
+    session itself.
     """
 
     slot: int
@@ -57,7 +57,7 @@ class Session:
     says_where: bool = False
     area: Area | None = None
     layers: tuple[str, ...] = ()
-    told: Intent | None = None
+    new_intent: Intent | None = None
     requests: int = 0
     last_request_s: float = 0.0
     asker: int = 0
@@ -68,19 +68,31 @@ class Session:
         return self.connection.peer
 
     def connect(self, connection: Connection) -> None:
-        """The session goes on on this connection."""
+        """Go on with the session on this connection."""
         self.disconnect()
-        self.connection, connection.session = connection, self
+        self.connection, connection.slot = connection, self.slot
 
     def disconnect(self) -> None:
-        """The session has no connection; what it said of where it is does not count any more."""
-        self.connection.session = self.intent = self.told = self.area = None
+        """Take the session off its connection, and forget what it said of where it is."""
+        self.connection.slot = 0
+        self.intent = self.new_intent = self.area = None
         self.says_where = False
         self.motion = Motion()
         self.sessions.moved[self] = None
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether its connection is still the session's, closed or not."""
+        return self.connection.slot == self.slot
+
+    def state_intent(self, intent: Intent) -> None:
+        """Take what the client says of where it is and is going to be."""
+        self.intent = self.new_intent = intent
+        self.says_where = True
+        self.sessions.moved[self] = None
+
     def hold(self, residents: Iterable[Resident]) -> None:
-        """The session was handed these segments."""
+        """Count segments that it was handed."""
         held = self.held
         for resident in residents:
             known = held.get(resident.version)
@@ -94,11 +106,11 @@ class Session:
             if self.slot not in resident.sessions:
                 self._share(resident, 1)
                 resident.sessions.add(self.slot)
-            elif len(resident.sessions) == 1:  # an earlier session of this slot has it still
+            elif len(resident.sessions) == 1:  # the session that had this slot before has it still
                 self.exclusive_bytes += resident.nbytes
 
     def _share(self, resident: Resident, one: int) -> None:
-        """One more of the segment's holders is this session, or (-1) one less."""
+        """Share out a segment that this session has from now on (1), or no longer has (-1)."""
         others = resident.sessions
         if not others:
             self.exclusive_bytes += one * resident.nbytes
@@ -116,14 +128,14 @@ class Session:
             self._share(resident, -1)
 
     def drop(self, versions: Iterable[int]) -> list[Resident]:
-        """The session does not have these versions any more; returns what it had of them."""
+        """Remove versions, and return the segments that it had of them."""
         dropped = [resident for version in versions for resident in self.held.pop(version, ())]
         for resident in dropped:
             self._lose(resident)
         return dropped
 
     def drop_segment(self, resident: Resident) -> None:
-        """The session cannot have this one segment any more."""
+        """Remove one segment, if it has it."""
         known = self.held.get(resident.version, [])
         if resident in known:
             known.remove(resident)
@@ -132,18 +144,18 @@ class Session:
                 del self.held[resident.version]
 
     def residents(self) -> list[Resident]:
-        """Everything the session holds."""
+        """Return everything that the session holds."""
         return [resident for known in self.held.values() for resident in known]
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
-        """This session as a line in a reply."""
+        """Return this session as a line in a reply."""
         return Holder(
             self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells, self.command
         )
 
 
 def command_of(pid: int) -> str:
-    """Command name of a process, empty where it cannot be read."""
+    """Return the command name of a process, empty where it cannot be read."""
     if pid <= 0:
         return ""
     with contextlib.suppress(OSError):
@@ -155,14 +167,16 @@ class Sessions:
     """All sessions of this epoch, by slot.
 
     Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
-    it maps is locked under its slot, also when a later life of the daemon asks whose that is.
+    it maps is locked under its slot, also when a later run of the daemon looks for the holder.
 
     Attributes
     ----------
+    slots : dict
+        Sessions by slot.
     departed : dict
-        By slot, those whose connection has ended and who may still map what they were handed.
+        By slot, sessions whose connection has ended and whose process may still map what it was handed.
     moved : dict
-        Who has moved, or asked for another area, since the last `follow_moves`.
+        Sessions that have moved, or asked for another area, since the last `follow_moves`.
     places_version : int
         Another one after each change of `places`.
     """
@@ -170,20 +184,20 @@ class Sessions:
     LIMIT = 4096
 
     def __init__(self) -> None:
-        self._by_slot: dict[int, Session] = {}
+        self.slots: dict[int, Session] = {}
         self.departed: dict[int, Session] = {}
         self.moved: dict[Session, None] = {}
         self.places_version = 0
 
     def __len__(self) -> int:
-        return len(self._by_slot)
+        return len(self.slots)
 
     def __iter__(self) -> Iterator[Session]:
-        return iter(self._by_slot.values())
+        return iter(self.slots.values())
 
     def by_slot(self, slot: int) -> Session | None:
-        """The session whose lock byte is ``slot``."""
-        return self._by_slot.get(slot)
+        """Return the session whose lock byte is ``slot``."""
+        return self.slots.get(slot)
 
     def largest_holder(self) -> str:
         """Name, process and bytes of the client that was handed most; empty where none was handed any."""
@@ -193,10 +207,10 @@ class Sessions:
         return f"{most.client or most.command} (pid {most.peer.pid}): {format_bytes(most.held_bytes)}"
 
     def spare(self) -> Session | None:
-        """The session to give up when there are too many; None when everybody has just one.
+        """Return the session to end when there are too many; None when each process has just one.
 
-        It belongs to the process that has most (those whom the kernel does not name are one).  It is told
-        ``no_session`` and may open another.
+        It belongs to the process that has most (those that the kernel does not name are one).  Its next
+        request is answered ``no_session``, and it may open another.
         """
         sessions_of = Counter(session.peer.pid for session in self)
         owner, count = max(sessions_of.items(), key=lambda item: item[1], default=(0, 0))
@@ -208,45 +222,45 @@ class Sessions:
     def open(self, connection: Connection, client: str, now_s: float, *, slot: int = 0) -> Session:
         """Begin a session.
 
-        ``slot`` is the one that the client had before, on another connection or in an earlier life of the
+        ``slot`` is the one that the client had before, on another connection or in a previous run of the
         daemon, and keeps; 0 for none.
         """
-        if not 0 < slot <= MAX_SLOT or slot in self._by_slot:
+        if not 0 < slot <= MAX_SLOT or slot in self.slots:
             slot = secrets.randbelow(MAX_SLOT) + 1
         pid = connection.peer.pid
         session = Session(
             slot, connection, escaped(client)[:64], command_of(pid), self, last_request_s=now_s,
             asker=pid or -slot,
         )  # fmt: skip
-        connection.session = session
-        self._by_slot[slot] = session
+        connection.slot = slot
+        self.slots[slot] = session
         return session
 
     def close(self, session: Session) -> None:
         """End a session; what it held is for the caller to drop."""
         session.disconnect()
         self._follow(session)
-        self._by_slot.pop(session.slot, None)
+        self.slots.pop(session.slot, None)
         self.departed.pop(session.slot, None)
 
     def follow_moves(self) -> list[Session]:
         """Bring motions and `places` of some sessions that moved up to date, and return these."""
-        some = list(islice(self.moved, MOVES_AT_ONCE))
+        some = list(islice(self.moved, MOVES_PER_STEP))
         for session in some:
             self._follow(session)
         return some
 
     def places(self) -> Places:
-        """Where the clients are and are going to be, as of the last `follow_moves`."""
+        """Return where the clients are and are going to be, as of the last `follow_moves`."""
         return merged_places(session.places for session in self if len(session.places))
 
     def _follow(self, session: Session) -> None:
         self.moved.pop(session, None)
-        told, session.told = session.told, None
-        if told is not None:
-            session.motion.told(told, session.last_request_s)
-            if told.route:  # of a route, as long as it may be, the motion keeps what it needs
-                session.intent = msgspec.structs.replace(told, route=())
+        intent, session.new_intent = session.new_intent, None
+        if intent is not None:
+            session.motion.update(intent, session.last_request_s)
+            if intent.route:  # of a route, as long as it may be, the motion keeps what it needs
+                session.intent = msgspec.structs.replace(intent, route=())
         if session.intent is None:
             session.places = NOWHERE
         else:

@@ -71,7 +71,7 @@ class SocketFile:
                 os.unlink(self.path)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self.socket.close()
 
 
@@ -108,7 +108,7 @@ def _listen(path: str, gid: int) -> socket.socket:
             os.unlink(path)
     listening = socket.socket(socket.AF_UNIX)
     listening.setblocking(False)
-    # the file is made with the umask's mode; nobody may connect before it is right
+    # the file is made with the umask's mode; no client may connect before it is right
     mask = os.umask(0o117 if gid >= 0 else 0o177)
     try:
         listening.bind(path)
@@ -124,7 +124,7 @@ def _listen(path: str, gid: int) -> socket.socket:
 
 
 def _answers(path: str) -> int | None:
-    """Process that has the socket at ``path`` open, 0 where it is not known which; None: no process has."""
+    """Return the process that has the socket at ``path`` open, 0 if it is not known; None for no process."""
     for kind in (socket.SOCK_STREAM, socket.SOCK_SEQPACKET, socket.SOCK_DGRAM):
         with socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK) as probe:
             try:
@@ -141,7 +141,7 @@ def _answers(path: str) -> int | None:
 
 
 def _owner(path: str) -> int:
-    """Process that has an open socket with this path; 0 where the kernel does not show it."""
+    """Return the process that has an open socket with this path; 0 where the kernel does not show it."""
     inodes = set()
     with contextlib.suppress(OSError), open("/proc/net/unix", errors="surrogateescape") as table:
         for line in table:
@@ -156,7 +156,7 @@ def _owner(path: str) -> int:
 
 
 def _program(pid: int) -> str:
-    """A process for a message: its id and its program."""
+    """Describe a process for a message: its id and its program."""
     if not pid:
         return "a process that this user does not see"
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptors that the serving loop hears: clients' connections, loaders, the kernel."""
+"""Descriptors that the serving loop polls: clients' connections, loaders, the kernel."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ from typing import Final
 
 __all__ = ["WatchedDescriptors"]
 
-AT_ONCE: Final = 16
-"""Descriptors looked at per turn; the kernel begins with those that were not looked at last time."""
+DESCRIPTORS_PER_TURN: Final = 16
+"""The kernel begins with those that were not looked at last time."""
 
 
 class WatchedDescriptors:
-    """Who is called when which descriptor is readable.
+    """Callbacks for descriptors that are readable.
 
-    Attributes
-    ----------
-    callbacks : dict
-        What to call, by descriptor.
-    kinds : dict
-        What that is, by descriptor, one of `shmmap.statistics.counters.TURN_KINDS`.
+    ``kinds`` are the kinds of turn that they make, of `shmmap.statistics.counters.TURN_KINDS`.
     """
 
     def __init__(self) -> None:
@@ -51,11 +46,11 @@ class WatchedDescriptors:
             self._epoll.unregister(fd)
 
     def poll(self, timeout_s: float) -> list[int]:
-        """Wait until descriptors are to be looked at, at most so long, and return them."""
+        """Wait until descriptors are ready, at most this long, and return them."""
         again, self._again = self._again, []
-        ready = self._epoll.poll(0 if again else timeout_s, AT_ONCE)
+        ready = self._epoll.poll(0 if again else timeout_s, DESCRIPTORS_PER_TURN)
         return [*again, *(fd for fd, _events in ready)]
 
     def close(self) -> None:
-        """Watch nothing any more; after everything watched is gone."""
+        """Stop polling, after everything watched is gone."""
         self._epoll.close()

@@ -2,8 +2,8 @@
 """The bytes of a connection: ZMTP 3.0 with the NULL mechanism (rfc.zeromq.org/spec/23), the daemon's side.
 
 Clients use libzmq or any other ZeroMQ library.  The daemon does not: libzmq accepts connections in a thread
-of its own without bound, ends the process when descriptors run out, keeps all that is sent, and tells
-neither whose a connection is nor that it has ended.
+of its own without bound, ends the process when descriptors run out, keeps all that is sent, and shows
+neither the process of a connection nor that it has ended.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Incoming:
         The daemon's socket type, ``ROUTER`` or ``XPUB``.
     peer
         The only socket type that may be at the other end, ``DEALER`` or ``SUB``.
-    most_bytes
+    max_bytes
         The longest message, all its frames and their headers together.
 
     Attributes
@@ -48,10 +48,10 @@ class Incoming:
         Whether something that came was not looked at yet.
     """
 
-    def __init__(self, kind: bytes, peer: bytes, most_bytes: int) -> None:
+    def __init__(self, kind: bytes, peer: bytes, max_bytes: int) -> None:
         self._kind = kind
         self._peer = peer
-        self._most_bytes = most_bytes
+        self._max_bytes = max_bytes
         self._buffer = bytearray()
         self._next = 0  # where the next frame begins; before it are whole frames of a message
         self._first: tuple[int, int] | None = None  # that message's first frame, from and to
@@ -71,11 +71,11 @@ class Incoming:
         """Take bytes that came."""
         self._buffer += data
 
-    def messages(self, most_frames: int, say: Callable[[bytes], None]) -> list[tuple[bytes, bool]]:
+    def messages(self, max_frames: int, send: Callable[[bytes], None]) -> list[tuple[bytes, bool]]:
         """Return messages that are whole now: of each its first frame, and whether there were more.
 
-        Not more than so many frames are looked at; ``more`` then tells that others may be there.  ``say``
-        sends what the protocol itself has to say.
+        At most ``max_frames`` are looked at; ``more`` then says that others may be there.  ``send``
+        sends what the protocol itself requires.
 
         Raises
         ------
@@ -85,11 +85,11 @@ class Incoming:
             A message is longer than may be.
         """
         self.more = False
-        if not self._greeted and not self._greet(say):
+        if not self._greeted and not self._greet(send):
             return []
         messages: list[tuple[bytes, bool]] = []
         start = 0  # of the message under way
-        for _ in range(most_frames):
+        for _ in range(max_frames):
             frame = self._frame(start)
             if frame is None:
                 break
@@ -97,7 +97,7 @@ class Incoming:
             if flags & _COMMAND:
                 if self._next != start:
                     raise ProtocolMismatch("a command within a message")
-                self._command(bytes(self._buffer[begin:end]), say)
+                self._command(bytes(self._buffer[begin:end]), send)
                 start = end
             elif not self._ready:
                 raise ProtocolMismatch("a message before the handshake")
@@ -117,7 +117,7 @@ class Incoming:
                 self._first = (self._first[0] - start, self._first[1] - start)
         return messages
 
-    def _greet(self, say: Callable[[bytes], None]) -> bool:
+    def _greet(self, send: Callable[[bytes], None]) -> bool:
         if len(self._buffer) < len(GREETING):
             return False
         greeting = self._buffer[: len(GREETING)]
@@ -126,7 +126,7 @@ class Incoming:
         del self._buffer[: len(GREETING)]
         self._greeted = True
         ready = b"\x05READY" + _property(b"Socket-Type", self._kind) + _property(b"Identity", b"")
-        say(framed(ready, _COMMAND))
+        send(framed(ready, _COMMAND))
         return True
 
     def _frame(self, start: int) -> tuple[int, int, int] | None:
@@ -141,18 +141,18 @@ class Incoming:
                 return None
             size = int.from_bytes(buffer[at + 1 : begin], "big")
         end = begin + size
-        if end - start > self._most_bytes:
-            raise BadRequest(f"a message of more than {self._most_bytes} bytes")
+        if end - start > self._max_bytes:
+            raise BadRequest(f"a message of more than {self._max_bytes} bytes")
         return None if len(buffer) < end else (flags, begin, end)
 
-    def _command(self, body: bytes, say: Callable[[bytes], None]) -> None:
+    def _command(self, body: bytes, send: Callable[[bytes], None]) -> None:
         name, rest = body[1 : 1 + body[0]] if body else b"", body[1:]
         if name == b"READY":
             if _property(b"Socket-Type", self._peer) not in rest:
                 raise ProtocolMismatch(f"the other end is no {self._peer.decode()}")
             self._ready = True
         elif name == b"PING":
-            say(framed(b"\x04PONG" + body[7:23], _COMMAND))
+            send(framed(b"\x04PONG" + body[7:23], _COMMAND))
 
 
 def _property(name: bytes, value: bytes) -> bytes:

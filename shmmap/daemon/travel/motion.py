@@ -1,28 +1,114 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How one client moves: what it says of that, and what its poses tell."""
+"""How one client moves: its pose, its velocity, and where on the route that it sends it is."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.travel.route import FARTHEST_M, Route
+import numpy as np
+from numpy.typing import NDArray
+
 from shmmap.protocol.messages import Intent
 
-__all__ = ["MOST_SPEED_MPS", "Motion"]
+__all__ = ["FARTHEST_M", "MAX_SPEED_MPS", "MAX_VERTICES", "Motion", "Route"]
 
-MOST_SPEED_MPS: Final = 70.0
-"""A pose that is farther away than this speed allows is a jump; nobody is taken to be faster."""
+MAX_SPEED_MPS: Final = 70.0
+"""A pose that is farther away than this speed allows is a jump; no client is taken to be faster."""
 LEARN_S: Final = 0.5
 """Time between two poses, at least, from which a velocity is learnt."""
 SILENT_S: Final = 10.0
-"""Who says nothing for longer may have stood: who is farther away than one comes in this time has jumped."""
+"""A client that is silent for longer may have stood: farther away than one comes in this time is a jump."""
 TURN_RAD: Final = 0.35
-"""Who has turned by more since then has left the straight."""
+"""A client that has turned by more since then has left the straight."""
 TURNS_MPS: Final = 1.0
 FASTEST_S: Final = 60.0
-"""For about so long it is remembered how fast a client was: it will go on after a red light."""
+"""For about this long it is remembered how fast a client was: it will go on after a red light."""
+FARTHEST_M: Final = 1e8
+"""Coordinates beyond this, in metres, count as this."""
+MAX_VERTICES: Final = 512
+"""Vertices kept of a longer route, most of them where it bends."""
+OFF_ROUTE_M: Final = 100.0
+"""A client farther away than this from its route is not on it."""
+SLACK_M: Final = 10.0
+"""Of two stretches of a route that are about equally near (to this), the client is on the first."""
+BEHIND_M: Final = 20.0
+"""How far back on its route, at most, a client is looked for: it may be a street that is taken both ways."""
+
+
+class Route:
+    """A polyline ahead of a client.
+
+    Parameters
+    ----------
+    vertices
+        (x, y) each, metres, map frame, finite; at least one.
+
+    Attributes
+    ----------
+    length_m : float
+        From its first vertex to its last, metres.
+    last_heading : float
+        Where to it goes at its end, radians counter-clockwise from the map's x axis; 0 for a single vertex.
+    """
+
+    def __init__(self, vertices: Sequence[tuple[float, float]]) -> None:
+        self._at = np.array(vertices, dtype=np.float64).reshape(-1, 2).clip(-FARTHEST_M, FARTHEST_M)
+        self._along = _along(self._at)
+        self.length_m = float(self._along[-1])
+        if len(self._at) > MAX_VERTICES:
+            self._at = self._at[_significant(self._at, self._along)]
+            self._along = _along(self._at)
+            self.length_m = float(self._along[-1])
+        steps, lengths = np.diff(self._at, axis=0), np.diff(self._along)
+        moved = np.flatnonzero(lengths)
+        last = steps[moved[-1]] if len(moved) else np.zeros(2)
+        self.last_heading = math.atan2(last[1], last[0])
+        self._steps, self._lengths = steps, lengths
+
+    def at(self, along_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """Return positions along the route, (..., 2), metres, map frame; its ends for what is beyond them."""
+        x = np.interp(along_m, self._along, self._at[:, 0])
+        y = np.interp(along_m, self._along, self._at[:, 1])
+        return np.stack([x, y], axis=-1)
+
+    def find(self, x: float, y: float, from_m: float | None = None) -> float | None:
+        """Return how far along the route a client is; None if it is not on it.
+
+        Parameters
+        ----------
+        from_m
+            How far along it has come, if it was on this route: where a route passes a place twice, the
+            client is where it comes to next.
+        """
+        here = np.array([x, y])
+        if not len(self._steps):
+            near_m = float(np.hypot(*(self._at[0] - here)))
+            return 0.0 if near_m <= OFF_ROUTE_M else None
+        squares = np.maximum(self._lengths, 1e-9) ** 2
+        share = np.clip(((here - self._at[:-1]) * self._steps).sum(axis=1) / squares, 0.0, 1.0)
+        apart = self._at[:-1] + share[:, np.newaxis] * self._steps - here
+        away = np.hypot(apart[:, 0], apart[:, 1])
+        along = self._along[:-1] + share * self._lengths
+        if from_m is not None:
+            ahead = along >= from_m - BEHIND_M
+            if ahead.any() and away[ahead].min() <= OFF_ROUTE_M:
+                away = np.where(ahead, away, np.inf)
+        nearest = float(away.min())
+        if nearest > OFF_ROUTE_M:
+            return None
+        return self._first_near(away, along, nearest)
+
+    @staticmethod
+    def _first_near(away: NDArray[np.float64], along: NDArray[np.float64], nearest: float) -> float:
+        """Return the nearest place of the first stretch that is about as near as any."""
+        first = int(np.argmax(away <= nearest + SLACK_M))
+        last = first
+        while last + 1 < len(away) and away[last + 1] <= nearest + SLACK_M:
+            last += 1
+        return float(along[first + int(np.argmin(away[first : last + 1]))])
 
 
 @dataclass(eq=False, slots=True)
@@ -33,25 +119,25 @@ class Motion:
     ----------
     x, y
         Metres, map frame.
-    told_s
+    at_s
         When it was there.
     vx, vy
-        Metres per second, map frame: as told, else learnt from the poses; 0 if not known.
+        Metres per second, map frame: as sent, else learnt from the poses; 0 if not known.
     fastest_mps
         Its greatest speed of late.
     route, along_m
-        The way it says it will take, if it is on it, and how far along it is.
+        The route that it sends, if it is on it, and how far along it is.
     travelled_m
         How far it has come since its last jump.
     straight_m
         How far it has come without a turn.
     jumps
-        How often it was somewhere else all of a sudden.
+        How often it was suddenly somewhere else.
     """
 
     x: float = 0.0
     y: float = 0.0
-    told_s: float = -math.inf
+    at_s: float = -math.inf
     vx: float = 0.0
     vy: float = 0.0
     fastest_mps: float = 0.0
@@ -62,24 +148,24 @@ class Motion:
     jumps: int = 0
     _straight_rad: float = 0.0
     _vertices_hash: int = 0
-    _told_route: Route | None = None
+    _sent_route: Route | None = None
     _come_m: float = 0.0
     _learnt: tuple[float, float, float] = field(default=(0.0, 0.0, -math.inf))
 
     @property
     def speed_mps(self) -> float:
-        """Its speed now."""
+        """Return its speed now."""
         return math.hypot(self.vx, self.vy)
 
-    def told(self, intent: Intent, now_s: float) -> None:
-        """A client says where it is, and perhaps where to it moves."""
+    def update(self, intent: Intent, now_s: float) -> None:
+        """Take what the client says of its pose, its velocity and its route."""
         self._move(intent.x, intent.y, intent.vx, intent.vy, now_s)
         self._follow(intent.route)
 
     def _move(self, x: float, y: float, vx: float, vy: float, now_s: float) -> None:
         x, y = _within(x), _within(y)
-        step_m, took_s = math.hypot(x - self.x, y - self.y), now_s - self.told_s
-        if took_s == math.inf or step_m > MOST_SPEED_MPS * min(max(took_s, 1.0), SILENT_S):
+        step_m, took_s = math.hypot(x - self.x, y - self.y), now_s - self.at_s
+        if took_s == math.inf or step_m > MAX_SPEED_MPS * min(max(took_s, 1.0), SILENT_S):
             self.jumps += 1
             self.vx = self.vy = self.fastest_mps = self.travelled_m = self.straight_m = 0.0
             self._learnt = (x, y, now_s)
@@ -87,9 +173,9 @@ class Motion:
         else:
             self.travelled_m += step_m
             self.straight_m += step_m
-        self.x, self.y, self.told_s = x, y, now_s
+        self.x, self.y, self.at_s = x, y, now_s
         if vx or vy:
-            over = max(1.0, math.hypot(vx, vy) / MOST_SPEED_MPS)
+            over = max(1.0, math.hypot(vx, vy) / MAX_SPEED_MPS)
             self.vx, self.vy = vx / over, vy / over
         else:
             self._learn(now_s)
@@ -106,7 +192,7 @@ class Motion:
         self.vx, self.vy = (self.x - x) / took_s, (self.y - y) / took_s
 
     def _turn(self) -> None:
-        """See whether it is still straight on; poses of who hardly moves tell nothing of that."""
+        """Find out whether it still goes straight ahead; poses of a client that hardly moves do not say."""
         if self.speed_mps < TURNS_MPS:
             return
         heading_rad = math.atan2(self.vy, self.vx)
@@ -114,14 +200,14 @@ class Motion:
             self._straight_rad, self.straight_m = heading_rad, 0.0
 
     def _follow(self, vertices: tuple[tuple[float, float], ...]) -> None:
-        """Find the client on the way that it says it will take."""
+        """Find the client on the route that it sends."""
         before: float | None = self._come_m if self.route is not None else None
-        told = hash(vertices)
-        if told != self._vertices_hash:
-            self._vertices_hash, before = told, None
-            self._told_route = Route(vertices) if vertices else None
-        along_m = None if self._told_route is None else self._told_route.find(self.x, self.y, before)
-        self.route = None if along_m is None else self._told_route
+        sent = hash(vertices)
+        if sent != self._vertices_hash:
+            self._vertices_hash, before = sent, None
+            self._sent_route = Route(vertices) if vertices else None
+        along_m = None if self._sent_route is None else self._sent_route.find(self.x, self.y, before)
+        self.route = None if along_m is None else self._sent_route
         self.along_m = along_m or 0.0
         self._come_m = self.along_m if before is None else max(before, self.along_m)
 
@@ -129,3 +215,27 @@ class Motion:
 def _within(metres: float) -> float:
     """Anything farther away than numbers stay exact counts at the edge of that."""
     return max(-FARTHEST_M, min(metres, FARTHEST_M))
+
+
+def _along(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far along a polyline each of its vertices is, metres."""
+    steps = np.diff(at, axis=0)
+    return np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
+
+
+def _significant(at: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the vertices that best describe a polyline, at most `MAX_VERTICES`, its ends among them.
+
+    Chords stay about equally near to a curve if their ends are as dense as the square root of its
+    curvature; half of the vertices are spread so, the others evenly.
+    """
+    steps = np.diff(at, axis=0)
+    heading = np.arctan2(steps[:, 1], steps[:, 0])
+    turn = np.abs((np.diff(heading) + math.pi) % (2.0 * math.pi) - math.pi)
+    bend = np.concatenate(([0.0], np.cumsum(np.sqrt(turn * 0.5 * (along[2:] - along[:-2]))), [0.0]))
+    bend[-1] = bend[-2]
+    rank = along / max(along[-1], 1e-9) + bend / max(bend[-1], 1e-9)
+    wanted = np.linspace(0.0, rank[-1], MAX_VERTICES)
+    kept = np.unique(np.clip(np.searchsorted(rank, wanted), 0, len(at) - 1))
+    kept[-1] = len(at) - 1
+    return kept

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When will a cell be needed? Of all clients, the one that comes to it first counts.
+"""When a cell will be needed: by the client that comes to it first.
 
-Each client gives a few *places*: where it is, where it will be along its route, and from where on nobody
-knows.  From a place, cells within its reach are needed when the client is there; those beyond it later, the
-farther away the later.  `until_needed` takes the least over all places.
+Each client gives a few *places*: where it is, where it will be along its route, and the route's end, after
+which it may go anywhere.  From a place, cells within its reach are needed when the client is there; those
+beyond it later, the farther away the later.  `until_needed` takes the least over all places.
 
 A client without a route may go anywhere, rather ahead than back: its only place is where it is, and the time
 to a cell is multiplied by 1 for one straight ahead, 2 for one behind it.  One with a route needs what lies
@@ -21,27 +21,27 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.travel.motion import Motion
 
-__all__ = ["MOST_PLACES", "NOWHERE", "Places", "merged_places", "places_of", "until_needed"]
+__all__ = ["MAX_PLACES", "NOWHERE", "Places", "merged_places", "places_of", "until_needed"]
 
 Places: TypeAlias = NDArray[np.float64]
 """(P, 8): x, y, when the client is there (s), its reach (m), how far beyond that the place says anything (m),
 seconds per metre beyond its reach, and the unit vector of its heading, 0 if unknown."""
 
 NOWHERE: Final = np.empty((0, 8))
-MOST_PLACES: Final = 256
-"""Scoring takes time for each: with more of them, of those near each other the first counts."""
-MOST_LOOKED_AT: Final = 1024
-"""To find which count takes time, too: a third of a millisecond.  Of more places, some are left out."""
-MOST_OF_A_CLIENT: Final = 128
+MAX_PLACES: Final = 256
+"""Scoring takes time for each: of more places, the first counts of those that are near each other."""
+MAX_MERGED: Final = 1024
+"""Merging takes time, too: a third of a millisecond.  Of more places, some are left out."""
+MAX_PER_CLIENT: Final = 128
 """Places along a route; the longer it is, the farther apart are those that come late."""
 NEAREST_M: Final = 10.0
-"""Places along a route are at least so far apart, and an eighth of the client's reach."""
+"""Places along a route are at least this far apart, and an eighth of the client's reach."""
 SLOWEST_MPS: Final = 3.0
 """A client that stands still may drive off."""
 STAY_M: Final = 10.0
 """What is just beyond a client's reach stays, whatever its route says: it may turn round or leave it."""
-AT_ONCE: Final = 4096
-"""Pairs of a cell and a place that are looked at together: their tables stay in the processor's cache."""
+PAIRS_PER_BLOCK: Final = 4096
+"""Pairs of a cell and a place that are scored together: their tables stay in the processor's cache."""
 FIRST_SIDE_M: Final = 16.0
 """Places in one square of this side count as one at first, where there are too many."""
 
@@ -52,11 +52,11 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     Parameters
     ----------
     reach_m
-        Within so many metres around it it needs the map.
+        How far around it it needs the map, metres.
     """
     speed = max(motion.speed_mps, SLOWEST_MPS)
     pace = 1.0 / speed
-    here = [motion.x, motion.y, motion.told_s, reach_m]
+    here = [motion.x, motion.y, motion.at_s, reach_m]
     heading = [motion.vx / speed, motion.vy / speed] if motion.speed_mps >= SLOWEST_MPS else [0.0, 0.0]
     route = motion.route
     if route is None or route.length_m <= motion.along_m:
@@ -64,7 +64,7 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     speed = max(motion.fastest_mps, SLOWEST_MPS)
     left_m = route.length_m - motion.along_m
     near_m = max(reach_m / 8.0, NEAREST_M)
-    count = min(MOST_OF_A_CLIENT - 2, max(1, math.ceil(left_m / near_m)))
+    count = min(MAX_PER_CLIENT - 2, max(1, math.ceil(left_m / near_m)))
     # the first ones ``near_m`` apart; if that needs too many, later ones farther
     power = max(1.0, math.log(left_m / near_m) / math.log(count)) if count > 1 else 1.0
     ahead_m = left_m * (np.arange(1, count + 1) / count) ** power
@@ -73,35 +73,35 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     found[0] = [*here, STAY_M, pace, *heading]
     found[1:-1, :2] = route.at(motion.along_m + ahead_m)
     # what comes into reach between two places is needed before the client is at the second
-    found[1:-1, 2] = motion.told_s + (ahead_m - 0.5 * apart_m) / speed
+    found[1:-1, 2] = motion.at_s + (ahead_m - 0.5 * apart_m) / speed
     found[1:-1, 3] = reach_m
     found[1:-1, 4] = 0.5 * apart_m  # between two places the client is no farther from either
-    found[-1] = [*found[-2, :2], motion.told_s + left_m / speed, reach_m, math.inf, pace, 0.0, 0.0]
+    found[-1] = [*found[-2, :2], motion.at_s + left_m / speed, reach_m, math.inf, pace, 0.0, 0.0]
     return found
 
 
 def merged_places(some: Iterable[Places]) -> Places:
-    """Return the places of many clients as one table of at most `MOST_PLACES`.
+    """Return the places of many clients as one table of at most `MAX_PLACES`.
 
     Where there are more, the earliest of those in one square stands for all of them.
     """
     tables = list(some)
     if not tables:
         return NOWHERE
-    thin = sum(map(len, tables)) // MOST_LOOKED_AT + 1
+    thin = sum(map(len, tables)) // MAX_MERGED + 1
     if thin > 1:  # of each its first place, its last and some between them
         tables = [part for table in tables for part in (table[:-1:thin], table[-1:])]
     found = np.concatenate(tables)
-    if len(found) > MOST_PLACES:
+    if len(found) > MAX_PLACES:
         found = found[np.argsort(found[:, 2], kind="stable")]
     side = FIRST_SIDE_M
-    while len(found) > MOST_PLACES:
+    while len(found) > MAX_PLACES:
         squares = np.floor(np.clip(found[:, :2] / side, -(2.0**30), 2.0**30)).astype(np.int64)
         keys = squares[:, 0] << 32 | squares[:, 1] & 0xFFFFFFFF
         keys = keys << 1 ^ np.isinf(found[:, 4])  # from a place that is open anything may be reached
         _, first = np.unique(keys, return_index=True)
         found = found[np.sort(first)]
-        side *= 2.0 if len(found) < 4 * MOST_PLACES else 4.0
+        side *= 2.0 if len(found) < 4 * MAX_PLACES else 4.0
     return found
 
 
@@ -118,7 +118,7 @@ def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> ND
     found = np.full(len(boxes), np.inf)
     heads = (places[:, 6] != 0.0) | (places[:, 7] != 0.0)
     for some, somewhere in ((places[heads], True), (places[~heads], False)):
-        together = max(1, AT_ONCE // max(1, len(some)))
+        together = max(1, PAIRS_PER_BLOCK // max(1, len(some)))
         for begin in range(0, len(boxes) if len(some) else 0, together):
             part = slice(begin, begin + together)
             np.minimum(found[part], _until(boxes[part], some, now_s, somewhere=somewhere), out=found[part])
@@ -128,7 +128,7 @@ def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> ND
 def _until(
     boxes: NDArray[np.float64], places: Places, now_s: float, *, somewhere: bool
 ) -> NDArray[np.float64]:
-    """In how many seconds each cell will be needed; ``somewhere``: clients are known to head somewhere."""
+    """Return in how many seconds each cell will be needed; ``somewhere``: clients have a heading."""
     x, y, at_s, reach, limit, pace, hx, hy = places.T[:, :, np.newaxis]
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)

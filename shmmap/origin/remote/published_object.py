@@ -33,8 +33,7 @@ from shmmap.segment.layout import (
     SourceStamp,
     header_size,
 )
-from shmmap.segment.version import Source
-from shmmap.segment.version import Stamp
+from shmmap.segment.version import Source, Stamp
 from shmmap.segment.writer import write_all
 
 __all__ = [

@@ -16,8 +16,7 @@ import msgspec
 from shmmap.errors import ConfigError, ShmmapError
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, Current
-from shmmap.processes.packets import packet_buffer, receive_packet
-from shmmap.processes.start_child import how_ended, start_child
+from shmmap.processes.start_child import how_ended, packet_buffer, receive_packet, start_child
 
 __all__ = [
     "Verified",

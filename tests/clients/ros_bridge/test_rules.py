@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.shared_options import names
 from shmmap_clients.ros_bridge.catalogue import Requesters
 from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
 from shmmap_clients.ros_bridge.service_server import Request, Requester
 from shmmap_clients.ros_bridge.worker import MOST_OF_ONE, MOST_WAITING, WaitingRequests
+from shmmap_clients.shared_options import names
 
 import shmmap
 
@@ -69,7 +69,7 @@ def test_what_a_client_was_sent_is_what_it_holds() -> None:
 def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
     requesters = Requesters(most=2)
     for client in ("one", "two", "one", "three"):
-        requesters.answered(who, [], [], {"a": 1})
+        requesters.answered(client, [], [], {"a": 1})
     assert len(requesters) == 2
     assert [requesters.held(client, ["a"], {"a": 5})[0].version for client in ("one", "two", "three")] == [
         1,

@@ -31,7 +31,6 @@ from shmmap.daemon.records import Key
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.serving_loop import LOADS_A_TURN
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
@@ -77,7 +76,7 @@ class InnerDaemon:
         shm_dir: str = "",
         name: str = "inner",
         prefetch_share: float = 0.0,
-        ride_out_s: float = 10.0,
+        outage_tolerance_s: float = 10.0,
     ) -> None:
         prepare_process()
         self.shm_dir = shm_dir or tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
@@ -110,7 +109,7 @@ class InnerDaemon:
         self.map_switch = MapSwitch(self.cache)
         self.scheduler = Scheduler(
             self.cache, self.map_switch, self.pool, clock=self.now_s, prefetch_share=prefetch_share,
-            ride_out_s=ride_out_s,
+            outage_tolerance_s=outage_tolerance_s,
         )  # fmt: skip
         self.loads = self.scheduler.loads
         self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.hear_of_freed)
@@ -170,10 +169,9 @@ class InnerDaemon:
         self.scheduler.lost.end_overdue(now_s)
         self.cache.survey.turn(now_s)
         self.scheduler.free(now_s)
-        for _ in range(LOADS_A_TURN):
+        self.scheduler.pump(now_s)
+        while self.scheduler.unfinished:
             self.scheduler.pump(now_s)
-            if not self.scheduler.unfinished:
-                break
         self.cells.answer_overdue(now_s)
         self.map_switch.turn(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings: where they come from, which wins, and what is said of a wrong one."""
+"""Settings: where they come from, which wins, what is said of a wrong one, and the example of a file."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import os
-from dataclasses import fields
+import re
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.cli.parser import build_parser
-from shmmap.daemon.config import ROWS, DaemonConfig, load_config, option_of
+from shmmap.daemon.config import (
+    DROPPED,
+    ROWS,
+    DaemonConfig,
+    installed_config_file,
+    load_config,
+    option_of,
+    read_settings_file,
+    trace_settings,
+)
+from shmmap.daemon.config_live import LIVE_ROWS, LiveSettings
 from shmmap.daemon.config_table import parse_bytes
 from shmmap.errors import ConfigError
+from shmmap.service.installation import configuration
+from tests.support.daemon_process import ROOT
+
+EXAMPLE = ROOT / "systemd" / "shmmap.toml"
+OF_THE_SERVICE = DaemonConfig(map_path="/var/lib/shmmap/maps", group="shmmap")
 
 
 def load(
@@ -26,24 +42,30 @@ def load(
     return load_config(flags or {}, file=file, environ=environ or {})
 
 
+# --- where they come from -----------------------------------------------------------------------------
+
+
 def test_defaults() -> None:
-    assert load() == DaemonConfig()
-    assert load({"budget": None, "workers": None}) == DaemonConfig()
+    environ = {"SHMMAP_TEST_DATA": "/x", "SHMMAPX": "1"}  # which are no settings
+    assert load() == load({"budget": None, "workers": None}) == load(environ=environ) == DaemonConfig()
 
 
-def test_later_origins_win(tmp_path: Path) -> None:
+def test_later_origins_win_and_each_setting_knows_its_own(tmp_path: Path) -> None:
     file = tmp_path / "shmmap.toml"
-    file.write_text('budget = "1G"\nworkers = 2\ninstance = "file"\nload_timeout_s = 5\nstrict = true\n')
-    environ = {"SHMMAP_WORKERS": "3", "SHMMAP_INSTANCE": "variable", "HOME": "/root", "SHMMAP_STRICT": "no"}
-    config = load({"instance": "flag"}, environ, str(file))
-    assert (config.budget_bytes, config.workers, config.instance) == (1 << 30, 3, "flag")
-    assert (config.load_timeout_s, config.strict) == (5.0, False)
-    assert isinstance(config.load_timeout_s, float)
-
-
-def test_variables_that_are_no_settings() -> None:
-    environ = {"SHMMAP_TEST_DATA": "/x", "SHMMAPX": "1"}
-    assert load(environ=environ) == DaemonConfig()
+    file.write_text(
+        "# settings\nworkers = 2\nload_timeout_s = 5\n  'log_level' = \"debug\"\nbudget = '1G'\n"
+        "instance = 'car'\nstrict = true\n"
+    )
+    environ = {"SHMMAP_BUDGET": "2G", "SHMMAP_STRICT": "no", "HOME": "/"}
+    found = trace_settings({"instance": "bus", "group": None}, file=str(file), environ=environ)
+    assert found["workers"] == (2, f"{file}:2")
+    assert found["log_level"] == ("debug", f"{file}:4")
+    assert found["budget_bytes"] == (2 << 30, "SHMMAP_BUDGET")
+    assert found["instance"] == ("bus", "command line")
+    assert found["group"] == ("", "default")
+    assert set(found) == set(DaemonConfig.__dataclass_fields__)
+    config = load({"instance": "bus"}, environ, str(file))
+    assert (config.strict, config.load_timeout_s, type(config.load_timeout_s)) == (False, 5.0, float)
 
 
 @pytest.mark.parametrize(
@@ -60,17 +82,45 @@ def test_variables_that_are_no_settings() -> None:
 def test_the_endpoint_of_clients_is_the_daemon_s(
     flags: dict[str, str], environ: dict[str, str], endpoint: str, instance: str
 ) -> None:
-    """And whoever knows the socket alone finds the statistics, as they are named after the instance."""
+    """A program that knows the socket alone finds the statistics, as they are named after the instance."""
     config = load(flags, environ={"SHMMAP_ENDPOINT": "/run/city.sock", **environ})
     assert (config.endpoint, config.instance) == (endpoint, instance)
 
 
-def test_sizes_have_one_name_in_files_variables_and_options() -> None:
+def test_sizes_have_one_name_in_files_variables_and_options(tmp_path: Path) -> None:
+    """Not that of the attribute in the code."""
     assert load({"cache_size": "1G"}).cache_bytes == 1 << 30
     assert load(environ={"SHMMAP_CACHE_SIZE": "2G", "SHMMAP_BUDGET": "1M"}).cache_bytes == 2 << 30
-    with pytest.raises(ConfigError, match="unknown") as caught:
-        load({"cache_sise": 1})
-    assert caught.value.hint == "did you mean 'cache_size'?"
+    file = tmp_path / "shmmap.toml"
+    for word in ("budget_bytes", "cache_bytes"):
+        file.write_text(f"{word} = '1G'\n")
+        with pytest.raises(ConfigError, match=word):
+            load(file=str(file))
+        with pytest.raises(ConfigError, match=word):
+            load(environ={f"SHMMAP_{word.upper()}": "1G"})
+
+
+def test_which_file_is_installed(tmp_path: Path) -> None:
+    own = tmp_path / "shmmap" / "shmmap.toml"
+    environ = {"XDG_CONFIG_HOME": str(tmp_path), "HOME": "/nowhere"}
+    assert installed_config_file(environ) in ("", "/etc/shmmap/shmmap.toml")
+    own.parent.mkdir()
+    own.touch()
+    assert installed_config_file(environ) == str(own)
+    (tmp_path / ".config").symlink_to(tmp_path)
+    assert installed_config_file({"HOME": str(tmp_path)}) == f"{tmp_path}/.config/shmmap/shmmap.toml"
+
+
+def test_the_command_line_has_the_options_that_errors_name() -> None:
+    (verbs,) = (one for one in build_parser()._actions if isinstance(one, argparse._SubParsersAction))
+    actions = {action.dest: action for action in verbs.choices["serve"]._actions}
+    assert set(actions) == {*(field.name for field in fields(DaemonConfig)), "config", "help", *DROPPED}
+    for name in ROWS:
+        assert option_of(name) in (*actions[name].option_strings, actions[name].metavar)
+        assert actions[name].default is None, "the configuration file may say"
+
+
+# --- values -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -100,6 +150,33 @@ def test_any_text_is_a_size_or_refused(text: str) -> None:
         assert 0 <= parse_bytes(text) <= 1 << 62
 
 
+@pytest.mark.parametrize(("quota", "value"), [("0.5", 0.5), ("1", 1.0), ("64M", float(64 << 20)), (1, 1.0)])
+def test_quotas_are_parts_or_bytes(quota: str | int, value: float) -> None:
+    assert load({"session_quota": quota}).session_quota == value
+
+
+def test_a_processor_is_left_for_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    for processors, loaders in ((1, 1), (2, 1), (4, 3), (64, 4)):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, count=processors: set(range(count)))
+        assert DaemonConfig().loaders() == loaders
+    assert DaemonConfig(workers=9).loaders() == 9
+
+
+def test_the_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert DaemonConfig(endpoint="ipc:///run/a.sock").socket() == "/run/a.sock"
+    assert DaemonConfig(endpoint="/run/a.sock", runtime_dir="/other").socket() == "/run/a.sock"
+    assert DaemonConfig(runtime_dir=str(tmp_path), instance="car").socket() == f"{tmp_path}/car.sock"
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/service")
+    assert DaemonConfig(instance="car").socket() == "/run/service/car.sock"
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert DaemonConfig().socket() == f"{tmp_path}/shmmap/default.sock"
+
+
+# --- mistakes -----------------------------------------------------------------------------------------
+
+
 BAD: list[tuple[str, Any]] = [
     ("workers", -1), ("workers", 65), ("workers", "many"), ("workers", 1.5), ("workers", True),
     ("workers", "1e9"), ("load_timeout_s", float("nan")),
@@ -119,24 +196,14 @@ BAD: list[tuple[str, Any]] = [
 def test_a_wrong_value_is_refused_with_its_origin(name: str, value: Any) -> None:
     with pytest.raises(ConfigError) as failure:
         load({name: value})
-    assert failure.value.origin == "command line"
-    assert failure.value.key == name
+    assert (failure.value.origin, failure.value.key, failure.value.exit_code) == ("command line", name, 78)
     assert failure.value.message.startswith("command line: ")
     assert option_of(name) in failure.value.message
-    assert failure.value.exit_code == 78
 
 
-def test_the_command_line_has_the_options_that_errors_name() -> None:
-    (verbs,) = (one for one in build_parser()._actions if isinstance(one, argparse._SubParsersAction))
-    actions = {action.dest: action for action in verbs.choices["serve"]._actions}
-    assert set(actions) == {*(field.name for field in fields(DaemonConfig)), "config", "help", "eviction"}
-    for name in ROWS:
-        assert option_of(name) in (*actions[name].option_strings, actions[name].metavar)
-        assert actions[name].default is None, "the configuration file may say"
-
-
-def test_a_value_out_of_range_is_told_what_may_be() -> None:
-    for name, value, hint in (
+@pytest.mark.parametrize(
+    ("name", "value", "hint"),
+    [
         ("log_level", "loud", "debug, info or warning"),
         ("session_quota", "90", "up to 1"),
         ("workers", 65, "0 to 64; 0: one less than there are processors"),
@@ -146,92 +213,133 @@ def test_a_value_out_of_range_is_told_what_may_be() -> None:
         ("cache_size", 1.5, 'its default is "8G"'),
         ("strict", "maybe", "its default is false"),
         ("map_path", 5, "in quotes"),
-    ):
-        with pytest.raises(ConfigError) as failure:
-            load({name: value})
-        assert hint in failure.value.hint
+    ],
+)
+def test_the_hint_names_what_is_allowed(name: str, value: Any, hint: str) -> None:
+    with pytest.raises(ConfigError) as failure:
+        load({name: value})
+    assert hint in failure.value.hint
 
 
-def test_a_setting_that_is_gone_is_refused_with_what_to_do(tmp_path: Path) -> None:
+GONE: list[tuple[dict[str, str], str, str, str, str]] = [
+    ({}, "", 'workers = 2\neviction = "time"\n', ":2: eviction is gone: what clients", "delete this line"),
+    ({}, "EVICTION", "", "SHMMAP_EVICTION: eviction is gone: what clients", "unset SHMMAP_EVICTION"),
+    ({"eviction": "distance"}, "", "", "command line: --eviction is gone: what clients", "leave it out"),
+    (
+        {},
+        "",
+        "ride_out_s = 5\n",
+        ":1: ride_out_s is gone: it is outage_tolerance_s",
+        "write outage_tolerance_s",
+    ),
+    ({}, "RIDE_OUT_S", "", "it is SHMMAP_OUTAGE_TOLERANCE_S now", "write SHMMAP_OUTAGE_TOLERANCE_S"),
+    (
+        {"ride_out_s": "5"},
+        "",
+        "",
+        "--ride-out is gone: it is --outage-tolerance now",
+        "write --outage-tolerance",
+    ),
+]
+
+
+@pytest.mark.parametrize(("flags", "variable", "text", "message", "hint"), GONE)
+def test_a_setting_that_is_gone_is_refused_with_what_to_do(
+    tmp_path: Path, flags: dict[str, str], variable: str, text: str, message: str, hint: str
+) -> None:
     """Also one that says what always holds now."""
     file = tmp_path / "shmmap.toml"
-    file.write_text('workers = 2\neviction = "time"\n')
-    cases: list[tuple[dict[str, Any], dict[str, str], str, str, str]] = [
-        ({}, {}, str(file), f"{file}:2: eviction is gone: what clients will need", "delete this line"),
-        ({}, {"SHMMAP_EVICTION": "lru"}, "", "SHMMAP_EVICTION: eviction is gone", "unset SHMMAP_EVICTION"),
-        ({"eviction": "distance"}, {}, "", "command line: --eviction is gone", "leave it out"),
-    ]
-    for flags, environ, path, message, hint in cases:
-        with pytest.raises(ConfigError) as failure:
-            load(flags, environ, path)
-        assert message in failure.value.message
-        assert failure.value.hint == hint
-        assert failure.value.exit_code == 78
+    file.write_text(text)
+    with pytest.raises(ConfigError) as failure:
+        load(flags, {f"SHMMAP_{variable}": "time"} if variable else {}, str(file))
+    assert message in failure.value.message
+    assert (failure.value.hint, failure.value.exit_code) == (hint, 78)
 
 
 def test_a_wrong_variable_is_named() -> None:
-    with pytest.raises(ConfigError) as failure:
+    with pytest.raises(ConfigError, match="SHMMAP_BUDGET: ") as failure:
         load(environ={"SHMMAP_BUDGET": "lots"})
     assert failure.value.origin == "SHMMAP_BUDGET"
-    assert "SHMMAP_BUDGET: " in failure.value.message
-
-
-def test_a_wrong_line_of_the_file_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "shmmap.toml"
-    file.write_text("workers = 'x'\n")
-    with pytest.raises(ConfigError) as failure:
-        load(file=str(file))
-    assert failure.value.origin == f"{file}:1"
 
 
 @pytest.mark.parametrize(
-    ("given_name", "suggestion"),
-    [("budgett", "budget"), ("bugdet", "budget"), ("worker", "workers"), ("shmdir", "shm_dir"), ("qqqq", "")],
+    ("name", "suggestion"),
+    [
+        ("budgett", "budget"),
+        ("bugdet", "budget"),
+        ("worker", "workers"),
+        ("cache_sise", "cache_size"),
+        ("shmdir", "shm_dir"),
+        ("qqqq", ""),
+    ],
 )
-def test_unknown_settings_with_a_suggestion(given_name: str, suggestion: str) -> None:
-    for flags, environ in (({given_name: "1"}, {}), ({}, {f"SHMMAP_{given_name.upper()}": "1"})):
+def test_unknown_settings_with_a_suggestion(name: str, suggestion: str) -> None:
+    for flags, environ in (({name: "1"}, {}), ({}, {f"SHMMAP_{name.upper()}": "1"})):
         with pytest.raises(ConfigError, match="unknown setting") as failure:
             load(flags, environ)
-        if suggestion:
-            assert f"did you mean '{suggestion}" in failure.value.hint
-        else:
-            assert "settings are: " in failure.value.hint
+        expected = f"did you mean '{suggestion}'?" if suggestion else "settings are: "
+        assert failure.value.hint.startswith(expected)
 
 
-@pytest.mark.parametrize("content", [b"workers = ", b"= 3", b"\xff\xfe", b"[table]\nworkers = 3\n"])
-def test_files_that_are_no_settings(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize(
+    ("text", "line"), [("a=1\nworkers = 'x'\n", 1), ("workers = 2\nbugdet = 3\n", 2), ("\n\nworkers=-1", 3)]
+)
+def test_a_mistake_is_named_with_its_line(tmp_path: Path, text: str, line: int) -> None:
     file = tmp_path / "shmmap.toml"
-    file.write_bytes(content)
+    file.write_text(text)
+    with pytest.raises(ConfigError) as failure:
+        load(file=str(file))
+    assert failure.value.origin == f"{file}:{line}"
+    assert failure.value.message.startswith(f"{file}:{line}: ")
+
+
+def test_lines_that_only_look_like_settings(tmp_path: Path) -> None:
+    file = tmp_path / "shmmap.toml"
+    file.write_text('map_path = """\nworkers = 9\n"""\n"workers"=3\n[budget]\nworkers = 4\n')
+    found = read_settings_file(str(file))
+    assert found["map_path"] == ("workers = 9\n", f"{file}:1")
+    assert found["workers"] == (3, f"{file}:4")
+    assert found["budget"].origin == f"{file}:5"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"workers = ", b"= 3", b"\xff\xfe", b"[table]\nworkers = 3\n", b"a = " + b"[" * 5000 + b"]" * 5000,
+     b"#" * ((1 << 20) + 1), "pipe", "directory", "missing"],
+)  # fmt: skip
+def test_what_is_no_file_of_settings(tmp_path: Path, content: bytes | str) -> None:
+    file = tmp_path / "shmmap.toml"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content == "directory":
+        file.mkdir()
+    elif content == "pipe":
+        os.mkfifo(tmp_path / "pipe")
+        file.symlink_to("pipe")
     with pytest.raises(ConfigError, match=str(file)):
         load(file=str(file))
 
 
-def test_a_file_that_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="No such file"):
-        load(file=str(tmp_path / "none.toml"))
+# --- the example --------------------------------------------------------------------------------------
 
 
-def test_quotas_are_parts_or_bytes() -> None:
-    assert load({"session_quota": "0.5"}).session_quota == 0.5
-    assert load({"session_quota": "1"}).session_quota == 1.0
-    assert load({"session_quota": "64M"}).session_quota == float(64 << 20)
-    assert load({"session_quota": 1}).session_quota == 1.0
+def test_the_example_is_the_one_that_settings_make() -> None:
+    """After a setting is changed: ``python -m tests.unit.daemon.test_config`` writes it again."""
+    assert EXAMPLE.read_text(encoding="utf-8") == configuration()
+    assert load(file=str(EXAMPLE)) == OF_THE_SERVICE
 
 
-def test_a_processor_is_left_for_who_is_being_served(monkeypatch: pytest.MonkeyPatch) -> None:
-    for processors, loaders in ((1, 1), (2, 1), (4, 3), (64, 4)):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, count=processors: set(range(count)))
-        assert DaemonConfig().loaders() == loaders
-    assert DaemonConfig(workers=9).loaders() == 9
+def test_what_the_example_comments_out_are_all_settings_with_their_defaults(tmp_path: Path) -> None:
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assignment = re.compile(r"^#?(?:  )?(?=([a-z_]+) = |\[live\.lidar\]$)", re.MULTILINE)
+    named = [match[1] for match in assignment.finditer(text) if match[1]]
+    assert named == [*(row.called for row in ROWS.values()), *LIVE_ROWS]
+    assert [*ROWS, "live"] == [one.name for one in fields(DaemonConfig)]
+    assert ["name", *LIVE_ROWS] == [one.name for one in fields(LiveSettings)]
+    file = tmp_path / "all.toml"
+    file.write_text(assignment.sub("", text))
+    assert load(file=str(file)) == replace(OF_THE_SERVICE, live=(LiveSettings("lidar"),))
 
 
-def test_the_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    assert DaemonConfig(endpoint="ipc:///run/a.sock").socket() == "/run/a.sock"
-    assert DaemonConfig(endpoint="/run/a.sock", runtime_dir="/other").socket() == "/run/a.sock"
-    assert DaemonConfig(runtime_dir=str(tmp_path), instance="car").socket() == f"{tmp_path}/car.sock"
-    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/service")
-    assert DaemonConfig(instance="car").socket() == "/run/service/car.sock"
-    monkeypatch.delenv("RUNTIME_DIRECTORY")
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert DaemonConfig().socket() == f"{tmp_path}/shmmap/default.sock"
+if __name__ == "__main__":
+    EXAMPLE.write_text(configuration(), encoding="utf-8")

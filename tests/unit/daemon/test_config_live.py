@@ -35,9 +35,9 @@ def test_a_flag_s_map_has_the_settings_of_its_table() -> None:
 @pytest.mark.parametrize("name", ["", "a b", "a.b", "a/b", "..", "ä", "x" * 65, "a\n"])
 def test_a_name_that_cannot_be(name: str) -> None:
     for flags, tables in (([name], {}), ([], {name: {}})):
-        with pytest.raises(ConfigError, match="cannot be called") as told:
+        with pytest.raises(ConfigError, match="cannot be called") as failure:
             live_settings(flags, tables, FILE)
-        assert "64 letters" in told.value.hint
+        assert "64 letters" in failure.value.hint
 
 
 @pytest.mark.parametrize(
@@ -66,28 +66,28 @@ def test_a_name_that_cannot_be(name: str) -> None:
         ({"clamp_min": 0.0}, "live.lidar.clamp_min: clamp_min = 0.0: need a probability", ""),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(table: dict[str, Any], said: str, hint: str) -> None:
-    with pytest.raises(ConfigError) as told:
+def test_what_is_wrong_is_reported_with_its_place(table: dict[str, Any], said: str, hint: str) -> None:
+    with pytest.raises(ConfigError) as failure:
         live_settings([], {"lidar": table}, FILE)
-    assert said in told.value.message
-    assert told.value.message.startswith(f"{FILE}: live")
-    assert told.value.origin == FILE
-    assert hint in told.value.hint
-    assert told.value.hint or "need" in told.value.message
+    assert said in failure.value.message
+    assert failure.value.message.startswith(f"{FILE}: live")
+    assert failure.value.origin == FILE
+    assert hint in failure.value.hint
+    assert failure.value.hint or "need" in failure.value.message
 
 
 @pytest.mark.parametrize("tables", [{"lidar": 3}, {"lidar": [{}]}, 7, ["lidar"]])
 def test_what_is_no_table(tables: Any) -> None:
-    with pytest.raises(ConfigError, match="live must be tables") as told:
+    with pytest.raises(ConfigError, match="live must be tables") as failure:
         live_settings([], tables, FILE)
-    assert "[live.NAME]" in told.value.hint
+    assert "[live.NAME]" in failure.value.hint
 
 
 def test_two_maps_in_one_directory(tmp_path: Path) -> None:
     (tmp_path / "same").symlink_to(tmp_path)
-    with pytest.raises(ConfigError, match="live maps a and b are both in") as told:
+    with pytest.raises(ConfigError, match="live maps a and b are both in") as failure:
         live_settings([f"a={tmp_path}", f"b={tmp_path}/same"], {})
-    assert "a directory of its own" in told.value.hint
+    assert "a directory of its own" in failure.value.hint
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,6 @@ def test_where_a_map_is_kept(environ: dict[str, str], path: str) -> None:
 
 
 def test_where_nothing_says_where() -> None:
-    with pytest.raises(ConfigError, match="no state directory for live map lidar") as told:
+    with pytest.raises(ConfigError, match="no state directory for live map lidar") as failure:
         live_directory("city", "lidar", {"HOME": ""})
-    assert told.value.hint == "name one: --live lidar=DIR"
+    assert failure.value.hint == "name one: --live lidar=DIR"

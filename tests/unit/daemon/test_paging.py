@@ -74,7 +74,7 @@ class Paged:
 
     @property
     def paging(self) -> Paging:
-        found = [chore for _, chore in self.daemon.service._loop.chores if isinstance(chore, Paging)]
+        found = [task for _, task in self.daemon.service._loop.tasks if isinstance(task, Paging)]
         return found[0]
 
     def count(self, name: str) -> int:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Three walks a reader can take, and how many files of the daemon each enters on the loop's thread.
 
-Start-up, what has its own time (asked for by `ServingLoop._patience_s`, done by `_look_after_the_rest`) and
+Start-up, what has its own time (asked for by `ServingLoop._poll_timeout_s`, done by `_do_what_is_due`) and
 loader processes do not count.
 ``shmmap/ARCHITECTURE.md`` lists the files of each walk; the lists there are these sets.
 """
@@ -25,7 +25,7 @@ from tests.unit.daemon.whole_daemon import WholeDaemon
 DAEMON = str(Path(shmmap.daemon.__file__).parent)
 ARCHITECTURE = Path(DAEMON).with_name("ARCHITECTURE.md")
 EVERYWHERE = m.BoxMessage(-1e4, -1e4, 1e4, 1e4)
-LEFT_OUT = {"_poll", "_patience_s", "_look_after_the_rest"}
+LEFT_OUT = {"_poll", "_poll_timeout_s", "_do_what_is_due"}
 
 
 class Walker:

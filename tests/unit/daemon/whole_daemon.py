@@ -72,8 +72,11 @@ class WholeDaemon:
         self.ask(HELLO)
 
     def turn(self) -> None:
+        """Serve what has come, and do a round of all other work."""
         loop = self.service._loop
-        loop._turn(loop._poll(loop._patience_s()))
+        loop.turn()
+        while loop._round is not None:
+            loop.turn()
 
     def turn_until(self, done: Callable[[], object]) -> None:
         end_s = time.monotonic() + PATIENCE_S

@@ -189,7 +189,7 @@ def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
 DRIVING = {
     "prefetch_budget_bytes": 512 << 20,
     "budget_bytes": 1 << 30,
-    "ride_out_ns": 10 * S,
+    "outage_tolerance_ns": 10 * S,
     "hits_10min": 4000,
 }
 SMALLER = "give the clients a smaller radius or a layer with fewer bytes"
@@ -233,7 +233,7 @@ WAITED = "moving clients waited for 150 cells in the last 10 min"
             DRIVING | {"prefetch_misses_10min": 1, "last_outage_ns": 13 * S + 1},
             "warn",
             "moving clients waited for 1 cell in the last 10 min; the map's storage was out of reach for 13",
-            "raise --ride-out (14)",
+            "raise --outage-tolerance (14)",
         ),
         (
             DRIVING | {"prefetch_misses_10min": 150, "prefetch_short": 1},

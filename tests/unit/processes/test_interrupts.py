@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handlers of signals are as they were after the block, wherever a signal falls."""
+"""Interrupts at the wrong moment: handlers of signals are as before, and none is lost."""
 
 from __future__ import annotations
 
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -70,3 +71,59 @@ def test_what_is_held_back_comes_after_the_block_also_when_it_fails() -> None:
         signal.raise_signal(signal.SIGINT)
         raise ValueError
     assert isinstance(caught.value.__context__, ValueError)
+
+
+PROGRAM = """\
+import os, signal, sys, time, weakref
+from shmmap.cli.program import keep_interrupts
+
+class Thing:
+    def __del__(self):
+        if "finalizer" in sys.argv:
+            signal.raise_signal(number)
+
+def callback(_):
+    if "callback" in sys.argv:
+        signal.raise_signal(number)
+
+def stop(*_):
+    raise SystemExit(7)
+
+def dictionary():
+    found = weakref.WeakValueDictionary()
+    one = found[1] = Thing()
+    return found, one
+
+keep_interrupts()
+number = signal.SIGTERM if "stop" in sys.argv else signal.SIGINT
+signal.signal(signal.SIGTERM, stop)
+for _ in range(2 if "twice" in sys.argv else 1):
+    try:
+        thing = Thing()
+        watched = weakref.ref(thing, callback)
+        del thing
+        os.write(1, b"ignored ")
+        time.sleep(30)
+    except (KeyboardInterrupt, SystemExit) as error:
+        os.write(1, type(error).__name__.encode() + b" ")
+"""
+
+
+@pytest.mark.parametrize("where", ["finalizer", "callback"])
+@pytest.mark.parametrize("what", ["interrupt", "stop"])
+@pytest.mark.parametrize("times", ["once", "twice"])
+def test_what_was_ignored_comes_again(where: str, what: str, times: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, where, what, times], capture_output=True, text=True, timeout=60
+    )
+    raised = "KeyboardInterrupt" if what == "interrupt" else "SystemExit"
+    assert done.stdout.split() == ["ignored", raised] * (2 if times == "twice" else 1)
+    assert done.stderr == ""
+
+
+def test_other_exceptions_are_reported_as_before() -> None:
+    program = PROGRAM.replace("signal.raise_signal(number)", "raise ValueError('odd')").replace("30", "0")
+    done = subprocess.run(
+        [sys.executable, "-c", program, "finalizer"], capture_output=True, text=True, timeout=60
+    )
+    assert "ValueError: odd" in done.stderr

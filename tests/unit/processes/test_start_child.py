@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A child process, from its first instruction on."""
+"""A child process from its first instruction on; packets with and without a descriptor, into one buffer."""
 
 from __future__ import annotations
 
+import os
 import re
 import signal
+import socket
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
-from shmmap.processes.start_child import start_child
+from shmmap.processes.start_child import MAX_PACKET_BYTES, channel, packet_buffer, receive_packet, start_child
 
 
 @pytest.mark.parametrize("new_session", [False, True])
@@ -25,3 +28,73 @@ def test_ctrl_c_cannot_end_a_child_in_its_imports(new_session: bool) -> None:
     assert found is not None
     assert int(found[1], 16) & 1 << signal.SIGINT - 1
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ()), "the parent hears it"
+
+
+def test_a_descriptor_comes_with_its_packet_and_is_not_inherited() -> None:
+    ours, theirs = channel()
+    read, write = os.pipe()
+    buffer = packet_buffer()
+    with ours, theirs:
+        ours.send(b"first")
+        socket.send_fds(ours, [b"second"], [write])
+        data, fd = receive_packet(theirs, buffer)
+        assert (bytes(data), fd) == (b"first", -1)
+        data, fd = receive_packet(theirs, buffer)
+        assert bytes(data) == b"second"
+        assert not os.get_inheritable(fd)
+        os.write(fd, b"x")
+        assert os.read(read, 1) == b"x"
+        ours.close()
+        data, none = receive_packet(theirs, buffer)
+        assert (len(data), none) == (0, -1)
+    for one in (read, write, fd):
+        os.close(one)
+
+
+def test_of_several_descriptors_only_one_comes() -> None:
+    """A loader that has gone mad must not fill the daemon's table."""
+    ours, theirs = channel()
+    with ours, theirs:
+        before = len(os.listdir("/proc/self/fd"))
+        socket.send_fds(ours, [b"x"], [0] * 10)
+        _, fd = receive_packet(theirs, packet_buffer())
+        after = len(os.listdir("/proc/self/fd"))
+        os.close(fd)
+    assert after - before == 1
+
+
+def test_the_longest_packet_arrives_and_short_ones_take_no_memory() -> None:
+    ours, theirs = channel()
+    buffer = packet_buffer()
+    with ours, theirs:
+        longest = bytes(MAX_PACKET_BYTES - 1024)
+        ours.send(longest)
+        assert receive_packet(theirs, buffer)[0] == longest
+        theirs.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            receive_packet(theirs, buffer)
+        ours.send(b"short")
+        tracemalloc.start()
+        receive_packet(theirs, buffer)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 1 << 16
+
+
+def test_who_does_not_wait_gets_what_is_there_and_the_channel_still_waits() -> None:
+    ours, theirs = channel()
+    buffer = packet_buffer()
+    with ours, theirs:
+        with pytest.raises(BlockingIOError):
+            receive_packet(theirs, buffer, wait=False)
+        assert theirs.getblocking()
+        ours.send(b"one")
+        assert bytes(receive_packet(theirs, buffer, wait=False)[0]) == b"one"
+
+
+def test_the_longest_packet_goes_both_ways() -> None:
+    ours, theirs = channel()
+    longest = bytes(MAX_PACKET_BYTES - 1024)
+    with ours, theirs:
+        theirs.send(longest)
+        assert receive_packet(ours, packet_buffer())[0] == longest

@@ -23,7 +23,7 @@ from tests.unit.statistics.conftest import client, row
 
 
 def test_no_room_for_clients(shm: ShmDirectory, writer: StatisticsWriter) -> None:
-    writer.reserve = lambda _: False
+    writer._reserve = lambda _: False
     writer.show_clients([client(number) for number in range(20)])
     writer.beat()
     assert len(read_statistics("unit", shm.path).clients) == 16
@@ -43,7 +43,7 @@ def test_no_room_for_rows(
         fallocate(fd, offset, length)
 
     if cause == "budget":
-        writer.reserve = lambda _: not full
+        writer._reserve = lambda _: not full
     else:
         monkeypatch.setattr(os, "posix_fallocate", refuse)
     size = writer.size_bytes

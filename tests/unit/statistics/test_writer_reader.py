@@ -130,10 +130,10 @@ def test_live_maps_take_memory_only_where_there_are_any(shm: ShmDirectory, write
 
 def test_live_maps_that_find_no_memory_are_shown_later(shm: ShmDirectory, writer: StatisticsWriter) -> None:
     row = live_map(1)
-    writer.reserve = lambda _nbytes: False
+    writer._reserve = lambda _nbytes: False
     writer.show_live_maps([row])
     assert read_statistics("unit", shm.path).live == []
-    writer.reserve = lambda _nbytes: True
+    writer._reserve = lambda _nbytes: True
     writer.show_live_maps([row])
     assert read_statistics("unit", shm.path).live == [row]
 

@@ -29,8 +29,7 @@ def directory_from(args: argparse.Namespace) -> str:
 
 def _places(name: str) -> list[str]:
     """Where a live map of a name may have its files, as settings and custom say."""
-    from shmmap.daemon.config import load_config
-    from shmmap.daemon.config_file import installed_config_file
+    from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 
     config = load_config({}, file=installed_config_file())

@@ -47,7 +47,7 @@ from shmmap.errors import (
 )
 from shmmap.logfmt import log
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.packets import packet_buffer, receive_packet
+from shmmap.processes.start_child import packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_request, encode, request_number
 from shmmap.protocol.live import LIVE_REQUESTS, LiveList, LiveListed, LiveMapRow
 from shmmap.protocol.messages import ErrorReply

@@ -11,7 +11,7 @@ import os
 import pwd
 from typing import Final
 
-from shmmap.daemon.host.groups import group_id
+from shmmap.daemon.prerequisites import group_id
 from shmmap.daemon.transport.connection import Peer
 from shmmap.errors import NotPermitted
 

@@ -113,7 +113,7 @@ def test_nothing_is_cut_off_where_it_can_go_on_below(width: int) -> None:
 
 
 DRIVING = FULL | counters(
-    prefetch_budget_bytes=50 * MIB, ride_out_ns=10**10, last_outage_ns=2 * 10**9,
+    prefetch_budget_bytes=50 * MIB, outage_tolerance_ns=10**10, last_outage_ns=2 * 10**9,
     prefetch_started=120, prefetch_used=100, prefetch_in_vain=3, prefetch_misses=7, prefetch_misses_1min=2,
     bytes_loaded=105, bytes_used=100, budget_bytes=100 * MIB,
 )  # fmt: skip
@@ -138,7 +138,7 @@ def test_what_was_prefetched_and_what_of_it_was_used(width: int) -> None:
 
 def test_what_programs_are_told_of_prefetching() -> None:
     assert prefetch_as_json(DRIVING) == {
-        "ride_out_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "prefetch_misses": 7,
+        "outage_tolerance_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "prefetch_misses": 7,
         "prefetch_started": 120, "prefetch_used": 100, "prefetch_in_vain": 3, "prefetch_overtaken": 0,
         "bytes_prefetched": 0, "over_fetch": 1.05,
     }  # fmt: skip

@@ -20,8 +20,7 @@ from shmmap.daemon.records import Failure, Key
 from shmmap.layers.sources import CellJob, Neighbour
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import MAX_NEIGHBOURS
-from shmmap.processes.packets import MAX_PACKET_BYTES
-from shmmap.processes.start_child import channel
+from shmmap.processes.start_child import MAX_PACKET_BYTES, channel
 from shmmap.protocol.messages import Area, CircleMessage, Selected
 from shmmap.segment.layout import SourceStamp
 from shmmap.segment.version import Source

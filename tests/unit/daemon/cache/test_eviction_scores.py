@@ -44,7 +44,7 @@ def residents(draw: st.DrawFn) -> list[Resident]:
 def client(x: float, y: float, vx: float = 0.0, vy: float = 0.0, *route: tuple[float, float]) -> Places:
     """Where a client with a reach of 50 m will be."""
     motion = Motion()
-    motion.told(Intent(x, y, vx, vy, route=route), 0.0)
+    motion.update(Intent(x, y, vx, vy, route=route), 0.0)
     return places_of(motion, 50.0)
 
 

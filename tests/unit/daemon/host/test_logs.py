@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes to the log."""
+"""What goes to the log, and when defects are too many to go on."""
 
 from __future__ import annotations
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Iterator
+from typing import cast
 
 import pytest
 
-from shmmap.daemon.host.logs import set_up_logging
+from shmmap.daemon.host.logs import MAX_DEFECTS, WITHIN_S, Defects, set_up_logging
+from shmmap.statistics.writer import StatisticsWriter
 
 
 @pytest.fixture
@@ -50,8 +53,42 @@ def test_under_systemd(
     except ValueError:
         log.exception("two\nlines")
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:5] == [f"<{n}>text" for n in (7, 6, 4, 3, 2)]
-    assert lines[5] == r"<3>two\nlines"
+    assert lines[:6] == [*(f"<{n}>text" for n in (7, 6, 4, 3, 2)), r"<3>two\nlines"]
     assert len(lines) > 7
     assert all(line.startswith("<3>") for line in lines[5:])
     assert lines[-1] == r"<3>ValueError: no\x1b[2J"
+
+
+class Counts(Counter[str]):
+    def add(self, name: str) -> None:
+        self[name] += 1
+
+
+def here(defects: Defects) -> bool:
+    try:
+        raise RuntimeError("here")
+    except RuntimeError:
+        return defects.record()
+
+
+def there(defects: Defects) -> bool:
+    try:
+        raise RuntimeError("there")
+    except RuntimeError:
+        return defects.record()
+
+
+def test_a_hundred_defects_in_ten_seconds_at_one_place(caplog: pytest.LogCaptureFixture) -> None:
+    """That many are too many; those of another place, or over a longer time, are not."""
+    caplog.set_level(logging.ERROR, "shmmap")
+    now_s, counts = 0.0, Counts()
+    defects = Defects(cast("StatisticsWriter", counts), lambda: now_s)
+    for number in range(3 * MAX_DEFECTS):
+        now_s = number * (WITHIN_S / (MAX_DEFECTS - 1) + 0.001)
+        assert not here(defects)
+    now_s += 2 * WITHIN_S
+    assert not any(here(defects) or there(defects) for _ in range(MAX_DEFECTS - 1))
+    assert here(defects)
+    assert counts == {"defects": 5 * MAX_DEFECTS - 1}
+    assert 3 < len(caplog.records) <= 6 + 2
+    assert "there" in caplog.text

@@ -1,16 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The choice of a budget on file systems of given sizes, and memory limits of control groups."""
+"""Budgets on file systems of given sizes, memory limits of control groups, mounts, and memory given back."""
 
 from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import pytest
 
-from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes, out_of_memory_kills
+from shmmap.daemon.host import memory
+from shmmap.daemon.host.memory import (
+    Mount,
+    choose_budget,
+    file_system_of,
+    loader_bytes,
+    memory_limit_bytes,
+    mounts,
+    out_of_memory_kills,
+)
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
@@ -181,3 +193,65 @@ def test_processes_killed_for_lack_of_memory(tmp_path: Path) -> None:
     assert out_of_memory_kills(str(tmp_path / "vmstat")) == 3
     assert out_of_memory_kills(str(tmp_path / "none")) == 0
     assert out_of_memory_kills() >= 0
+
+
+LINES = (
+    "22 1 0:20 / / rw - ext4 /dev/sda1 rw\n"
+    "30 22 0:30 / /maps rw shared:1 - nfs4 server:/maps rw,vers=4\n"
+    "31 22 0:31 / /maps\\040néw rw - xfs /dev/sdb1 rw\n"
+    "32 22 0:32 /sub /maps rw - ext3 /dev/sdc1 rw\n"
+)
+
+
+def test_every_mount_is_given(tmp_path: Path) -> None:
+    (tmp_path / "mountinfo").write_text(LINES)
+    found = list(mounts(str(tmp_path / "mountinfo")))
+    assert found[1] == Mount("nfs4", "/", "/maps", ["rw", "vers=4"])
+    assert (found[2].point, found[3].root) == ("/maps néw", "/sub")
+    assert list(mounts(str(tmp_path / "none"))) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"), [("/", "ext4"), ("/mapsets", "ext4"), ("/maps/town", "ext3"), ("/maps néw/a", "xfs")]
+)
+def test_the_innermost_mount_counts_and_the_last_at_one_place(
+    path: str, kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "mountinfo").write_text(LINES)
+    found = list(mounts(str(tmp_path / "mountinfo")))
+    monkeypatch.setattr(memory, "mounts", lambda: iter(found))
+    assert file_system_of(path) == kind
+
+
+def test_file_systems_of_this_machine() -> None:
+    assert file_system_of("/proc/self") == "proc"
+    assert file_system_of("/dev/shm") == "tmpfs"
+
+
+PROGRAM: Final = """
+import sys
+from pathlib import Path
+from shmmap.daemon.prerequisites import give_back_large_tables
+
+def own_kib():
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("RssAnon:")[1].split()[0])
+
+if sys.argv[1] == "large":
+    give_back_large_tables()
+before = own_kib()
+table = b"1" * (8 << 20)
+del table
+table, later = b"1" * (8 << 20), b"1" * (7 << 20)
+del table
+print(own_kib() - before - 7 * 1024)
+"""
+
+
+@pytest.mark.parametrize(("which", "given_back"), [("large", True), ("none", False)])
+def test_a_large_table_goes_back_whatever_was_made_after_it(which: str, given_back: bool) -> None:
+    """And the C library alone would keep it, once one of its size has been freed."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, which], stdout=subprocess.PIPE, text=True, check=True, timeout=60.0
+    )
+    assert (int(done.stdout) < 4096) == given_back

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.host.memory import choose_budget
-from shmmap.daemon.host.mounts import Mount
+from shmmap.daemon.host.memory import Mount, choose_budget
 from shmmap.daemon.live import place
 from shmmap.daemon.live.messages import Begin
 from shmmap.daemon.live.place import CEILING_BYTES, bytes_beside_cells, place_live_maps

@@ -27,8 +27,7 @@ from shmmap.daemon.live.relay import (
 from shmmap.daemon.live.tickets import REFUSED_AT_ONCE
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted
-from shmmap.processes.packets import packet_buffer, receive_packet
-from shmmap.processes.start_child import channel
+from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.live import LiveList, LiveListed, LiveMove
 

@@ -26,7 +26,7 @@ from shmmap.errors import Offline
 from shmmap.layers.contract import Box
 from shmmap.layers.sources import FILES, CellJob, CellSource
 from shmmap.layers.spec import LayerSpec
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SegmentHeader
 from shmmap.segment.version import Source, Stamp

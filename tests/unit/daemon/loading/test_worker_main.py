@@ -21,7 +21,7 @@ import pytest
 
 import shmmap
 from shmmap.daemon.loading import worker_messages
-from shmmap.processes.packets import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
 from shmmap.segment.pins import in_use, prepare_process

@@ -25,8 +25,7 @@ from tests.support.daemon_process import Deadline
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
 from shmmap.daemon.map.published_view import PublishedView
-from shmmap.daemon.map.shard_fetcher import THREADS, ShardFetcher
-from shmmap.daemon.map.shard_pages import BACKGROUND_AT_ONCE, ShardPages
+from shmmap.daemon.map.shard_pages import BACKGROUND_FETCHES, THREADS, ShardFetcher, ShardPages
 from shmmap.layers.spec import layer_spec
 from shmmap.origin.remote.published_index import (
     Root,
@@ -143,10 +142,10 @@ class Served:
         self.fetcher = ShardFetcher(cast("Store", self.store), lambda: self.failed.append(None))
 
     def view(
-        self, root: Root, before: PublishedView | None = None, most_bytes: int = 1 << 40
+        self, root: Root, before: PublishedView | None = None, max_bytes: int = 1 << 40
     ) -> PublishedView:
         known = before.pages.shards() if before is not None else {}
-        return PublishedView(root, 1, self.fetcher, known, most_bytes=most_bytes)
+        return PublishedView(root, 1, self.fetcher, known, max_bytes=max_bytes)
 
     def whole(self, root: Root) -> PublishedView:
         view = self.view(root)
@@ -295,7 +294,7 @@ def test_the_rest_comes_in_the_background_while_it_fits(served: Served) -> None:
     whole = served.whole(root)
     assert len(whole.pages) > 500
     pages = map(whole.pages.page, range(len(whole.pages)))
-    view = served.view(root, most_bytes=sum(page.nbytes for page in pages if page is not None) // 3)
+    view = served.view(root, max_bytes=sum(page.nbytes for page in pages if page is not None) // 3)
     fetch(view.pages, view.pages.of_area(Circle(700, 700, 50)))
     while select.select([view.pages.fd], [], [], 0.5)[0]:
         view.pages.collect()
@@ -321,7 +320,7 @@ def test_what_an_area_needs_comes_before_the_background(served: Served) -> None:
     view = served.view(root)
     view.pages.collect()
     begun = Deadline()
-    while begun(len(served.store.asked) < BACKGROUND_AT_ONCE):
+    while begun(len(served.store.asked) < BACKGROUND_FETCHES):
         time.sleep(0.001)
     needed = view.pages.of_area(Circle(-1200, -1200, 300))
     assert len(needed) > THREADS
@@ -332,15 +331,15 @@ def test_what_an_area_needs_comes_before_the_background(served: Served) -> None:
     paths = {blob_path(root.shard_sha256(number)) for number in needed}
     asked = list(served.store.asked)
     last = max(map(asked.index, paths))
-    assert len(asked[: last + 1]) - len(paths) == BACKGROUND_AT_ONCE
-    assert BACKGROUND_AT_ONCE < THREADS / 2
+    assert len(asked[: last + 1]) - len(paths) == BACKGROUND_FETCHES
+    assert BACKGROUND_FETCHES < THREADS / 2
 
 
 def test_few_shards_are_kept_whatever_they_take(served: Served) -> None:
     root = publish(served.store, some_cells(np.random.default_rng(6), 50, width=100.0))
     view = served.whole(root)
     assert len(view.pages) <= 16
-    small = served.view(root, before=view, most_bytes=1)
+    small = served.view(root, before=view, max_bytes=1)
     assert small.complete
     assert small.pages.spare() is None
 

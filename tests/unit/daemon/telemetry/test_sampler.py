@@ -26,7 +26,6 @@ from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon
 
 S = 1_000_000_000
-PARTS = 8
 
 
 def beat(sampler: Sampler, now_s: float) -> int:
@@ -75,19 +74,6 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
     assert whole == [1000.0, 1000.0 + BEAT_S]
 
 
-def test_a_beat_takes_some_turns_and_goes_on_where_it_was(inner: Inner, small_map: DividedMap) -> None:
-    one = inner(small_map.root)
-    whole: list[float] = []
-    sampler = sampler_of(one, lambda: whole.append(1.0))
-    assert sampler.next_s <= 0.0
-    sampler.turn(1000.0)
-    assert (sampler.next_s, whole) == (0.0, [])
-    beats = one.statistics._sequence
-    assert beat(sampler, 1000.001) == PARTS - 1
-    assert (whole, one.statistics._sequence) == ([1.0], beats + 1)
-    assert sampler.next_s == 1000.0 + BEAT_S
-
-
 def test_outages_of_the_storage(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     health = one.scheduler.prefetcher.prefetch.health
@@ -111,7 +97,7 @@ def test_outages_of_the_storage(inner: Inner, small_map: DividedMap) -> None:
 
 
 def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
-    one = inner(small_map.root, prefetch_share=0.5, ride_out_s=2.4)
+    one = inner(small_map.root, prefetch_share=0.5, outage_tolerance_s=2.4)
     sampler, values = sampler_of(one), one.statistics.values
 
     def short(now_s: float) -> int:
@@ -119,7 +105,7 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
         return values["prefetch_short"]
 
     assert short(1000.0) == 0
-    assert (values["prefetch_budget_bytes"], values["ride_out_ns"]) == (32 << 20, 2_400_000_000)
+    assert (values["prefetch_budget_bytes"], values["outage_tolerance_ns"]) == (32 << 20, 2_400_000_000)
     one.ledger.prefetched_bytes = 32 << 20
     assert short(1001.0) == 1
     one.ledger.prefetched_bytes = 0
@@ -130,7 +116,7 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
     assert (off.statistics.values["prefetch_budget_bytes"], off.statistics.values["prefetch_short"]) == (0, 0)
 
 
-def test_rows_of_many_clients_are_made_anew_a_few_at_a_time() -> None:
+def test_rows_of_many_clients_are_updated_a_few_at_a_time() -> None:
     """The oldest ones first, and only of those that changed."""
     sessions, rows = Sessions(), SessionRows()
     clients = [
@@ -144,7 +130,7 @@ def test_rows_of_many_clients_are_made_anew_a_few_at_a_time() -> None:
     for client in clients:
         client.requests += 1
     requests = [(row.requests, one.requests) for row, one in zip(rows.of(sessions), clients, strict=True)]
-    assert [told == now for told, now in requests].count(True) == CLIENT_ROWS_PER_BEAT
+    assert [shown == now for shown, now in requests].count(True) == CLIENT_ROWS_PER_BEAT
     for _ in range(2):
         for client in clients[:CLIENT_ROWS_PER_BEAT]:
             client.requests += 1  # these ask all the time

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shmmap.daemon.transport.inbox import (
-    MOST_BYTES,
-    MOST_OF_A_PROCESS,
-    MOST_REMEMBERED,
+    MAX_PER_PROCESS,
+    MAX_PROCESS_BYTES,
+    MAX_REMEMBERED,
     FairQueue,
 )
 
@@ -25,17 +25,7 @@ def serve(turns: FairQueue[str], cost_s: float) -> str | None:
     return turn[1]
 
 
-def test_a_quiet_process_is_served_next() -> None:
-    turns: FairQueue[str] = FairQueue()
-    for number in range(50):
-        turns.add("loud", number % 5, "loud", 10)
-    assert serve(turns, 1.0) == "loud"
-    turns.add("quiet", 0, "quiet", 10)
-    turns.add("other", 0, "other", 10)
-    assert [serve(turns, 1.0) for _ in range(4)] == ["quiet", "other", "loud", "loud"]
-
-
-def test_who_asks_for_what_is_expensive_waits_longer() -> None:
+def test_expensive_requests_wait_longer() -> None:
     turns: FairQueue[str] = FairQueue()
     served: Counter[str] = Counter()
     for _ in range(300):
@@ -75,18 +65,18 @@ def test_connections_of_a_process_take_turns() -> None:
 
 def test_limits() -> None:
     turns: FairQueue[int] = FairQueue()
-    assert sum(turns.add("p", n % 5, n, 1) for n in range(2000)) == MOST_OF_A_PROCESS
-    assert turns.add("q", 0, 0, 2 * MOST_BYTES)  # a single one always may
+    assert sum(turns.add("p", n % 5, n, 1) for n in range(2000)) == MAX_PER_PROCESS
+    assert turns.add("q", 0, 0, 2 * MAX_PROCESS_BYTES)  # a single one always may
     assert not turns.add("q", 1, 0, 1)
-    assert len(turns) == MOST_OF_A_PROCESS + 1
+    assert len(turns) == MAX_PER_PROCESS + 1
 
 
-def test_nobody_is_remembered_for_ever() -> None:
+def test_idle_processes_are_forgotten() -> None:
     turns: FairQueue[str] = FairQueue()
-    for number in range(3 * MOST_REMEMBERED):
+    for number in range(3 * MAX_REMEMBERED):
         turns.add(number, 0, "x", 1)
         serve(turns, 1.0)
-    assert len(turns._lines) <= MOST_REMEMBERED
+    assert len(turns._lines) <= MAX_REMEMBERED
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2), st.floats(0.001, 1.0), st.booleans())))
@@ -127,12 +117,12 @@ def test_the_quiet_one_waits_for_each_loud_one_once(loud: int) -> None:
 
 def test_what_must_be_answered_is_never_refused() -> None:
     turns: FairQueue[str] = FairQueue()
-    for _ in range(MOST_OF_A_PROCESS):
+    for _ in range(MAX_PER_PROCESS):
         assert turns.add("p", "c", "loud", 0)
     assert not turns.add("p", "c", "more", 0)
     assert turns.add("p", "c", "answer", 0, always=True)
     assert turns.add("q", "d", "quiet", 0)
-    assert "quiet" in [serve(turns, 1.0) for _ in range(3)], "nobody waits for a loud process's answers"
+    assert "quiet" in [serve(turns, 1.0) for _ in range(3)], "no process waits for a loud one's answers"
 
 
 def test_what_comes_for_a_process_while_it_is_served() -> None:
@@ -167,7 +157,7 @@ def test_what_has_begun_is_remembered_however_many_come() -> None:
     turns.add("p", "a", "long", 5)
     assert turns.take() == ("p", "long")
     turns.served("p", 100.0, "long")
-    for number in range(MOST_REMEMBERED + 10):
+    for number in range(MAX_REMEMBERED + 10):
         turns.add(number, 0, "other", 1)
         assert serve(turns, 0.0) == "other"
     assert turns.take() == ("p", "long")

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.connection import Peer
-from shmmap.daemon.transport.sessions import MOVES_AT_ONCE, Session, Sessions, command_of
-from shmmap.daemon.travel.places import MOST_OF_A_CLIENT
+from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Sessions, command_of
+from shmmap.daemon.travel.places import MAX_PER_CLIENT
 from shmmap.protocol.messages import Intent
 from tests.support import connections
+from tests.support.connections import says
 
 
 def resident(number: int, version: int, nbytes: int) -> Resident:
@@ -32,7 +33,7 @@ def resident(number: int, version: int, nbytes: int) -> Resident:
     )
 )
 def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
-    """Two segments share each version; what nobody has changes nothing."""
+    """Two segments share each version; what no session has changes nothing."""
     sessions = Sessions()
     clients = [sessions.open(connections.of(), str(n), 0.0) for n in range(3)]
     segments = [resident(n, n // 2 + 1, 10**n) for n in range(8)]
@@ -93,22 +94,23 @@ def test_a_later_session_of_the_same_slot_keeps_what_it_has(shared: bool) -> Non
 
 
 def test_a_session_and_its_connections() -> None:
-    """It can change its connection, and says nothing of where it is meanwhile."""
+    """It can change its connection; what it said of where it is does not count any more then."""
     sessions = Sessions()
     first, second = connections.of(Peer(0, 0, os.getpid())), connections.of(Peer(0, 0, os.getpid()))
     session = sessions.open(first, "x" * 100, 1.0)
     assert session.client == "x" * 64
     assert session.command == command_of(os.getpid()) != ""
-    assert first.session is sessions.by_slot(session.slot) is session
-    move(session, Intent(1.0, 2.0))
+    assert (first.slot, sessions.by_slot(session.slot)) == (session.slot, session)
+    says(session, Intent(1.0, 2.0), 0.0)
     session.connect(second)
-    assert [first.session, second.session] == [None, session]
+    assert (first.slot, second.slot, session.is_connected) == (0, session.slot, True)
     assert session.connection is second
     sessions.follow_moves()
     assert len(sessions.places()) == 0
     sessions.departed[session.slot] = session
     sessions.close(session)
-    assert [second.session, sessions.by_slot(session.slot), sessions.departed] == [None, None, {}]
+    assert (second.slot, sessions.by_slot(session.slot), sessions.departed) == (0, None, {})
+    assert not session.is_connected
     sessions.close(session)  # twice does no harm
 
 
@@ -122,17 +124,10 @@ def test_a_slot_is_kept_or_new() -> None:
     assert kept.slot == 1234
     others = [sessions.open(connections.of(), "", 0.0, slot=slot) for slot in (1234, 0, -1, 1 << 62)]
     assert len({1234, *(other.slot for other in others)}) == 5
+    assert all(0 < other.slot < 1 << 62 for other in others)
 
 
-def test_slots_are_never_alike() -> None:
-    sessions = Sessions()
-    opened = [sessions.open(connections.of(), "", 0.0) for n in range(200)]
-    assert len({session.slot for session in opened}) == 200
-    assert all(0 < session.slot < 1 << 62 for session in opened)
-    assert {type(session) for session in sessions} == {Session}
-
-
-def test_who_gives_way() -> None:
+def test_which_session_ends_when_there_are_too_many() -> None:
     sessions = Sessions()
     assert sessions.spare() is None
     watched = sessions.open(connections.of(Peer(0, 0, os.getpid())), "", 0.0)
@@ -148,19 +143,13 @@ def test_who_gives_way() -> None:
     assert sessions.spare() is busy
 
 
-def move(session: Session, intent: Intent, at_s: float = 0.0) -> None:
-    session.intent = session.told = intent
-    session.last_request_s = at_s
-    session.sessions.moved[session] = None
-
-
 def test_many_moves_are_followed_a_few_at_a_time() -> None:
     sessions = Sessions()
-    for number in range(3 * MOVES_AT_ONCE):
-        move(sessions.open(connections.of(), "", 0.0), Intent(100.0 * number, 0.0))
+    for number in range(3 * MOVES_PER_STEP):
+        says(sessions.open(connections.of(), "", 0.0), Intent(100.0 * number, 0.0), 0.0)
     for count in (1, 2, 3):
-        assert len(sessions.follow_moves()) == MOVES_AT_ONCE
-        assert len(sessions.places()) == count * MOVES_AT_ONCE
+        assert len(sessions.follow_moves()) == MOVES_PER_STEP
+        assert len(sessions.places()) == count * MOVES_PER_STEP
     assert sessions.moved == {}
     assert sessions.follow_moves() == []
 
@@ -171,11 +160,11 @@ def places(sessions: Sessions) -> set[tuple[float, float]]:
     return {(x, y) for x, y, *_ in sessions.places().tolist()}
 
 
-def test_eviction_is_told_where_clients_are_going() -> None:
+def test_where_clients_are_going() -> None:
     sessions = Sessions()
     one, other = (sessions.open(connections.of(), "", 0.0) for _ in range(2))
     assert places(sessions) == set()
-    move(one, Intent(1.0, 2.0, route=((1.0, 2.0), (101.0, 2.0))))
+    says(one, Intent(1.0, 2.0, route=((1.0, 2.0), (101.0, 2.0))), 0.0)
     version = sessions.places_version
     found = places(sessions)
     assert sessions.places_version != version
@@ -183,9 +172,9 @@ def test_eviction_is_told_where_clients_are_going() -> None:
     assert {y for _, y in found} == {2.0}, "all along the route"
     assert one.intent is not None
     assert not one.intent.route, "the motion has it; it may be long"
-    move(other, Intent(-2.0, 3.0))
+    says(other, Intent(-2.0, 3.0), 0.0)
     assert places(sessions) == found | {(-2.0, 3.0)}
-    one.connection.session = None
+    one.connection.slot = 0
     sessions.close(one)
     assert places(sessions) == {(-2.0, 3.0)}
     other.disconnect()
@@ -196,22 +185,12 @@ def test_a_route_lasts_until_the_client_says_something_else() -> None:
     """A request that says nothing of it changes nothing; one with another pose and no route ends it."""
     sessions = Sessions()
     session = sessions.open(connections.of(), "", 0.0)
-    move(session, Intent(0.0, 0.0, route=((0.0, 0.0), (100.0, 0.0))))
+    says(session, Intent(0.0, 0.0, route=((0.0, 0.0), (100.0, 0.0))), 0.0)
     sessions.follow_moves()
     sessions.moved[session] = None  # it asks for another area
     assert (100.0, 0.0) in places(sessions)
-    move(session, Intent(1.0, 0.0), 1.0)
+    says(session, Intent(1.0, 0.0), 1.0)
     assert places(sessions) == {(1.0, 0.0)}
-
-
-def test_how_a_client_moves_is_learnt_from_its_poses() -> None:
-    sessions = Sessions()
-    session = sessions.open(connections.of(), "", 0.0)
-    for second in range(4):
-        move(session, Intent(10.0 * second, 0.0), float(second))
-        sessions.follow_moves()
-    assert (session.motion.vx, session.motion.vy) == (10.0, 0.0)
-    assert session.motion.travelled_m == 30.0
 
 
 @pytest.mark.parametrize("far", [1e4, 1e9, 1e308])
@@ -220,7 +199,7 @@ def test_however_long_a_route_is_it_counts_as_so_many_places(far: float) -> None
     sessions = Sessions()
     route = tuple((far * (1 + n % 3), far * n * (-1) ** n) for n in range(4096))
     for intent in (Intent(0.0, 0.0, route=route), Intent(far, far, vx=-far, vy=far)):
-        move(sessions.open(connections.of(), "", 0.0), intent)
+        says(sessions.open(connections.of(), "", 0.0), intent, 0.0)
         sessions.follow_moves()
-    assert all(len(session.places) <= MOST_OF_A_CLIENT for session in sessions)
+    assert all(len(session.places) <= MAX_PER_CLIENT for session in sessions)
     assert np.isfinite(sessions.places()[:, :4]).all()

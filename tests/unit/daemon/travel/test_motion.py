@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a client moves: what it says, and what its poses tell."""
+"""How a client moves: what it says, and what its poses show."""
 
 from __future__ import annotations
 
@@ -9,24 +9,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmmap.daemon.travel.motion import MOST_SPEED_MPS, Motion
-from shmmap.daemon.travel.route import FARTHEST_M
+from shmmap.daemon.travel.motion import FARTHEST_M, MAX_SPEED_MPS, Motion
 from shmmap.protocol.messages import Intent
 
 hostile = st.floats(allow_nan=False, allow_infinity=False)
 routes = st.lists(st.tuples(hostile, hostile), max_size=5).map(tuple)
 
 
+@pytest.fixture
+def at_origin() -> Motion:
+    """A client that was at the origin at 0 s."""
+    motion = Motion()
+    motion.update(Intent(0.0, 0.0), 0.0)
+    return motion
+
+
 def driven(motion: Motion, begin_s: float, end_s: float, vx: float, vy: float = 0.0) -> None:
     """A client moves on from where it is, and says so each second."""
     x, y = motion.x, motion.y
     for second in range(1, int(end_s - begin_s) + 1):
-        motion.told(Intent(x + vx * second, y + vy * second), begin_s + second)
+        motion.update(Intent(x + vx * second, y + vy * second), begin_s + second)
 
 
 def test_a_velocity_is_learnt() -> None:
     motion = Motion()
-    motion.told(Intent(100.0, 50.0), 10.0)
+    motion.update(Intent(100.0, 50.0), 10.0)
     assert (motion.jumps, motion.speed_mps, motion.travelled_m) == (1, 0.0, 0.0)
     driven(motion, 10.0, 20.0, 8.0, -6.0)
     assert (motion.vx, motion.vy) == pytest.approx((8.0, -6.0))
@@ -34,80 +41,73 @@ def test_a_velocity_is_learnt() -> None:
     assert motion.jumps == 1
 
 
-def test_poses_close_together_are_learnt_from_together() -> None:
-    """Of two poses a few milliseconds apart nobody can tell a velocity."""
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0), 0.0)
+def test_poses_close_together_are_learnt_from_together(at_origin: Motion) -> None:
+    """Two poses a few milliseconds apart show no velocity."""
     for step in range(1, 101):
         jitter = 0.05 if step % 2 else -0.05
-        motion.told(Intent(0.1 * step + jitter, 0.0), 0.01 * step)
-    assert motion.vx == pytest.approx(10.0, abs=0.5)
-    assert motion.fastest_mps == pytest.approx(10.0, abs=0.5)
+        at_origin.update(Intent(0.1 * step + jitter, 0.0), 0.01 * step)
+    assert at_origin.vx == pytest.approx(10.0, abs=0.5)
+    assert at_origin.fastest_mps == pytest.approx(10.0, abs=0.5)
 
 
-def test_a_velocity_that_is_told_counts() -> None:
+def test_a_velocity_that_is_sent_counts() -> None:
     motion = Motion()
-    motion.told(Intent(0.0, 0.0, vx=3.0, vy=4.0), 0.0)
+    motion.update(Intent(0.0, 0.0, vx=3.0, vy=4.0), 0.0)
     assert (motion.vx, motion.vy, motion.fastest_mps) == (3.0, 4.0, 5.0)
-    motion.told(Intent(1.0, 0.0, vx=1e300, vy=0.0), 1.0)
-    assert motion.speed_mps == pytest.approx(MOST_SPEED_MPS)
+    motion.update(Intent(1.0, 0.0, vx=1e300, vy=0.0), 1.0)
+    assert motion.speed_mps == pytest.approx(MAX_SPEED_MPS)
 
 
-def test_how_far_it_has_come_straight_on() -> None:
-    """Bends count as straight until they add up to a corner; who stands turns nowhere."""
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0), 0.0)
-    driven(motion, 0.0, 10.0, 10.0)
-    driven(motion, 10.0, 20.0, 10.0, 2.0)
-    straight_m = motion.straight_m
-    assert straight_m == pytest.approx(motion.travelled_m)
-    driven(motion, 20.0, 40.0, 0.0, -0.5)  # crawls to the side
-    assert motion.straight_m == pytest.approx(straight_m + 10.0)
-    driven(motion, 40.0, 41.0, 10.0, 5.0)
-    assert motion.straight_m == 0.0
-    driven(motion, 41.0, 44.0, 10.0, 5.0)
-    assert motion.straight_m == pytest.approx(3 * math.hypot(10.0, 5.0))
-    motion.told(Intent(5000.0, 0.0), 45.0)
-    assert motion.straight_m == 0.0
+def test_how_far_it_has_come_straight_ahead(at_origin: Motion) -> None:
+    """Bends count as straight until they add up to a corner; a client that stands does not turn."""
+    driven(at_origin, 0.0, 10.0, 10.0)
+    driven(at_origin, 10.0, 20.0, 10.0, 2.0)
+    straight_m = at_origin.straight_m
+    assert straight_m == pytest.approx(at_origin.travelled_m)
+    driven(at_origin, 20.0, 40.0, 0.0, -0.5)  # crawls to the side
+    assert at_origin.straight_m == pytest.approx(straight_m + 10.0)
+    driven(at_origin, 40.0, 41.0, 10.0, 5.0)
+    assert at_origin.straight_m == 0.0
+    driven(at_origin, 41.0, 44.0, 10.0, 5.0)
+    assert at_origin.straight_m == pytest.approx(3 * math.hypot(10.0, 5.0))
+    at_origin.update(Intent(5000.0, 0.0), 45.0)
+    assert at_origin.straight_m == 0.0
 
 
-def test_a_jump_makes_everything_new() -> None:
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0), 0.0)
-    driven(motion, 0.0, 10.0, 15.0)
-    motion.told(Intent(5000.0, 0.0), 11.0)
-    assert (motion.jumps, motion.speed_mps, motion.fastest_mps, motion.travelled_m) == (2, 0.0, 0.0, 0.0)
-    motion.told(Intent(5010.0, 0.0), 12.0)
-    assert motion.vx == pytest.approx(10.0)
+def test_a_jump_resets_everything(at_origin: Motion) -> None:
+    driven(at_origin, 0.0, 10.0, 15.0)
+    at_origin.update(Intent(5000.0, 0.0), 11.0)
+    assert (at_origin.jumps, at_origin.speed_mps, at_origin.fastest_mps, at_origin.travelled_m) == (
+        2,
+        0.0,
+        0.0,
+        0.0,
+    )
+    at_origin.update(Intent(5010.0, 0.0), 12.0)
+    assert at_origin.vx == pytest.approx(10.0)
 
 
-def test_a_red_light_is_no_jump() -> None:
+def test_a_red_light_is_no_jump(at_origin: Motion) -> None:
     """However long a client stands and is silent: it will go on, as fast as before."""
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0), 0.0)
-    driven(motion, 0.0, 10.0, 15.0)
-    motion.told(Intent(151.0, 0.0), 50.0)
-    assert motion.jumps == 1
-    assert motion.speed_mps < 0.1
-    assert motion.fastest_mps == pytest.approx(15.0 * math.exp(-40.0 / 60.0))
-    assert motion.travelled_m == pytest.approx(151.0)
+    driven(at_origin, 0.0, 10.0, 15.0)
+    at_origin.update(Intent(151.0, 0.0), 50.0)
+    assert at_origin.jumps == 1
+    assert at_origin.speed_mps < 0.1
+    assert at_origin.fastest_mps == pytest.approx(15.0 * math.exp(-40.0 / 60.0))
+    assert at_origin.travelled_m == pytest.approx(151.0)
 
 
-def test_silent_and_far_away_is_a_jump() -> None:
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0), 0.0)
-    motion.told(Intent(5000.0, 0.0), 3600.0)
-    assert motion.jumps == 2
+def test_silent_and_far_away_is_a_jump(at_origin: Motion) -> None:
+    at_origin.update(Intent(5000.0, 0.0), 3600.0)
+    assert at_origin.jumps == 2
 
 
-def test_what_was_fast_is_forgotten_slowly() -> None:
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0), 0.0)
-    driven(motion, 0.0, 10.0, 20.0)
-    driven(motion, 10.0, 70.0, 5.0)
-    assert motion.fastest_mps == pytest.approx(20.0 * math.exp(-1.0), rel=0.02)
-    driven(motion, 70.0, 400.0, 5.0)
-    assert motion.fastest_mps == pytest.approx(5.0)
+def test_what_was_fast_is_forgotten_slowly(at_origin: Motion) -> None:
+    driven(at_origin, 0.0, 10.0, 20.0)
+    driven(at_origin, 10.0, 70.0, 5.0)
+    assert at_origin.fastest_mps == pytest.approx(20.0 * math.exp(-1.0), rel=0.02)
+    driven(at_origin, 70.0, 400.0, 5.0)
+    assert at_origin.fastest_mps == pytest.approx(5.0)
 
 
 LOOP = ((0.0, 0.0), (500.0, 0.0), (500.0, 400.0), (0.0, 400.0), (0.0, 0.0), (500.0, 0.0))
@@ -122,7 +122,7 @@ def test_along_its_route() -> None:
         for length, dx, dy in legs:
             part = min(along, length)
             x, y, along = x + part * dx, y + part * dy, along - part
-        motion.told(Intent(x, y, route=LOOP), float(second))
+        motion.update(Intent(x, y, route=LOOP), float(second))
         assert motion.route is not None
         assert motion.along_m == pytest.approx(12.0 * second, abs=11.0)
     assert motion.along_m == pytest.approx(12.0 * 169)
@@ -132,44 +132,36 @@ def test_off_its_route_and_on_it_again() -> None:
     motion = Motion()
     on_it, along = [], []
     for second, (x, y) in enumerate([(0.0, 0.0), (0.0, -60.0), (0.0, -120.0), (60.0, -90.0)]):
-        motion.told(Intent(x, y, route=LOOP), float(second))
+        motion.update(Intent(x, y, route=LOOP), float(second))
         on_it.append(motion.route is not None)
         along.append(motion.along_m)
     assert on_it == [True, True, False, True]
     assert along == pytest.approx([0.0, 0.0, 0.0, 60.0])
 
 
-def test_another_route_begins_anew() -> None:
+def test_another_route_begins_at_its_start() -> None:
     motion = Motion()
-    motion.told(Intent(480.0, 0.0, route=LOOP), 0.0)
+    motion.update(Intent(480.0, 0.0, route=LOOP), 0.0)
     assert motion.along_m == pytest.approx(480.0)
-    motion.told(Intent(490.0, 0.0, route=((490.0, 0.0), (490.0, 900.0))), 1.0)
+    motion.update(Intent(490.0, 0.0, route=((490.0, 0.0), (490.0, 900.0))), 1.0)
     assert motion.along_m == pytest.approx(0.0)
     assert motion.route is not None
     assert motion.route.length_m == pytest.approx(900.0)
-    motion.told(Intent(500.0, 0.0), 2.0)
+    motion.update(Intent(500.0, 0.0), 2.0)
     assert motion.route is None
 
 
-def test_a_trajectory_told_again_each_second() -> None:
+def test_a_trajectory_sent_again_each_second() -> None:
     """150 m ahead, from where the client is: always at its beginning, without a jump."""
     motion = Motion()
     for second in range(60):
         x = 12.0 * second
-        motion.told(Intent(x, 0.3, route=tuple((x + 10.0 * n, 0.0) for n in range(16))), float(second))
+        motion.update(Intent(x, 0.3, route=tuple((x + 10.0 * n, 0.0) for n in range(16))), float(second))
         assert motion.route is not None
         assert motion.along_m == pytest.approx(0.0)
         assert motion.route.length_m - motion.along_m == pytest.approx(150.0)
     assert motion.jumps == 1
     assert motion.fastest_mps == pytest.approx(12.0)
-
-
-def test_who_tells_no_route_any_more_has_none() -> None:
-    motion = Motion()
-    motion.told(Intent(0.0, 0.0, route=LOOP), 0.0)
-    motion.told(Intent(10.0, 0.0), 1.0)
-    assert motion.route is None
-    assert motion.vx == pytest.approx(10.0)
 
 
 @settings(deadline=None)
@@ -181,9 +173,9 @@ def test_hostile_poses(
     for x, y, vx, vy, route, later_s in steps:
         now_s += later_s
         before = motion.travelled_m
-        motion.told(Intent(x, y, vx, vy, route=route), now_s)
+        motion.update(Intent(x, y, vx, vy, route=route), now_s)
         assert max(abs(motion.x), abs(motion.y)) <= FARTHEST_M
-        assert motion.speed_mps <= MOST_SPEED_MPS * 2.01
+        assert motion.speed_mps <= MAX_SPEED_MPS * 2.01
         assert motion.fastest_mps >= motion.speed_mps * (1 - 1e-9)
-        assert 0.0 <= motion.travelled_m <= before + MOST_SPEED_MPS * 10.0
+        assert 0.0 <= motion.travelled_m <= before + MAX_SPEED_MPS * 10.0
         assert motion.route is None or 0.0 <= motion.along_m <= motion.route.length_m * (1 + 1e-9)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.travel.motion import Motion
 from shmmap.daemon.travel.places import (
-    MOST_PLACES,
+    MAX_PLACES,
     NOWHERE,
     SLOWEST_MPS,
     merged_places,
@@ -38,7 +38,7 @@ def moving(
 ) -> Motion:
     """A client that says where it is and how fast it moves."""
     motion = Motion()
-    motion.told(Intent(x, y, vx, vy, route=route), now_s)
+    motion.update(Intent(x, y, vx, vy, route=route), now_s)
     return motion
 
 
@@ -63,7 +63,7 @@ def test_ahead_comes_before_behind() -> None:
     assert until_s(motion, -310.0, 0.0) == pytest.approx(20.0)
 
 
-def test_who_stands_may_drive_off_anywhere() -> None:
+def test_a_standing_client_may_drive_off_anywhere() -> None:
     motion = moving(0.0, 0.0, 0.0, 0.0)
     for x, y in ((310.0, 0.0), (-310.0, 0.0), (0.0, 310.0)):
         assert until_s(motion, x, y) == pytest.approx(1.5 * 100.0 / SLOWEST_MPS)
@@ -99,7 +99,7 @@ def test_a_place_that_a_route_passes_twice_is_needed_the_first_time() -> None:
 def test_nothing_within_reach_of_a_route_is_needed_after_its_end(
     vertices: list[tuple[float, float]], share: float, angle: float
 ) -> None:
-    """Wherever on the way the client comes into reach of a cell, it is not among those that go first."""
+    """Wherever along the route a cell comes into reach, it is not among those evicted first."""
     motion = moving(*vertices[0], 10.0, 0.0, *vertices)
     route = motion.route
     if route is None or route.length_m < 1.0:
@@ -131,7 +131,7 @@ def test_a_route_of_4096_vertices_has_few_places() -> None:
     assert until_s(motion, 30_000.0, 0.0) == pytest.approx((30_000.0 - REACH_M) / 10.0, rel=0.1)
 
 
-def test_several_clients() -> None:
+def test_two_clients() -> None:
     one, other = moving(0.0, 0.0, 10.0, 0.0), moving(5000.0, 0.0, -10.0, 0.0)
     places = merged_places([places_of(one, REACH_M), places_of(other, REACH_M)])
     assert len(places) == 2
@@ -139,7 +139,7 @@ def test_several_clients() -> None:
     assert until_needed(cells, places, 0.0) == pytest.approx([179.0, 79.0])
 
 
-def test_nobody_is_anywhere() -> None:
+def test_no_clients() -> None:
     assert merged_places([]) is NOWHERE
     assert NOWHERE.shape == (0, 8)
 
@@ -154,7 +154,7 @@ def test_few_places_stand_for_all(clients: list[tuple[float, float, float]], dat
         tables.append(places_of(moving(x, y, speed, 0.0, *route), REACH_M))
     crowd = tables * 20
     merged = merged_places(crowd)
-    assert 0 < len(merged) <= MOST_PLACES
+    assert 0 < len(merged) <= MAX_PLACES
     assert np.isinf(merged[:, 4]).any(), "from somewhere anything may be reached"
     assert np.isfinite(until_needed(box(3e5, 3e5), merged, 0.0)).all()
 
@@ -166,4 +166,4 @@ def test_a_crowd_with_routes() -> None:
         for n in range(4096)
     ]
     merged = merged_places(tables)
-    assert MOST_PLACES // 8 < len(merged) <= MOST_PLACES
+    assert MAX_PLACES // 8 < len(merged) <= MAX_PLACES

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.daemon.travel.route import BEHIND_M, FARTHEST_M, MOST_VERTICES, OFF_ROUTE_M, Route
+from shmmap.daemon.travel.motion import BEHIND_M, FARTHEST_M, MAX_VERTICES, OFF_ROUTE_M, Route
 
 coordinates = st.floats(-1e5, 1e5)
 hostile = st.floats(allow_nan=False, allow_infinity=False)
@@ -115,9 +115,9 @@ def town(corners: int, radius: float) -> list[tuple[float, float]]:
     return vertices
 
 
-def test_of_many_vertices_those_are_kept_that_tell_where_it_bends() -> None:
+def test_of_many_vertices_those_at_bends_are_kept() -> None:
     vertices = town(100, 6.0)[:4096]
-    assert len(vertices) > 7 * MOST_VERTICES
+    assert len(vertices) > 7 * MAX_VERTICES
     route = Route(vertices)
     kept = route.at(np.linspace(0.0, route.length_m, 20_000))
     away = [float(np.hypot(*(kept - vertex).T).min()) for vertex in vertices]
@@ -135,7 +135,7 @@ def test_a_long_straight_route_keeps_its_ends() -> None:
 
 @given(st.lists(st.tuples(hostile, hostile), min_size=1, max_size=700), hostile, hostile)
 def test_hostile_coordinates(vertices: list[tuple[float, float]], x: float, y: float) -> None:
-    """Whatever is told, lengths are finite, and a client is on it or not."""
+    """Whatever is sent, lengths are finite, and a client is on it or not."""
     route = Route(vertices)
     assert 0.0 <= route.length_m < math.inf
     assert np.abs(route.at(np.array([0.0, route.length_m / 2, route.length_m]))).max() <= FARTHEST_M

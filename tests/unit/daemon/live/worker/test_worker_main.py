@@ -14,8 +14,7 @@ from shmmap.chunks.applying import UNDO_BYTES
 from shmmap.daemon.live import messages
 from shmmap.daemon.live.worker.main import HEARD_AT_ONCE, _record, _Worker
 from shmmap.errors import CannotStart
-from shmmap.processes.packets import packet_buffer, receive_packet
-from shmmap.processes.start_child import channel
+from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.live import LiveList, LiveOpen
 from shmmap.protocol.messages import ErrorReply

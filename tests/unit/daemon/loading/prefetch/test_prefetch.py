@@ -28,7 +28,7 @@ from shmmap.protocol.messages import Intent
 from shmmap.segment.layout import SourceStamp
 
 RADIUS_M = 50.0
-RIDE_OUT_S = 10.0
+OUTAGE_TOLERANCE_S = 10.0
 
 
 @cache
@@ -48,11 +48,11 @@ def street(columns: int = 80, version: int = 1) -> Catalogue:
 class Daemon:
     """What a scheduler keeps of cells: which are there, which are under way, which are not to be tried."""
 
-    def __init__(self, ride_out_s: float = RIDE_OUT_S) -> None:
+    def __init__(self, outage_tolerance_s: float = OUTAGE_TOLERANCE_S) -> None:
         self.present: set[tuple[int, str]] = set()
         self.loading: set[tuple[int, str]] = set()
         self.failed: set[tuple[int, str]] = set()
-        self.prefetch = Prefetch(self.is_absent, ride_out_s)
+        self.prefetch = Prefetch(self.is_absent, outage_tolerance_s)
         self.catalogue = street()
 
     def is_absent(self, index: int, layer: str) -> bool:
@@ -65,7 +65,7 @@ class Daemon:
         motion = Motion()
         for second in (0, 1):
             vertices = ((-20.0, y), (1300.0, y)) if route else ()
-            motion.told(Intent(10.0 * (second - 1), y, route=vertices), float(second))
+            motion.update(Intent(10.0 * (second - 1), y, route=vertices), float(second))
         self.prefetch.ways[name] = WayAhead(motion, Circle(0.0, y, RADIUS_M), layers)
         return motion
 
@@ -100,7 +100,7 @@ def test_in_order_of_time_each_once() -> None:
     times = [wish.needed_in_s for wish in found]
     assert times == sorted(times)
     assert len({wish.cell for wish in found}) == len(found) > 50
-    assert times[-1] > RIDE_OUT_S, "what is needed after the longest outage is wished for, too"
+    assert times[-1] > OUTAGE_TOLERANCE_S, "what is needed after the longest outage is wished for, too"
     assert daemon.next(1.0) is None
     assert not daemon.prefetch.more
 
@@ -168,7 +168,7 @@ def test_what_has_failed_is_passed_over_and_wished_for_later() -> None:
     assert first.cell not in {wish.cell for wish in daemon.wishes(1.0)}
     daemon.failed.clear()
     assert daemon.next(1.0 + 0.5 * PASS_S) is None
-    motion.told(Intent(10.0, 0.0, route=((-20.0, 0.0), (1300.0, 0.0))), 2.0)
+    motion.update(Intent(10.0, 0.0, route=((-20.0, 0.0), (1300.0, 0.0))), 2.0)
     again = daemon.next(1.0 + PASS_S)
     assert again is not None
     assert again.cell == first.cell
@@ -176,7 +176,7 @@ def test_what_has_failed_is_passed_over_and_wished_for_later() -> None:
 
 def test_a_long_pass_begins_again_too() -> None:
     """Where loads take longer than a pass, what failed at its beginning is not forgotten."""
-    daemon = Daemon(ride_out_s=60.0)
+    daemon = Daemon(outage_tolerance_s=60.0)
     daemon.client("a")
     first = daemon.next(1.0)
     assert first is not None
@@ -219,7 +219,7 @@ def test_without_a_route_outages_are_prepared_for_after_the_first() -> None:
     daemon = Daemon()
     daemon.client("a", route=False)
     before = daemon.prefetch.look_ahead
-    assert before.straight_s == before.sides_s < RIDE_OUT_S < before.way_s
+    assert before.straight_s == before.sides_s < OUTAGE_TOLERANCE_S < before.way_s
     failing(daemon)
     daemon.next(10.0)
     daemon.next(18.0)
@@ -288,7 +288,7 @@ def test_after_a_jump_nothing_of_the_way_before_is_wished_for() -> None:
     motion = daemon.client("a")
     assert len(daemon.wishes(1.0, 3)) == 3
     for second in (1.5, 2.5):
-        motion.told(Intent(1000.0 + 10.0 * second, 0.0), second)
+        motion.update(Intent(1000.0 + 10.0 * second, 0.0), second)
     daemon.prefetch.ways["a"].asks(Circle(1025.0, 0.0, RADIUS_M), ("points",))
     wishes = daemon.wishes(2.5)
     assert wishes
@@ -309,7 +309,7 @@ def test_who_stands_wishes_for_nothing() -> None:
     daemon = Daemon()
     motion = Motion()
     for second in range(5):
-        motion.told(Intent(0.0, 0.0), float(second))
+        motion.update(Intent(0.0, 0.0), float(second))
     daemon.prefetch.ways["a"] = WayAhead(motion, Circle(0.0, 0.0, RADIUS_M), ("points",))
     assert daemon.next(5.0) is None
     assert daemon.prefetch.next_s(5.0) == math.inf
@@ -340,7 +340,7 @@ def test_one_call_looks_at_little() -> None:
         calls += 1
         if not daemon.prefetch.more:
             break
-    assert calls >= 40 * RIDE_OUT_S * 10.0 / 10.0 / LOOKS_AT_ONCE
+    assert calls >= 40 * OUTAGE_TOLERANCE_S * 10.0 / 10.0 / LOOKS_AT_ONCE
 
 
 steps = st.lists(
@@ -385,7 +385,7 @@ def test_whatever_happens_a_wish_is_for_what_is_absent(
                 what, (motion.x, motion.y + 10 * later_s)
             )
             route = ((-20.0, 0.0), (1300.0, 0.0)) if number % 2 == 0 else ()
-            motion.told(Intent(x, y, route=route), now_s)
+            motion.update(Intent(x, y, route=route), now_s)
             way = daemon.prefetch.ways["ab"[number % 2]]
             way.asks(Circle(x, y, RADIUS_M), ("points",))
     wish = daemon.next(now_s + PASS_S)

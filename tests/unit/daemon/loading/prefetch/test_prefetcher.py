@@ -407,7 +407,7 @@ def shown_ahead(one: InnerDaemon) -> dict[str, bool]:
 def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     inner: Inner, small_map: DividedMap
 ) -> None:
-    one: InnerDaemon = inner(small_map.root, prefetch_share=0.5, ride_out_s=2.4, workers=2)
+    one: InnerDaemon = inner(small_map.root, prefetch_share=0.5, outage_tolerance_s=2.4, workers=2)
     session = one.session()
     route = ((-40.0, 0.0), (40.0, 0.0))
     says(session, Intent(-30.0, 0.0, 5.0, 0.0, None, route), one.now_s())

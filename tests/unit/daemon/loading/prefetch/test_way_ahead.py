@@ -62,8 +62,8 @@ def looked(
 def driving(vx: float, *route: tuple[float, float]) -> Motion:
     """A client at the origin that has driven so fast."""
     motion = Motion()
-    motion.told(Intent(-vx, 0.0, route=route), 0.0)
-    motion.told(Intent(0.0, 0.0, route=route), 1.0)
+    motion.update(Intent(-vx, 0.0, route=route), 0.0)
+    motion.update(Intent(0.0, 0.0, route=route), 1.0)
     return motion
 
 
@@ -123,13 +123,13 @@ def test_who_has_long_come_straight_on_is_looked_for_farther_ahead() -> None:
     motion = Motion()
     told = []
     for second in range(0, 100, 5):
-        motion.told(Intent(10.0 * second, 0.0), float(second))
+        motion.update(Intent(10.0 * second, 0.0), float(second))
         told.append(way_of(motion).looks_s(AHEAD))
     assert told[:13] == [AHEAD.straight_s] * 12 + [pytest.approx(10.0)]
     assert told[14:] == [AHEAD.way_s] * 6
     far_m = max(town().boxes[[cell for _, cell in looked(way_of(motion))]][:, 0]) - motion.x
     assert 200.0 <= far_m <= 200.0 + RADIUS_M
-    motion.told(Intent(950.0, 50.0), 100.0)
+    motion.update(Intent(950.0, 50.0), 100.0)
     assert way_of(motion).looks_s(AHEAD) == AHEAD.straight_s
 
 
@@ -146,7 +146,7 @@ def test_a_trajectory_told_again_each_second() -> None:
     way = way_of(motion)
     for second in range(40):
         x = 12.0 * second
-        motion.told(Intent(x, 0.2, route=tuple((x + 10.0 * n, 0.0) for n in range(16))), float(second))
+        motion.update(Intent(x, 0.2, route=tuple((x + 10.0 * n, 0.0) for n in range(16))), float(second))
         inside = set(town().query(Circle(x, 0.2, RADIUS_M))[0].tolist())
         if second > 2:
             assert inside <= found
@@ -158,7 +158,7 @@ def test_a_trajectory_told_again_each_second() -> None:
 def test_who_stands_goes_nowhere(route: tuple[tuple[float, float], ...]) -> None:
     motion = Motion()
     for second in range(20):
-        motion.told(Intent(0.0, 0.0, route=route), float(second))
+        motion.update(Intent(0.0, 0.0, route=route), float(second))
     way = way_of(motion)
     assert not way.moves
     assert looked(way) == []
@@ -169,7 +169,7 @@ def test_a_red_light_on_a_route() -> None:
     for route, moves in ((((-50.0, 0.0), (500.0, 0.0)), True), ((), False)):
         motion = driving(10.0, *route)
         for second in range(2, 30):
-            motion.told(Intent(0.0, 0.0, route=route), float(second))
+            motion.update(Intent(0.0, 0.0, route=route), float(second))
         way = way_of(motion)
         assert way.moves is moves
         assert bool(looked(way)) is moves
@@ -184,7 +184,7 @@ def test_it_goes_on_from_where_the_client_has_come_to() -> None:
     for second in range(2, 22):
         way.look(town(), AHEAD, STEP_M)
         way.look(town(), AHEAD, STEP_M)
-        motion.told(Intent(10.0 * (second - 1), 0.0, route=((-10.0, 0.0), (800.0, 0.0))), float(second))
+        motion.update(Intent(10.0 * (second - 1), 0.0, route=((-10.0, 0.0), (800.0, 0.0))), float(second))
         while (first := way.first()) is not None:
             cells.append(first[1])
             way.take()
@@ -199,7 +199,7 @@ def test_what_is_passed_meanwhile_is_needed_now() -> None:
     way.begin(0.0)
     for _ in range(4):
         way.look(town(), AHEAD, STEP_M)
-    motion.told(Intent(60.0, 0.0, route=((-10.0, 0.0), (800.0, 0.0))), 7.0)
+    motion.update(Intent(60.0, 0.0, route=((-10.0, 0.0), (800.0, 0.0))), 7.0)
     first = way.first()
     assert first is not None
     assert first[0] == 0.0
@@ -212,7 +212,7 @@ def test_a_jump_begins_anew() -> None:
     for _ in range(5):
         way.look(town(), AHEAD, STEP_M)
     for second in range(3):
-        motion.told(Intent(1200.0 + 10.0 * second, 100.0), 10.0 + second)
+        motion.update(Intent(1200.0 + 10.0 * second, 100.0), 10.0 + second)
     way.asks(Circle(1220.0, 100.0, RADIUS_M), ("points",))
     way.look(town(), AHEAD, STEP_M)
     found = []
@@ -253,7 +253,7 @@ def test_hostile_clients(
 ) -> None:
     """Whatever a client says, the way has an end, and every cell is found once."""
     motion = Motion()
-    motion.told(Intent(*pose, route=tuple(route)), 0.0)
-    motion.told(Intent(*pose, route=tuple(route)), 1.0)
+    motion.update(Intent(*pose, route=tuple(route)), 0.0)
+    motion.update(Intent(*pose, route=tuple(route)), 1.0)
     found = looked(way_of(motion), LookAhead(look_s, look_s, look_s))
     assert all(0.0 <= needed_s < math.inf for needed_s, _ in found)

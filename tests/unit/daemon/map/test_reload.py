@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What counts as a change of the map, and when it is time to act on it."""
+"""What counts as a change of the map, when it is read again, and reading it beside the loop."""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+import select
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from shmmap.daemon.host import inotify
-from shmmap.daemon.map.file_watch import MOST_S, SETTLE_S, FileWatch, directories_of
-from shmmap.errors import CannotStart
+from shmmap.daemon.map.catalogue_reload import Reloader, Reread
+from shmmap.daemon.map.file_watch import MAX_DELAY_S, SETTLE_S, FileWatch, directories_of
+from shmmap.errors import CannotStart, ShmmapError
+from shmmap.origin.catalogue import Catalogue
 
 
 @pytest.fixture
@@ -47,7 +52,7 @@ def test_it_is_due_once_the_files_were_left_alone(watch: FileWatch, tmp_path: Pa
 
 def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: FileWatch, tmp_path: Path) -> None:
     now_s = 100.0
-    while now_s < 100.0 + MOST_S:
+    while now_s < 100.0 + MAX_DELAY_S:
         (tmp_path / "a.pcd").write_bytes(b"a")
         watch.drain(now_s)
         assert not watch.due(now_s)
@@ -55,33 +60,26 @@ def test_a_map_that_is_written_without_pause_is_read_all_the_same(watch: FileWat
     assert watch.due(now_s)
 
 
-def changes(tmp_path: Path) -> dict[str, object]:
-    """Ways of changing a map that has a file a.pcd and a directory cells."""
-    return {
-        "written": lambda: (tmp_path / "a.pcd").write_bytes(b"b"),
-        "renamed onto": lambda: (tmp_path / "outside" / "n").rename(tmp_path / "a.pcd"),
-        "renamed away": lambda: (tmp_path / "a.pcd").rename(tmp_path / "outside" / "a.pcd"),
-        "removed": lambda: (tmp_path / "a.pcd").unlink(),
-        "a directory made": lambda: (tmp_path / "more").mkdir(),
-        "a directory removed": lambda: (tmp_path / "outside2").rmdir(),
-    }
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "written": lambda at: (at / "a.pcd").write_bytes(b"b"),
+    "renamed onto": lambda at: (at / "outside" / "n").rename(at / "a.pcd"),
+    "renamed away": lambda at: (at / "a.pcd").rename(at / "outside" / "a.pcd"),
+    "removed": lambda at: (at / "a.pcd").unlink(),
+    "a directory made": lambda at: (at / "more").mkdir(),
+    "a directory removed": lambda at: (at / "outside2").rmdir(),
+}
 
 
-@pytest.mark.parametrize(
-    "how", ["written", "renamed onto", "renamed away", "removed", "a directory made", "a directory removed"]
-)
+@pytest.mark.parametrize("how", CHANGES)
 def test_changes(tmp_path: Path, how: str) -> None:
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "outside2").mkdir()
+    for name in ("outside", "outside2"):
+        (tmp_path / name).mkdir()
     (tmp_path / "outside" / "n").write_bytes(b"n")
     (tmp_path / "a.pcd").write_bytes(b"a")
-    watch = FileWatch([str(tmp_path)])
-    change = changes(tmp_path)[how]
-    assert callable(change)
-    change()
-    watch.drain(1.0)
-    assert watch.due(2.0)
-    watch.close()
+    with closing(FileWatch([str(tmp_path)])) as watch:
+        CHANGES[how](tmp_path)
+        watch.drain(1.0)
+        assert watch.due(2.0)
 
 
 def test_reading_is_no_change(watch: FileWatch, tmp_path: Path) -> None:
@@ -149,7 +147,7 @@ def test_a_full_queue_counts_as_a_change(watch: FileWatch, monkeypatch: pytest.M
     assert watch.due(2.0)
 
 
-def test_a_limit_of_the_kernel_is_told_with_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limit_of_the_kernel_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ctypes.get_errno", lambda: errno.ENOSPC)
 
     class Full:
@@ -166,3 +164,59 @@ def test_a_limit_of_the_kernel_is_told_with_its_name(tmp_path: Path, monkeypatch
     with pytest.raises(CannotStart, match="No space left") as raised:
         FileWatch([str(tmp_path)])
     assert "max_user_watches" in raised.value.hint
+
+
+Result = Reread | ShmmapError
+
+
+class Origin:
+    """A map without cells."""
+
+    path = "/maps/town"
+
+    def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
+        assert fresh
+        assert before is not None
+        return Catalogue.from_cells([])
+
+
+@pytest.fixture
+def reloader() -> Iterator[Reloader]:
+    one = Reloader(Origin(), lambda: Catalogue.from_cells([]))
+    yield one
+    one.close()
+
+
+def collect(reloader: Reloader) -> None:
+    """Do what the loop does when the descriptor is readable."""
+    assert select.select([reloader.fd], [], [], 30.0)[0]
+    reloader.collect(lambda found: found, lambda _: None)
+
+
+def test_who_asks_meanwhile_gets_the_next_one(reloader: Reloader) -> None:
+    answers: list[tuple[str, Result]] = []
+    for name in "abc":
+        reloader.ask(lambda result, name=name: answers.append((name, result)))  # type: ignore[misc]
+    collect(reloader)
+    assert [name for name, _ in answers] == ["a"]
+    collect(reloader)
+    assert [name for name, _ in answers] == ["a", "b", "c"]
+    assert answers[1][1] is answers[2][1] is not answers[0][1]
+
+
+def test_no_thread_is_to_be_had(reloader: Reloader, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That reload fails, and is answered; the next one works."""
+    answers: list[Result] = []
+
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        reloader.ask(answers.append)
+    collect(reloader)
+    assert isinstance(answers[0], ShmmapError)
+    assert "can't start new thread" in answers[0].message
+    reloader.ask(answers.append)
+    collect(reloader)
+    assert isinstance(answers[1], Reread)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Connections of libzmq and of raw sockets: who they are, what is kept for them, and who loses them."""
+"""Connections of libzmq and of raw sockets: whose they are, what is kept for them, and which are ended."""
 
 from __future__ import annotations
 
@@ -18,15 +18,18 @@ import pytest
 import zmq
 
 from shmmap.daemon.transport.connection import (
-    FRAMES_AT_ONCE,
-    MOST_UNREAD_BYTES,
-    MOST_WAITING,
+    FRAMES_PER_TURN,
+    MAX_UNREAD_BYTES,
+    MAX_WAITING,
+    MEMORY_ALLOWANCE_BYTES,
+    MIN_SHARE,
     READ_BYTES,
     Connection,
+    Connections,
+    Listener,
     Peer,
 )
 from shmmap.daemon.transport.inbox import Inbox
-from shmmap.daemon.transport.listener import LEAST_SHARE, MEMORY_ALLOWANCE_BYTES, Connections, Listener
 from shmmap.daemon.transport.socket_file import SocketFile
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.daemon.transport.zmtp import GREETING, framed
@@ -62,21 +65,21 @@ class Counts(Counter[str]):
 
 
 class Loop:
-    """A listener and the turns of a loop; keeps what is heard."""
+    """A listener and the turns of a loop; keeps what is received."""
 
     def __init__(self, directory: str) -> None:
         self.path = f"{directory}/s.sock"
         self.watched = WatchedDescriptors()
         self.connections = Connections()
         self.counts = Counts()
-        self.heard: list[tuple[Connection, bytes, bool]] = []
+        self.received: list[tuple[Connection, bytes, bool]] = []
         self.ended: list[Connection] = []
         self.socket = SocketFile(self.path, -1).socket
         self.context: zmq.Context[Any] = zmq.Context()
         self.held: list[socket.socket] = []
         self.listener = Listener(
             self.socket, self.watched, self.connections, cast("StatisticsWriter", self.counts), b"ROUTER",
-            b"DEALER", LONGEST, lambda *message: self.heard.append(message), self.ended.append,
+            b"DEALER", LONGEST, lambda *message: self.received.append(message), self.ended.append,
         )  # fmt: skip
         self.listener.begin()
 
@@ -96,7 +99,7 @@ class Loop:
             pass
 
     def raw(self, data: bytes = b"") -> socket.socket:
-        """Connect a bare socket that has said this."""
+        """Connect a bare socket that has sent this."""
         one = socket.socket(socket.AF_UNIX)
         one.settimeout(30.0)
         one.connect(self.path)
@@ -106,7 +109,7 @@ class Loop:
         return one
 
     def send(self, one: socket.socket, data: bytes) -> None:
-        """Have a bare socket say more than the kernel keeps."""
+        """Have a bare socket send more than the kernel keeps."""
         one.setblocking(False)
         waiting = Deadline()
         while waiting(len(data) > 0):
@@ -161,19 +164,19 @@ def other(loop: Loop) -> Iterator[int]:
 
 
 def test_libzmq_s_client(loop: Loop) -> None:
-    """Requests and replies of all lengths, and who is there: the kernel says."""
+    """Requests and replies of all lengths, and the credentials that the kernel gives."""
     one = loop.dealer()
     sizes = (0, 1, 255, 256, 300_000)
     for size in sizes:
         one.send(bytes(size))
     one.send_multipart([b"first", b"second"])
     waiting = Deadline()
-    while waiting(len(loop.heard) < len(sizes) + 1):
+    while waiting(len(loop.received) < len(sizes) + 1):
         loop.turn()
-    assert [(len(body), several) for _, body, several in loop.heard] == [
+    assert [(len(body), is_multipart) for _, body, is_multipart in loop.received] == [
         *((size, False) for size in sizes), (5, True)
     ]  # fmt: skip
-    connection = loop.heard[0][0]
+    connection = loop.received[0][0]
     assert connection.peer == Peer(os.getuid(), os.getgid(), os.getpid())
     for size in sizes:
         connection.reply(bytes(size))
@@ -190,7 +193,7 @@ def test_libzmq_s_client(loop: Loop) -> None:
     while waiting(not loop.ended):
         loop.turn()
     assert loop.ended == [connection]
-    connection.reply(b"to nobody")
+    connection.reply(b"too late")
     assert loop.count == 0
 
 
@@ -207,28 +210,28 @@ def test_a_turn_does_little(loop: Loop) -> None:
     one.sendall(framed(b"x") * 1000)
     most = 0
     waiting = Deadline()
-    while waiting(len(loop.heard) < 1000):
-        before = len(loop.heard)
+    while waiting(len(loop.received) < 1000):
+        before = len(loop.received)
         loop.turn()
-        most = max(most, len(loop.heard) - before)
-    assert most == FRAMES_AT_ONCE
+        most = max(most, len(loop.received) - before)
+    assert most == FRAMES_PER_TURN
 
 
-def test_what_nobody_serves_yet_stays_in_the_kernel(loop: Loop) -> None:
+def test_what_waits_too_long_stays_in_the_kernel(loop: Loop) -> None:
     """A loud client is not read any more until some of its requests were served."""
     one = loop.raw(GREETING + READY)
     inbox = Inbox(cast("StatisticsWriter", loop.counts))
-    loop.listener.hear = inbox.hear
+    loop.listener.on_message = inbox.receive
     one.sendall(framed(b"x") * 500)
     loop.settle()
     waiting = len(inbox)
-    assert MOST_WAITING <= waiting < MOST_WAITING + FRAMES_AT_ONCE
+    assert MAX_WAITING <= waiting < MAX_WAITING + FRAMES_PER_TURN
     served = 0
     while (turn := inbox.take()) is not None:
         inbox.served(turn, 0.001)
         served += 1
         loop.settle()
-        assert len(inbox) < MOST_WAITING + FRAMES_AT_ONCE
+        assert len(inbox) < MAX_WAITING + FRAMES_PER_TURN
     assert served == 500
     assert loop.counts["errors_returned"] == 0
     one.sendall(framed(b"x") * 500)
@@ -245,7 +248,7 @@ def test_many_connections_take_turns(loop: Loop) -> None:
     for one in loop.held:
         one.sendall(framed(b"x"))
     assert [loop.turn() for _ in range(3)] == [16, 16, 8]
-    assert len({connection for connection, _, _ in loop.heard}) == 40
+    assert len({connection for connection, _, _ in loop.received}) == 40
 
 
 def test_replies_that_are_not_read(loop: Loop) -> None:
@@ -265,7 +268,7 @@ def test_replies_that_are_not_read(loop: Loop) -> None:
         loop.settle()
     assert received == expected
     assert (connection.unsent_bytes, loop.connections.nbytes) == (0, 0)
-    for _ in range(MOST_UNREAD_BYTES // 300_000 + 2):
+    for _ in range(MAX_UNREAD_BYTES // 300_000 + 2):
         connection.reply(sent[0])
     assert connection.unsent_bytes == 0
     loop.settle()
@@ -293,17 +296,17 @@ def test_a_message_that_is_too_long(loop: Loop) -> None:
     one = loop.raw(GREETING + READY)
     one.sendall(b"\x02" + (LONGEST + 1).to_bytes(8, "big"))
     loop.settle()
-    assert (len(loop.ended), loop.heard) == (1, [])
+    assert (len(loop.ended), loop.received) == (1, [])
 
 
 def test_more_connections_than_descriptors(loop: Loop, other: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who has most keeps a share, with a session first; others lose nothing."""
-    for _ in range(LEAST_SHARE + 4):
+    """The process that has most keeps a share, connections with a session first; others lose nothing."""
+    for _ in range(MIN_SHARE + 4):
         loop.raw()
     mine = loop.of(os.getpid())
-    with_session = mine[:LEAST_SHARE]
+    with_session = mine[:MIN_SHARE]
     for one in with_session:
-        one.session = cast("Any", "a session")
+        one.slot = 7
     highest = max(one.fd for one in loop.connections)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (highest + 49, highest + 49))
     loop.raw()
@@ -313,7 +316,7 @@ def test_more_connections_than_descriptors(loop: Loop, other: int, monkeypatch: 
     assert not loop.connections.short
 
 
-def test_newcomers_wait_where_nobody_has_many(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newcomers_wait_where_each_process_has_few(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
     first = loop.raw()
     highest = max(one.fd for one in loop.connections)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (highest + 49, highest + 49))
@@ -327,7 +330,7 @@ def test_newcomers_wait_where_nobody_has_many(loop: Loop, monkeypatch: pytest.Mo
 
 
 def test_a_machine_without_descriptors_is_asked_again(loop: Loop) -> None:
-    """With nobody connected, nobody's leaving makes room."""
+    """Without connections none can end and make room."""
     loop.connections.short = True
     loop.raw(GREETING)
     assert loop.count == 0
@@ -336,7 +339,7 @@ def test_a_machine_without_descriptors_is_asked_again(loop: Loop) -> None:
     assert loop.count == 1
 
 
-def test_what_was_said_last_is_delivered(loop: Loop) -> None:
+def test_the_last_replies_are_delivered(loop: Loop) -> None:
     one = loop.raw(GREETING + READY)
     (connection,) = loop.connections
     connection.reply(bytes(READ_BYTES * 8))
@@ -347,3 +350,25 @@ def test_what_was_said_last_is_delivered(loop: Loop) -> None:
     loop.connections.deliver(30.0)
     total, _ = reader.communicate()
     assert int(total) > READ_BYTES * 8
+
+
+def test_a_descriptor_that_only_its_callback_keeps_open_can_be_unwatched() -> None:
+    class Owner:
+        def __init__(self) -> None:
+            self.fd = os.eventfd(0, os.EFD_CLOEXEC)
+
+        def __del__(self) -> None:
+            os.close(self.fd)
+
+        def look(self) -> None:
+            """Do nothing."""
+
+    watched, owner = WatchedDescriptors(), Owner()
+    fd = owner.fd
+    watched.watch(fd, owner.look)
+    del owner
+    os.eventfd_write(fd, 1)
+    assert watched.poll(0.0) == [fd]
+    watched.unwatch(fd)
+    assert watched.poll(0.0) == []
+    watched.close()

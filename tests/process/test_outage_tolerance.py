@@ -22,9 +22,9 @@ pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 
 SIZE, ROAD_M, SHARDS = 20, 1400, 20
-SPEED, RIDE_OUT_S, RADIUS, STEP = 20.0, 30.0, 6.0, 20
+SPEED, OUTAGE_TOLERANCE_S, RADIUS, STEP = 20.0, 30.0, 6.0, 20
 ROUTE = [(0.0, 10.0), (float(ROAD_M), 10.0)]
-DRIVEN_M = int(SPEED * RIDE_OUT_S)
+DRIVEN_M = int(SPEED * OUTAGE_TOLERANCE_S)
 TIMEOUT_S = 60.0
 
 
@@ -72,7 +72,7 @@ def until_out(one: DaemonProcess) -> None:
 
 def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, web: FaultyWeb) -> None:
     """Only a part of the list of cells fits; the pages along the route stay."""
-    words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--catalogue-budget", "64K")
+    words = ("--poll", "1", "--outage-tolerance", str(OUTAGE_TOLERANCE_S), "--catalogue-budget", "64K")
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
         assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S).complete
@@ -84,7 +84,16 @@ def test_cells_and_pages_along_the_route_are_in_memory(daemon: DaemonFactory, we
 
 def test_what_does_not_fit_in_memory_is_on_the_disk(daemon: DaemonFactory, web: FaultyWeb) -> None:
     """Memory has room for a few seconds of the drive; the rest comes out of the disk cache in time."""
-    words = ("--poll", "1", "--ride-out", str(RIDE_OUT_S), "--budget", "2M", "--prefetch-share", "0.2")
+    words = (
+        "--poll",
+        "1",
+        "--outage-tolerance",
+        str(OUTAGE_TOLERANCE_S),
+        "--budget",
+        "2M",
+        "--prefetch-share",
+        "0.2",
+    )
     one = daemon(web.url, *words)
     with shmmap.MapWindow(one.endpoint, RADIUS) as window:
         assert window.move_to(1.0, 10.0, vx=SPEED, route=ROUTE, wait=TIMEOUT_S).complete
