@@ -3,7 +3,7 @@
 
 ::
 
-    from shmmap import build_layer
+    from shmmap.layers import build_layer
 
     ndt = build_layer("ndt(leaf=2.0)", xyz)
     ndt["mean"], ndt["inverse_covariance"], ndt.lattice

@@ -55,7 +55,7 @@ SCENES: Final = {
     ),
     "events": (
         "own = threading.local()",
-        "own.events = getattr(own, 'events', None) or shmmap.EventStream(endpoint); own.events.next(0.01)",
+        "own.events = getattr(own, 'events', None) or shmmap.events.EventStream(endpoint); own.events.next(0.01)",
     ),
 }
 

@@ -70,8 +70,8 @@ ARGUMENTS: dict[str, Callable[[shmmap.Client], object]] = {
     "move wait": lambda c: shmmap.MapWindow(c, 5.0, background=False).move_to(0, 0, wait=[1]),  # type: ignore[arg-type]
     "wait until": lambda c: shmmap.MapWindow(c, 5.0, background=False).wait_until_current(None),  # type: ignore[arg-type]
     "covers": lambda c: shmmap.MapWindow(c, 5.0, background=False).covers("a", 0),  # type: ignore[arg-type]
-    "events since": lambda c: shmmap.EventStream(c.endpoint, since="x"),  # type: ignore[arg-type]
-    "events timeout": lambda c: shmmap.EventStream(c.endpoint, timeout=None),  # type: ignore[arg-type]
+    "events since": lambda c: shmmap.events.EventStream(c.endpoint, since="x"),  # type: ignore[arg-type]
+    "events timeout": lambda c: shmmap.events.EventStream(c.endpoint, timeout=None),  # type: ignore[arg-type]
 }
 
 
@@ -125,7 +125,7 @@ def test_an_instance_by_its_name(daemon: Factory, tmp_path: Path, monkeypatch: p
             assert client.endpoint == one.endpoint
     with shmmap.MapWindow(name, 5.0) as window, shmmap.MapWindow(radius=5.0, instance=name) as other:
         assert window.client.endpoint == other.client.endpoint == one.endpoint
-    for stream in (shmmap.EventStream(name), shmmap.EventStream(instance=name)):
+    for stream in (shmmap.events.EventStream(name), shmmap.events.EventStream(instance=name)):
         assert stream.path == one.endpoint
         stream.close()
     monkeypatch.setenv("SHMMAP_ENDPOINT", "/nobody/is/here.sock")
@@ -142,7 +142,7 @@ def test_an_instance_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     for ask in (
         lambda: shmmap.connect("u1"),
         lambda: shmmap.MapWindow("u1"),
-        lambda: shmmap.EventStream("u1"),
+        lambda: shmmap.events.EventStream("u1"),
     ):
         with pytest.raises(NoSocket, match=r"/u1\.sock: there is no socket \(.*connect\(instance=") as caught:
             ask()

@@ -477,7 +477,7 @@ class CppWindow:
 
 
 class CppEventStream:
-    """As `shmmap.EventStream`."""
+    """As `shmmap.events.EventStream`."""
 
     def __init__(
         self,
@@ -499,14 +499,14 @@ class CppEventStream:
         """The daemon's present life."""
         return int(self._program.told("epoch")[0][1])
 
-    def next(self, timeout: float | None = None) -> events.Event | shmmap.Missed | None:
-        """As `shmmap.EventStream.next`."""
+    def next(self, timeout: float | None = None) -> events.Event | shmmap.events.MissedEvents | None:
+        """As `shmmap.events.EventStream.next`."""
         lines = self._program.told("next", 1e6 if timeout is None else timeout)
         if not lines:
             return None
         what, *words = lines[0]
         if what == "missed":
-            return shmmap.Missed(*map(int, words))
+            return shmmap.events.MissedEvents(*map(int, words))
         named = words[:4] + [word.partition("=")[2] for word in words[4:]]
         found: events.Event = msgspec.convert(named, events.Event, strict=False)
         return found

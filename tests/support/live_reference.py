@@ -19,7 +19,7 @@ __all__ = ["held", "mapped_around", "reference"]
 Scan = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def reference(scans: Iterable[Scan], scan_filter: shmmap.ScanFilter = FILTER) -> dict[Voxel, int]:
+def reference(scans: Iterable[Scan], scan_filter: shmmap.live.ScanFilter = FILTER) -> dict[Voxel, int]:
     """Log-odds of all known voxels after these scans."""
     slow = SlowOccupancy(
         RESOLUTION, min_range=scan_filter.min_range, max_range=scan_filter.max_range,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from shmmap import EventStream
+from shmmap.events import EventStream
 from shmmap.protocol import events as e
 from shmmap.statistics.reader import read_statistics
 from tests.support.daemon_process import DaemonProcess

@@ -8,7 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapWindow, canonical_layer
+from shmmap import BadRequest, MapWindow
+from shmmap.layers import canonical_layer
 from shmmap_clients.elevation_map.rule import ElevationRule
 
 __all__ = ["WindowHeights"]

@@ -9,15 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from shmmap import (
-    ChunkInfo,
-    Counts,
-    DaemonUnreachable,
-    LiveInterrupted,
-    LiveMap,
-    LiveMapper,
-    LiveMapRow,
-)
+from shmmap import DaemonUnreachable
+from shmmap.errors import LiveInterrupted
+from shmmap.live import ChunkInfo, LiveMap, LiveMapper, LiveMapRow
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import Decimated, RunningSpread
 

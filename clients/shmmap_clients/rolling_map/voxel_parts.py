@@ -9,7 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import Box, LiveMap, OverBudget, ZRange
+from shmmap import Box, ZRange
+from shmmap.errors import OverBudget
+from shmmap.live import LiveMap
 
 __all__ = ["all_voxels"]
 
@@ -22,7 +24,7 @@ def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.fl
     Parameters
     ----------
     kind, scope
-        As `shmmap.LiveMap.voxels` takes them.
+        As `shmmap.live.LiveMap.voxels` takes them.
 
     Raises
     ------

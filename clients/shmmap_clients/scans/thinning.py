@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import build_layer
+from shmmap.layers import build_layer
 
 __all__ = ["thinned"]
 

@@ -325,7 +325,7 @@ class MapWindow:
             Metres, map frame; what lies beyond the window is not there, and not ``covered``.
         layer
             Which of the window's layers, as it was asked for or as `Cell.layer` names it; by default the
-            first.  Of two layers of one kind, the name is that of `Cell.layer` (`shmmap.canonical_layer`).
+            first.  Of two layers of one kind, the name is that of `Cell.layer` (`shmmap.layers.canonical_layer`).
 
         Raises
         ------

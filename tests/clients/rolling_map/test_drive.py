@@ -8,8 +8,6 @@ from shmmap_clients.rolling_map.drive import DriveStatistics, MappedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import KEPT
 
-from shmmap import Counts
-
 
 def test_the_path_of_a_long_drive_keeps_its_ends() -> None:
     statistics = DriveStatistics()

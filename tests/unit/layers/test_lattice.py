@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shmmap import build_layer
-from shmmap.layers import lattice
+from shmmap.layers import build_layer, lattice
 from shmmap.layers.lattice import group_points
 from shmmap.layers.ndt import CONVENTIONS, voxel_covariances
 from tests.support.layer_oracles import covariance_of, voxels_of

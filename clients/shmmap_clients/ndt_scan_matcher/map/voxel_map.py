@@ -119,7 +119,7 @@ class VoxelMap:
             return cell.inverse
         derived = self._derived.setdefault(key, {})
         if covariance not in derived:
-            from shmmap import voxel_covariances
+            from shmmap.layers import voxel_covariances
 
             derived[covariance] = voxel_covariances(cell.count, cell.scatter, covariance)[1]
         return derived[covariance]
