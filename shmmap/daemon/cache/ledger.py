@@ -82,8 +82,8 @@ class Ledger:
         What the daemon itself keeps in shared memory (its statistics); counts as used.
     aside_bytes
         Segments of an earlier run that cannot be judged before more of the map is known; counts as used.
-    prefetched_bytes
-        Memory of what was fetched before anybody asked for it, and nobody has asked for yet.
+    prefetched, prefetched_bytes
+        What was fetched ahead and no client has asked for yet, and its memory.
     unchecked_count
         How many residents are of an earlier life and not yet checked.
     """
@@ -102,6 +102,7 @@ class Ledger:
         self.overhead_bytes = 0
         self.aside_bytes = 0
         self.prefetched_bytes = 0
+        self.prefetched: dict[Resident, None] = {}
         self.unchecked_count = 0
         self._by_name: ShardedDict[str, Resident] = ShardedDict()
         self._needed: dict[Key, int] = {}
@@ -194,7 +195,9 @@ class Ledger:
         self._layers[resident.key.layer] += 1
         self.resident_bytes += resident.nbytes
         self.unchecked_count += not resident.checked
-        self.prefetched_bytes += resident.nbytes * resident.prefetched
+        if resident.prefetched:
+            self.prefetched[resident] = None
+            self.prefetched_bytes += resident.nbytes
         self.segments.add(resident)
         self.order.new[resident] = None
         self.order.changes += 1
@@ -208,10 +211,14 @@ class Ledger:
         self.unchecked_count -= 1
 
     def asked_for(self, resident: Resident) -> None:
-        """Somebody asked for what was fetched ahead."""
-        if resident.prefetched and self._by_name.get(resident.name) is resident:
-            self.prefetched_bytes -= resident.nbytes
+        """Note that a client asked for what was fetched ahead."""
+        self._not_ahead(resident)
         resident.prefetched = False
+
+    def _not_ahead(self, resident: Resident) -> None:
+        if resident in self.prefetched:
+            del self.prefetched[resident]
+            self.prefetched_bytes -= resident.nbytes
 
     # --- leaving --------------------------------------------------------------------------------
 
@@ -221,7 +228,7 @@ class Ledger:
         if not self._layers[resident.key.layer]:
             del self._layers[resident.key.layer]
         self.unchecked_count -= not resident.checked
-        self.prefetched_bytes -= resident.nbytes * resident.prefetched
+        self._not_ahead(resident)
         self.resident_bytes -= resident.nbytes
         self.order.leave(resident)
         self.retired_bytes += resident.nbytes

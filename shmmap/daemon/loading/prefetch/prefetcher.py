@@ -5,7 +5,7 @@ A wish becomes a load like any other when nothing else is queued and a loader ha
 waits, none is out of date, and what a client asks for comes first.  Some places are kept free, so that a
 demand need not wait for a wish, unless the wish is nearly one itself.  Memory: a wish takes the place of what
 will be needed later than itself, never of what will be needed sooner or is in use, and what was fetched ahead
-and not asked for yet takes its share of the budget at most.
+and not asked for yet takes its share of the budget at most: in a full share, too, what is needed first stays.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ FOLLOW_S: Final = 0.005
 another all are looked at once."""
 KEPT: Final = 4
 """A part of one loader's places is kept free for demands: a quarter, one at least."""
+SWAP_S: Final = 0.25
+"""So long nothing is looked for in the share of what was fetched ahead after there was nothing to give up."""
 FULL_S: Final = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
 
@@ -71,6 +73,7 @@ class Prefetcher:
         self._now_s = 0.0
         self._next_s = -math.inf
         self._full_until_s = self._followed_s = self._answered_s = -math.inf
+        self._swapped_s = -math.inf
         self._running: dict[Load, int] = {}
         self._no_room = False
 
@@ -157,11 +160,28 @@ class Prefetcher:
         taken = cache.ledger.prefetched_bytes + sum(self._running.values())
         self._no_room = taken + nbytes > self.share * cache.ledger.budget_bytes
         if self._no_room:
-            self._next_s = math.inf  # until somebody asks for what was fetched
+            shortage = int(taken + nbytes - self.share * cache.ledger.budget_bytes)
+            self._next_s = now_s if self._swap(key, wish.cell, nbytes, shortage) else math.inf
         else:
             computed = cache.layers.is_computed(wish.cell, wish.layer)
             self._loads.prefetch(key, nbytes, wish.needed_in_s, computed=computed)
             self._next_s = now_s
+
+    def _swap(self, key: Key, index: int, nbytes: int, shortage: int) -> bool:
+        """Give up what was fetched ahead and is needed later, for a wish that their share has no room for."""
+        if self._now_s < self._swapped_s + SWAP_S:
+            return False  # the next move of a client asks again
+        swapped = self._cache.evictor.give_up_prefetched(
+            shortage, self._now_s, self._wished(key, index, nbytes)
+        )
+        if not swapped:
+            self._swapped_s = self._now_s
+        return swapped
+
+    def _wished(self, key: Key, index: int, nbytes: int) -> Resident:
+        """What a wish would be in memory, to compare it with what is there."""
+        box = self._cache.catalogue.box(index)
+        return Resident("", key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=self._now_s)
 
     def _is_absent(self, index: int, layer: str) -> bool:
         """Whether a cell could be fetched ahead; one that is larger than the share never can."""
@@ -178,8 +198,7 @@ class Prefetcher:
         """Have memory freed for a wish; False if all there is will be needed sooner, or is in use."""
         index = self._cache.index_of(load.key.cell_id)
         if index is not None:
-            nbytes, box = load.estimate, self._cache.catalogue.box(index)
-            wished = Resident("", load.key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=now_s)
+            wished = self._wished(load.key, index, load.estimate)
             if self._cache.evictor.free(shortage, now_s, rather_than=wished):
                 return True
         self.full(now_s)

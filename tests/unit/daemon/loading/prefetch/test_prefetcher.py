@@ -285,6 +285,30 @@ def test_no_more_than_its_share_of_the_budget(prefetching: Callable[..., InnerDa
     assert other.ledger.prefetched_bytes < one.ledger.prefetched_bytes
 
 
+def test_a_full_share_gives_up_what_is_needed_later(prefetching: Callable[..., InnerDaemon]) -> None:
+    """A client turns round: what lies ahead of it now takes the place of what nobody comes to any more."""
+    one = prefetching()
+    each = one.cache.estimate(0, "points")
+    one.scheduler.prefetcher.share = (6.5 * each) / one.ledger.budget_bytes
+    drive = Drive(one, 0.0)
+    one.run_until(lambda: idle(one))
+
+    def ahead() -> set[float]:
+        return {resident.box[0] for resident in one.ledger.residents() if resident.prefetched}
+
+    assert {40.0, 60.0} <= ahead() <= {40.0, 60.0, 80.0}, "what is needed first"
+    for _ in range(3):
+        one.offset_s += 1.0
+        intent = Intent(0.0, 10.0, vx=-SPEED_MPS, route=((0.0, 10.0), (-400.0, 10.0)))
+        says(drive.session, intent, one.now_s())
+        one.turn()
+        one.run_until(lambda: idle(one))
+    assert {-60.0, -80.0} <= ahead()
+    assert not {60.0, 80.0} & ahead()
+    assert one.ledger.prefetched_bytes == sum(r.nbytes for r in one.ledger.residents() if r.prefetched)
+    assert one.ledger.prefetched_bytes <= 6.5 * each
+
+
 def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., InnerDaemon]) -> None:
     """What lies behind gives way, what is nearer ahead does not; nothing is refused or failed."""
     one = prefetching(prefetch_share=1.0)
