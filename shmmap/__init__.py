@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One copy of a vehicle's point-cloud map per machine, in shared memory: `connect` to the daemon, ask the `Client`
-for an area, `Circle` or `Box`, read the points of each `Cell`; or follow a vehicle with a `MapWindow`.
+"""One copy of a vehicle's point-cloud map per machine, in shared memory, for every process.
+
+First `connect` to the daemon; ask the `Client` for an area, a `Circle` or a `Box`, and read the points of
+each `Cell`; or follow a vehicle with a `MapWindow`:
 
 ::
 
@@ -103,25 +105,27 @@ _PACKAGES: Final = ("errors", "events", "layers", "live")
 _load = lazy_names(__name__)
 
 
-def __getattr__(name: str) -> Any:
-    if name in _PACKAGES:
-        return importlib.import_module(f"shmmap.{name}")
-    try:
-        with _needed_packages(f"shmmap.{name}"):
-            return _load(name)
-    except AttributeError:
-        for package in _PACKAGES:
-            if name in importlib.import_module(f"shmmap.{package}").__all__:
-                error = AttributeError(
-                    f"module 'shmmap' has no attribute {name!r}: it is shmmap.{package}.{name}"
-                )
-                raise error from None
-        raise
-    except (OSError, ImportError) as error:
-        limit = _no_files_left(error, f"shmmap.{name} cannot be loaded: ")
-        if limit is None:
+if not TYPE_CHECKING:  # for a type checker a name that is not in the list is no name
+
+    def __getattr__(name: str) -> Any:
+        if name in _PACKAGES:
+            return importlib.import_module(f"shmmap.{name}")
+        try:
+            with _needed_packages(f"shmmap.{name}"):
+                return _load(name)
+        except AttributeError:
+            for package in _PACKAGES:
+                if name in importlib.import_module(f"shmmap.{package}").__all__:
+                    error = AttributeError(
+                        f"module 'shmmap' has no attribute {name!r}: it is shmmap.{package}.{name}"
+                    )
+                    raise error from None
             raise
-        raise limit from None
+        except (OSError, ImportError) as error:
+            limit = _no_files_left(error, f"shmmap.{name} cannot be loaded: ")
+            if limit is None:
+                raise
+            raise limit from None
 
 
 def __dir__() -> list[str]:

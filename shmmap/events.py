@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens in the daemon, as it happens: cells loaded, changed, evicted; maps reloaded; clients that come and go.
+"""What happens in the daemon, as it happens: cells loaded, changed, evicted; clients that join and leave.
 
 ::
 
@@ -67,4 +67,5 @@ __all__ = [
     "Retried",
 ]
 
-__getattr__ = lazy_names(__name__)
+if not TYPE_CHECKING:
+    __getattr__ = lazy_names(__name__)

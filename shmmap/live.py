@@ -42,4 +42,5 @@ __all__ = [
     "Voxels",
 ]
 
-__getattr__ = lazy_names(__name__)
+if not TYPE_CHECKING:
+    __getattr__ = lazy_names(__name__)

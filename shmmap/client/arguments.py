@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 import numpy as np
 
-from shmmap import geometry
 from shmmap.errors import BadRequest
 from shmmap.protocol.messages import Intent
 
@@ -27,7 +26,6 @@ __all__ = [
     "MAX_ROUTE_PLACES",
     "checked_seconds",
     "given_intent",
-    "heights",
     "names",
     "number",
     "pose_intent",
@@ -98,7 +96,7 @@ def names(what: str, given: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def request_waits(wait: float | None) -> Iterator[float | None]:
-    """Yield what each request for the same cells lets the daemon wait, seconds: several where ``wait`` is long.
+    """Yield the seconds that each request for the same cells may wait: several where ``wait`` is long.
 
     Raises
     ------
@@ -110,17 +108,6 @@ def request_waits(wait: float | None) -> Iterator[float | None]:
         yield MAX_WAIT_S
         left_s -= MAX_WAIT_S
     yield left_s
-
-
-def heights(z: tuple[float, float] | None) -> geometry.ZRange | None:
-    """Return heights of interest, (lowest, highest) in metres; None: all."""
-    if z is None or isinstance(z, geometry.ZRange):
-        return z
-    try:
-        lowest, highest = z
-    except (TypeError, ValueError):
-        raise BadRequest(f"z must be (lowest, highest) in metres, not {z!r}") from None
-    return geometry.ZRange(lowest, highest)
 
 
 # --- where a vehicle is and goes ------------------------------------------------------------------

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CellSet", "Held", "HeldCells", "PendingLayer", "cell_error", "gather"]
 
-Held: TypeAlias = Cell | str | tuple[str, int] | tuple[str, int | None, tuple[str, ...]]
+Held: TypeAlias = Cell | str | tuple[str, int | None] | tuple[str, int | None, tuple[str, ...]]
 """An attached cell, or an id (which means its current version), id and version, or these and layers."""
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 import numpy as np
 
 from shmmap import geometry
-from shmmap.client.arguments import given_intent, heights, names, request_waits, timeout_s
+from shmmap.client.arguments import given_intent, names, request_waits, timeout_s
 from shmmap.client.cell_set import CellSet, Held, HeldCells
 from shmmap.client.connection import until_served
 from shmmap.client.discovery import candidates
@@ -182,7 +182,7 @@ class Client:
         strict: bool | None = False,
     ) -> CellSet:
         """Cells within ``radius`` metres of a place, whole: `area` with a circle."""
-        return self.area(geometry.Circle(x, y, radius, heights(z)), layers, wait=wait, strict=strict)
+        return self.area(geometry.Circle(x, y, radius, z), layers, wait=wait, strict=strict)
 
     def area(
         self,
@@ -270,7 +270,7 @@ class Client:
         """
         from shmmap.client.points_around import points_around  # windows need it, and few others
 
-        found = self.area(geometry.Circle(x, y, radius, heights(z)), layer, wait=wait, strict=strict)
+        found = self.area(geometry.Circle(x, y, radius, z), layer, wait=wait, strict=strict)
         boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
         return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
 
@@ -298,8 +298,8 @@ class Client:
         Parameters
         ----------
         held
-            Cells of earlier answers; or ids: alone (meaning the current version), with a version, (id, version),
-            or with the layers that have it, too, (id, version, layers).
+            Cells of earlier answers; or ids: alone (meaning the current version), with a version,
+            ``(id, version)``, or with the layers that have it, too, ``(id, version, layers)``.
         by_name
             Send held cells by name and version, not by version alone: for the first request to a
             restarted daemon, which cannot know what the versions of a previous run belonged to.
@@ -499,7 +499,7 @@ class Client:
 
 
 def _waited(wait: float | None, ask: Callable[[float | None], CellSet]) -> CellSet:
-    """Return the last answer to a request that is repeated while cells are pending and ``wait`` is not over."""
+    """Repeat a request while cells are pending and ``wait`` is not over; returns the last answer."""
     found = CellSet()
     for wait_s in request_waits(wait):
         found = ask(wait_s)

@@ -36,4 +36,5 @@ __all__ = [
     "voxel_covariances",
 ]
 
-__getattr__ = lazy_names(__name__)
+if not TYPE_CHECKING:
+    __getattr__ = lazy_names(__name__)

@@ -48,7 +48,6 @@ ARGUMENTS: dict[str, Callable[[shmmap.Client], object]] = {
     "z three": lambda c: c.points_around(0, 0, 5, z=(1, 2, 3)),  # type: ignore[arg-type]
     "wait nan": lambda c: c.around(0, 0, wait=NAN),
     "wait text": lambda c: c.around(0, 0, wait="1"[:0] or "long"),  # type: ignore[arg-type]
-    "wait infinite": lambda c: c.around(0, 0, wait=math.inf),
     "layers none": lambda c: c.around(0, 0, layers=None),  # type: ignore[arg-type]
     "layers numbers": lambda c: c.around(0, 0, layers=[1, 2]),  # type: ignore[list-item]
     "ids none": lambda c: c.selected(None),  # type: ignore[arg-type]
@@ -56,8 +55,9 @@ ARGUMENTS: dict[str, Callable[[shmmap.Client], object]] = {
     "held numbers": lambda c: c.differential(shmmap.Circle(0, 0, 5), [1]),  # type: ignore[list-item]
     "held triples": lambda c: c.differential(shmmap.Circle(0, 0, 5), [("a", 1, 2)]),  # type: ignore[list-item]
     "held beyond": lambda c: c.differential(shmmap.Circle(0, 0, 5), [("a", 1 << 70)]),
-    "intent tuple": lambda c: c.area(shmmap.Circle(0, 0, 5), intent=(1, 2)),  # type: ignore[arg-type]
-    "intent object": lambda c: c.area(shmmap.Circle(0, 0, 5), intent=shmmap.Intent(object(), 0)),  # type: ignore[arg-type]
+    "pose number": lambda c: c.area(shmmap.Circle(0, 0, 5), pose=1.0),  # type: ignore[arg-type]
+    "pose object": lambda c: c.area(shmmap.Circle(0, 0, 5), pose=(object(), 0)),  # type: ignore[arg-type]
+    "route alone": lambda c: c.selected(["0_0.pcd"], route=[(0.0, 0.0), (5.0, 0.0)]),
     "box text": lambda c: c.area(shmmap.Box("a", 0, 1, 1)),  # type: ignore[arg-type]
     "window radius": lambda c: shmmap.MapWindow(c, None),  # type: ignore[arg-type]
     "window layers": lambda c: shmmap.MapWindow(c, 5.0, layers=5),  # type: ignore[arg-type]
@@ -95,6 +95,7 @@ def test_an_argument_that_makes_no_sense(client: shmmap.Client, name: str) -> No
 
 def test_numbers_of_any_kind_are_numbers(client: shmmap.Client) -> None:
     whole = client.around(0.0, 0.0, 5.0)
+    assert len(client.around(0, 0, 5, wait=math.inf)) == len(whole)
     kinds: tuple[Any, ...] = (int, np.float32, np.float64, np.int16, np.array)
     for kind in kinds:
         assert len(client.around(kind(0), kind(0), kind(5), wait=kind(5))) == len(whole)

@@ -145,7 +145,7 @@ def test_a_beginning_that_makes_no_sense(since: float) -> None:
 def test_a_gap_is_noticed_and_closed(
     daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
-    """More happens than any queue holds while the listener does not read; what is too old is `MissedEvents`."""
+    """More happens than any queue holds while the listener does not read: the oldest are `MissedEvents`."""
     one = daemon(divided_map.root)
     client, stream = connect(one), listen(one)
     client.selected(["0_0.pcd"])

@@ -277,7 +277,7 @@ def _area(area: shmmap.Circle | shmmap.AutowareSquare | shmmap.Box) -> str:
     if isinstance(area, shmmap.Box):
         return _words("box", *area.bounds)
     kind = "circle" if isinstance(area, shmmap.Circle) else "square"
-    heights = (area.z.min, area.z.max) if area.z is not None else ()
+    heights = area.z or ()
     return _words(kind, area.x, area.y, area.radius, *heights)
 
 
@@ -342,7 +342,7 @@ class CppClient:
         z: Any = None,
     ) -> CppCells:
         """As `shmmap.Client.around`."""
-        circle = shmmap.Circle(float(x), float(y), float(radius), shmmap.ZRange(*z) if z else None)
+        circle = shmmap.Circle(float(x), float(y), float(radius), z)
         return self.area(circle, layers, wait)
 
     def differential(

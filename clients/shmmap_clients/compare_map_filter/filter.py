@@ -127,7 +127,7 @@ class CompareMapFilter:
         return self
 
     def use_tables(self, tables: Iterable[LayerTable]) -> CompareMapFilter:
-        """Compare with tables made by `shmmap.layers.build_layer`, without a daemon; errors as in `use_cells`."""
+        """Compare with tables of `shmmap.layers.build_layer`, without a daemon; errors as in `use_cells`."""
         self._use(
             {
                 id(table): SearchCell.of_table(table.columns, table.lattice, table)

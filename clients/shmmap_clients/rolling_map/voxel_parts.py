@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import Box, ZRange
+from shmmap import Box
 from shmmap.errors import OverBudget
 from shmmap.live import LiveMap
 
@@ -59,7 +59,7 @@ def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.fl
 def _box(low: NDArray[np.int64], high: NDArray[np.int64], resolution: float) -> Box:
     """The box of voxels from ``low`` to below ``high``: no voxel has its middle on its faces."""
     (x0, y0, z0), (x1, y1, z1) = (low * resolution).tolist(), (high * resolution).tolist()
-    return Box(x0, y0, x1, y1, ZRange(z0, z1))
+    return Box(x0, y0, x1, y1, (z0, z1))
 
 
 def _halves(

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Mapping
-from typing import Final
-
-from shmmap import HeldCell
+from typing import Final, TypeAlias
 
 __all__ = ["MOST_REQUESTERS", "Requesters"]
+
+Versioned: TypeAlias = tuple[str, int | None]
+"""The id of a cell and its version; None: the current one."""
 
 MOST_REQUESTERS: Final = 256
 """So many clients are remembered: then the one that has not asked for longest is forgotten."""
@@ -35,7 +36,7 @@ class Requesters:
     def __len__(self) -> int:
         return len(self._versions)
 
-    def held(self, requester: str, ids: Iterable[str], current: Mapping[str, int]) -> list[HeldCell]:
+    def held(self, requester: str, ids: Iterable[str], current: Mapping[str, int]) -> list[Versioned]:
         """Return what a client has: ids with versions.
 
         Parameters
@@ -52,10 +53,10 @@ class Requesters:
         One for each id, also for those that nobody knows: in the order given, without repetitions.
         """
         known = self._versions.get(requester, {})
-        return [HeldCell(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
+        return [(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
 
     def answered(
-        self, requester: str, held: Iterable[HeldCell], removed: Collection[str], sent: Mapping[str, int]
+        self, requester: str, held: Iterable[Versioned], removed: Collection[str], sent: Mapping[str, int]
     ) -> None:
         """Remember what a client has after an answer.
 
@@ -65,7 +66,7 @@ class Requesters:
             What it had; what it was told to drop; the versions of what it was sent.
         """
         gone = set(removed)
-        versions = {one.id: one.version for one in held if one.version is not None and one.id not in gone}
+        versions = {one: version for one, version in held if version is not None and one not in gone}
         versions.update(sent)
         self._versions[requester] = versions
         self._versions.move_to_end(requester)

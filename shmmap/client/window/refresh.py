@@ -67,7 +67,7 @@ class WindowRefresher:
         *,
         layers: Sequence[str],
         shape: str,
-        z: geometry.ZRange | None,
+        z: tuple[float, float] | None,
         retention: RetentionPolicy,
         populate: bool,
         timeout_s: float | None = None,
