@@ -1,191 +1,134 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One copy of a vehicle's point-cloud map per machine, in shared memory.
+"""One copy of a vehicle's point-cloud map per machine, in shared memory, for every process.
+
+First `connect` to the daemon; ask the `Client` for an area, a `Circle` or a `Box`, and read the points of
+each `Cell`; or follow a vehicle with a `MapWindow`:
 
 ::
 
     import shmmap
 
-    cells = shmmap.connect().around(x, y, radius=50)
-    print(sum(len(cell.xyz) for cell in cells))
+    with shmmap.connect() as client:
+        cells = client.around(x, y, radius=50)  # metres, map frame
+        print(sum(len(cell) for cell in cells), "points, the first ones at", cells[0].xyz[:3])
 
-Every public name is loaded when it is first used, so that ``import shmmap`` itself costs next to nothing: it
-loads what says why a name cannot be loaded.
+Ask
+    ========================  ==================================================================
+    `connect`, `Client`       a session with the daemon: `around`, `area`, `selected`, `differential`
+    `Circle`, `Box`           areas; `AutowareSquare` is Autoware's area test; `Area` any of them
+    `Cell`, `CellSet`         a cell: columns over shared memory; the cells that answer a request
+    `PendingLayer`            what of a `CellSet` is still being loaded
+    `PointsAround`            the points in a circle, as views of the cells that they lie in
+    `MapListing`, `CellInfo`  the cells that the map has, loaded or not
+    ========================  ==================================================================
+
+Follow
+    ========================  ==================================================================
+    `MapWindow`               the cells around a moving pose, kept current by a thread
+    `WindowUpdate`            what a move has changed
+    `Retention`               what a window keeps attached of what it has left; a policy of one's own
+                              is a `RetentionPolicy`, which judges `RetentionCandidate`
+    ========================  ==================================================================
+
+Files
+    ========================  ==================================================================
+    `read_cloud`              read a cloud file of any format: columns by name
+    `write_pcd`               write columns, or an array of points, as a PCD file
+    ========================  ==================================================================
+
+Errors
+    Every error is a `ShmmapError`: `BadRequest` (an argument makes no sense), `DaemonUnreachable` and
+    `NoAnswer`, `CellError` (`UnknownCell`, `LoadFailed`, `LoadTimeout`, `Offline`), `StaleHandle`,
+    `LimitReached`, `NotPermitted`, `MapDataError`; the whole tree is `shmmap.errors`.  What is less than was
+    asked for is a `ShmmapWarning`.
+
+More
+    `shmmap.layers` (layers without a daemon, kinds of one's own), `shmmap.live` (live maps),
+    `shmmap.events` (what happens in the daemon), `shmmap.testing` (a daemon for tests).
+
+Every name is loaded when it is first used, so that ``import shmmap`` itself costs next to nothing.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import importlib
+from typing import TYPE_CHECKING, Any, Final
 
-import shmmap.errors as _errors
-from shmmap.lazy_names import lazy_names
-from shmmap.optional_packages import needed_packages
-from shmmap.segment.process_limits import no_files_left
-from shmmap.version import __version__
+from shmmap.errors import BadRequest as BadRequest
+from shmmap.errors import CellError as CellError
+from shmmap.errors import DaemonUnreachable as DaemonUnreachable
+from shmmap.errors import LimitReached as LimitReached
+from shmmap.errors import LoadFailed as LoadFailed
+from shmmap.errors import LoadTimeout as LoadTimeout
+from shmmap.errors import MapDataError as MapDataError
+from shmmap.errors import NoAnswer as NoAnswer
+from shmmap.errors import NotPermitted as NotPermitted
+from shmmap.errors import Offline as Offline
+from shmmap.errors import ShmmapError as ShmmapError
+from shmmap.errors import ShmmapWarning as ShmmapWarning
+from shmmap.errors import StaleHandle as StaleHandle
+from shmmap.errors import UnknownCell as UnknownCell
+from shmmap.lazy_names import lazy_names, public_names
+from shmmap.optional_packages import needed_packages as _needed_packages
+from shmmap.segment.process_limits import no_files_left as _no_files_left
+from shmmap.version import __version__ as __version__
 
-if TYPE_CHECKING:
-    from shmmap.chunks.occupancy import Occupancy
-    from shmmap.chunks.scan_filter import Counts, ScanFilter
-    from shmmap.client import (
-        Cell,
-        CellInfo,
-        CellSet,
-        Client,
-        Departed,
-        EventStream,
-        MapListing,
-        MapWindow,
-        Missed,
-        PendingLayer,
-        PointsAround,
-        Retention,
-        RetentionPolicy,
-        WindowUpdate,
-        connect,
-    )
-    from shmmap.client.live.chunk_reader import ChunkInfo
-    from shmmap.client.live.live_map import LiveMap, Sphere, Voxels
-    from shmmap.client.live.mapper import LiveMapper
-    from shmmap.errors import (
-        BadRequest,
-        Busy,
-        CannotStart,
-        CannotWrite,
-        CellError,
-        ConfigError,
-        ConnectionLost,
-        DaemonUnreachable,
-        InstanceBusy,
-        InternalError,
-        LimitReached,
-        LiveInterrupted,
-        LoadFailed,
-        LoadTimeout,
-        MapDataError,
-        MapMissing,
-        NoAnswer,
-        NoColumn,
-        NoSession,
-        NoSocket,
-        NoSpace,
-        NotPermitted,
-        Offline,
-        OverBudget,
-        PackageMissing,
-        ProtocolMismatch,
-        SegmentCorrupt,
-        SegmentError,
-        ShmmapError,
-        ShmmapWarning,
-        SocketPermission,
-        StaleHandle,
-        StaleSocket,
-        UnknownCell,
-    )
-    from shmmap.formats.cloud import read_cloud
-    from shmmap.formats.pcd.writer import write_pcd
-    from shmmap.geometry import Area, AutowareSquare, Box, Circle, ZRange
-    from shmmap.layers.build import build_layer
-    from shmmap.layers.contract import LayerKind, LayerTable
-    from shmmap.layers.ground import ground_height
-    from shmmap.layers.spec import canonical_layer
-    from shmmap.layers.voxels import voxel_covariances
-    from shmmap.protocol.live import LiveMapRow
-    from shmmap.protocol.messages import HeldCell, Holder, Intent
+if TYPE_CHECKING:  # the list of public names
+    from shmmap import events as events
+    from shmmap import layers as layers
+    from shmmap import live as live
+    from shmmap.client import Cell as Cell
+    from shmmap.client import CellInfo as CellInfo
+    from shmmap.client import CellSet as CellSet
+    from shmmap.client import Client as Client
+    from shmmap.client import MapListing as MapListing
+    from shmmap.client import MapWindow as MapWindow
+    from shmmap.client import PendingLayer as PendingLayer
+    from shmmap.client import PointsAround as PointsAround
+    from shmmap.client import Retention as Retention
+    from shmmap.client import RetentionCandidate as RetentionCandidate
+    from shmmap.client import RetentionPolicy as RetentionPolicy
+    from shmmap.client import WindowUpdate as WindowUpdate
+    from shmmap.client import connect as connect
+    from shmmap.formats.cloud import read_cloud as read_cloud
+    from shmmap.formats.pcd.writer import write_pcd as write_pcd
+    from shmmap.geometry import Area as Area
+    from shmmap.geometry import AutowareSquare as AutowareSquare
+    from shmmap.geometry import Box as Box
+    from shmmap.geometry import Circle as Circle
 
-__all__ = [
-    "Area",
-    "AutowareSquare",
-    "BadRequest",
-    "Box",
-    "Busy",
-    "CannotStart",
-    "CannotWrite",
-    "Cell",
-    "CellError",
-    "CellInfo",
-    "CellSet",
-    "ChunkInfo",
-    "Circle",
-    "Client",
-    "ConfigError",
-    "ConnectionLost",
-    "Counts",
-    "DaemonUnreachable",
-    "Departed",
-    "EventStream",
-    "HeldCell",
-    "Holder",
-    "InstanceBusy",
-    "Intent",
-    "InternalError",
-    "LayerKind",
-    "LayerTable",
-    "LimitReached",
-    "LiveInterrupted",
-    "LiveMap",
-    "LiveMapRow",
-    "LiveMapper",
-    "LoadFailed",
-    "LoadTimeout",
-    "MapDataError",
-    "MapListing",
-    "MapMissing",
-    "MapWindow",
-    "Missed",
-    "NoAnswer",
-    "NoColumn",
-    "NoSession",
-    "NoSocket",
-    "NoSpace",
-    "NotPermitted",
-    "Occupancy",
-    "Offline",
-    "OverBudget",
-    "PackageMissing",
-    "PendingLayer",
-    "PointsAround",
-    "ProtocolMismatch",
-    "Retention",
-    "RetentionPolicy",
-    "ScanFilter",
-    "SegmentCorrupt",
-    "SegmentError",
-    "ShmmapError",
-    "ShmmapWarning",
-    "SocketPermission",
-    "Sphere",
-    "StaleHandle",
-    "StaleSocket",
-    "UnknownCell",
-    "Voxels",
-    "WindowUpdate",
-    "ZRange",
-    "__version__",
-    "build_layer",
-    "canonical_layer",
-    "connect",
-    "ground_height",
-    "needed_packages",
-    "read_cloud",
-    "voxel_covariances",
-    "write_pcd",
-]
+_PACKAGES: Final = ("errors", "events", "layers", "live")
+"""Where the other public names are."""
 
+# No `__all__`: of its classes `help(shmmap)` would print all that they have, seven thousand lines.
 _load = lazy_names(__name__)
 
 
-def __getattr__(name: str) -> Any:
-    if name in _errors.__all__:  # an error can be named where no file can be opened
-        return getattr(_errors, name)
-    try:
-        with needed_packages(f"shmmap.{name}"):
-            return _load(name)
-    except (OSError, ImportError) as error:
-        limit = no_files_left(error, f"shmmap.{name} cannot be loaded: ")
-        if limit is None:
+if not TYPE_CHECKING:  # for a type checker a name that is not in the list is no name
+
+    def __getattr__(name: str) -> Any:
+        if name in _PACKAGES:
+            return importlib.import_module(f"shmmap.{name}")
+        try:
+            with _needed_packages(f"shmmap.{name}"):
+                return _load(name)
+        except AttributeError:
+            for package in _PACKAGES:
+                if name in importlib.import_module(f"shmmap.{package}").__all__:
+                    error = AttributeError(
+                        f"module 'shmmap' has no attribute {name!r}: it is shmmap.{package}.{name}"
+                    )
+                    raise error from None
             raise
-        raise limit from None
+        except (OSError, ImportError) as error:
+            limit = _no_files_left(error, f"shmmap.{name} cannot be loaded: ")
+            if limit is None:
+                raise
+            raise limit from None
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    errors = [
+        name for name, value in globals().items() if isinstance(value, type) and issubclass(value, Exception)
+    ]
+    return sorted({*public_names(__name__), *errors, *_PACKAGES, "__version__"})

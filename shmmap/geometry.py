@@ -2,7 +2,8 @@
 """Areas a client asks for, and which cell boxes they touch.
 
 All coordinates are metres in the map frame.  Borders are closed: a box that only touches an area
-belongs to it.  A *box* is ``(min_x, min_y, max_x, max_y)``.
+belongs to it.  A *box* is ``(min_x, min_y, max_x, max_y)``.  Of an area, ``z`` says which
+heights are of interest, (lowest, highest); None: all.
 """
 
 from __future__ import annotations
@@ -21,7 +22,15 @@ if TYPE_CHECKING:
     Floats: TypeAlias = NDArray[np.float64]
     Mask: TypeAlias = NDArray[np.bool_]
 
-__all__ = ["Area", "AutowareSquare", "Box", "Circle", "ZRange", "distance_to_boxes"]
+__all__ = [
+    "Area",
+    "AutowareSquare",
+    "Box",
+    "Circle",
+    "checked_heights",
+    "distance_to_boxes",
+    "heights_overlap",
+]
 
 
 def _finite(kind: str, **values: float) -> None:
@@ -37,29 +46,40 @@ def _is_finite(value: float) -> bool:
         return False  # no number at all
 
 
-class ZRange(msgspec.Struct, frozen=True):
-    """Closed interval of heights, metres, map frame."""
+def checked_heights(z: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return heights of interest, (lowest, highest), metres, map frame; None: all.
 
-    min: float
-    max: float
+    Raises
+    ------
+    BadRequest
+        They are not two numbers, the lower one first.
+    """
+    if z is None:
+        return None
+    try:
+        lowest, highest = map(float, z)
+    except (TypeError, ValueError, OverflowError):
+        raise BadRequest(f"z must be (lowest, highest) in metres, not {z!r}") from None
+    if not lowest <= highest:
+        raise BadRequest(f"z must be (lowest, highest) in metres, not {z!r}")
+    return lowest, highest
 
-    def __post_init__(self) -> None:
-        try:
-            fits = float(self.min) <= float(self.max)
-        except (TypeError, ValueError, OverflowError):
-            fits = False
-        if not fits:
-            raise BadRequest(f"z range: need min <= max, not {self.min!r} and {self.max!r}")
 
-    def overlaps(self, z_min: float, z_max: float) -> bool:
-        """Whether the heights ``[z_min, z_max]`` touch this range; unknown (NaN) heights do."""
-        return not (z_max < self.min or z_min > self.max)
+def heights_overlap(z: tuple[float, float], z_min: float, z_max: float) -> bool:
+    """Whether the heights ``[z_min, z_max]`` touch the closed range ``z``; unknown (NaN) heights do."""
+    return not (z_max < z[0] or z_min > z[1])
 
 
-def _check_radius(kind: str, x: float, y: float, radius: float) -> None:
-    _finite(kind, x=x, y=y, radius=radius)
-    if radius < 0:
-        raise BadRequest(f"{kind}: radius must not be negative, it is {radius!r}")
+def _check_round(kind: str, area: Circle | AutowareSquare) -> None:
+    _finite(kind, x=area.x, y=area.y, radius=area.radius)
+    if area.radius < 0:
+        raise BadRequest(f"{kind}: radius must not be negative, it is {area.radius!r}")
+    _check_z(area)
+
+
+def _check_z(area: Area) -> None:
+    if area.z is not None:
+        msgspec.structs.force_setattr(area, "z", checked_heights(area.z))
 
 
 def _inside(bounds: tuple[float, float, float, float], x: float, y: float, radius: float) -> bool:
@@ -73,10 +93,10 @@ class Circle(msgspec.Struct, frozen=True):
     x: float
     y: float
     radius: float
-    z: ZRange | None = None
+    z: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        _check_radius("circle", self.x, self.y, self.radius)
+        _check_round("circle", self)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -121,10 +141,10 @@ class AutowareSquare(msgspec.Struct, frozen=True):
     x: float
     y: float
     radius: float
-    z: ZRange | None = None
+    z: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        _check_radius("square", self.x, self.y, self.radius)
+        _check_round("square", self)
         if max(abs(self.x), abs(self.y), self.radius) > float(np.finfo(np.float32).max):
             raise BadRequest("square: a coordinate does not fit Autoware's float32")
 
@@ -174,7 +194,7 @@ class Box(msgspec.Struct, frozen=True):
     min_y: float
     max_x: float
     max_y: float
-    z: ZRange | None = None
+    z: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         _finite("box", min_x=self.min_x, min_y=self.min_y, max_x=self.max_x, max_y=self.max_y)
@@ -184,6 +204,7 @@ class Box(msgspec.Struct, frozen=True):
                 f" y {self.min_y!r}..{self.max_y!r}",
                 hint="the order is min_x, min_y, max_x, max_y",
             )
+        _check_z(self)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:

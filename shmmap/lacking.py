@@ -213,7 +213,7 @@ def area_text(area: Area) -> str:
         centre = f"({format_metres(area.x)}, {format_metres(area.y)})"
         text = f"in the square of half-side {format_metres(area.radius)} m about {centre}"
     if area.z is not None:
-        text += f", z {format_metres(area.z.min)} .. {format_metres(area.z.max)} m"
+        text += f", z {format_metres(area.z[0])} .. {format_metres(area.z[1])} m"
     return text
 
 

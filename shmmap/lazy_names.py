@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["lazy_names"]
+__all__ = ["lazy_names", "public_names"]
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:
@@ -29,7 +29,7 @@ def lazy_names(package: str) -> Callable[[str], Any]:
 
     def load(name: str) -> Any:
         if not modules:
-            modules.update(_imported_for_types(package))
+            modules.update(public_names(package))
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = getattr(importlib.import_module(modules[name]), name)
@@ -39,7 +39,7 @@ def lazy_names(package: str) -> Callable[[str], Any]:
     return load
 
 
-def _imported_for_types(package: str) -> dict[str, str]:
+def public_names(package: str) -> dict[str, str]:
     """Return the module of each name that a package imports under ``if TYPE_CHECKING:``.
 
     Raises

@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 from typing import Any
 
-from shmmap import needed_packages
 from shmmap.cli.programs import (
     Parser,
     add_allow_empty,
@@ -41,6 +40,7 @@ from shmmap.cli.programs import (
     write_text,
     writing_errors,
 )
+from shmmap.layers import needed_packages
 
 __all__ = [
     "ProgressLine",

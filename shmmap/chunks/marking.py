@@ -16,14 +16,14 @@ import numpy as np
 
 from shmmap.chunks import marking_kernels as kernels
 from shmmap.chunks.marks import MOST_CHUNKS, Marks
-from shmmap.chunks.scan_filter import Counts, ScanFilter
+from shmmap.chunks.scan_filter import ScanCounts, ScanFilter
 from shmmap.chunks.voxels import CHUNK_SHIFT, CHUNK_SIDE, FURTHEST_SENSOR, WORDS, voxel_indices
 from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Counts", "Marker", "ScanFilter"]
+__all__ = ["Marker", "ScanCounts", "ScanFilter"]
 
 FIRST_SLOTS: Final = 64
 MOST_REACH: Final = 64
@@ -69,7 +69,7 @@ class Marker:
         self._misses = np.zeros(count * WORDS, np.uint64)
         self._used = np.zeros(count + 1, np.int32)
 
-    def mark(self, points: ArrayLike, pose: ArrayLike) -> tuple[Marks, Counts]:
+    def mark(self, points: ArrayLike, pose: ArrayLike) -> tuple[Marks, ScanCounts]:
         """Mark a scan.
 
         Parameters
@@ -116,7 +116,7 @@ class Marker:
     def _try(
         self, points: NDArray[np.floating], pose: NDArray[np.float64], corner: NDArray[np.int64],
         sensor: NDArray[np.int64],
-    ) -> Counts | None:  # fmt: skip
+    ) -> ScanCounts | None:  # fmt: skip
         """Mark, if there are slots enough."""
         wanted, counts = self.filter, np.zeros(5, np.int64)
         limits = np.array(
@@ -129,7 +129,7 @@ class Marker:
         x, y, z = sensor.tolist()
         if not kernels.mark_rays(ends, rays, x, y, z, *slots, self._misses):
             return None
-        return Counts(*counts.tolist())
+        return ScanCounts(*counts.tolist())
 
     def _forget(self) -> None:
         used = int(self._used[0])

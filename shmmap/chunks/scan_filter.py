@@ -9,7 +9,7 @@ import msgspec
 
 from shmmap.errors import ConfigError
 
-__all__ = ["Counts", "ScanFilter"]
+__all__ = ["ScanCounts", "ScanFilter"]
 
 
 class ScanFilter(msgspec.Struct, frozen=True):
@@ -48,7 +48,7 @@ class ScanFilter(msgspec.Struct, frozen=True):
                 raise ConfigError(f"{most} = {high!r}: need more than {least} = {low!r}", key=most)
 
 
-class Counts(msgspec.Struct, frozen=True):
+class ScanCounts(msgspec.Struct, frozen=True):
     """What became of a scan's points: in range, cut at the greatest range, and left out for what reason."""
 
     near: int

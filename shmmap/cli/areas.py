@@ -90,7 +90,7 @@ def area_from(args: argparse.Namespace) -> Area | None:
         return None
     import shmmap.geometry as geometry
 
-    z = geometry.ZRange(*args.z) if args.z is not None else None
+    z = geometry.checked_heights(args.z)
     if args.circle is not None:
         x, y, radius = args.circle
         return geometry.Circle(x, y, radius, z)
@@ -147,7 +147,9 @@ def cells_meant(args: argparse.Namespace, client: Client, area: Area | None) -> 
 
 def _at_height(area: Area, cell: CellInfo) -> bool:
     """Whether a cell may have points in the area's heights; those of a cell never loaded are not known."""
-    return area.z is None or cell.z_bounds is None or area.z.overlaps(*cell.z_bounds)
+    from shmmap.geometry import heights_overlap
+
+    return area.z is None or cell.z_bounds is None or heights_overlap(area.z, *cell.z_bounds)
 
 
 # --- where there is nothing ---------------------------------------------------------------------------

@@ -14,7 +14,7 @@ The rest of `shmmap.cli` may change at any time; these names, their parameters a
 `at_least`, `seconds`, `output_file`
     Types of options: whole numbers, durations, files to be written (refused at once where they cannot be).
 `write_text`, `writing_errors`
-    Write a file; `shmmap.CannotWrite` where it cannot be.
+    Write a file; `shmmap.errors.CannotWrite` where it cannot be.
 `print_json`, `print_line`, `printable`
     One JSON document; a line of text, and text, with nothing in it that a terminal would obey.
 `complain`

@@ -25,11 +25,11 @@ from shmmap.client.client import Client, connect
 from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap.client.event_stream import EventStream, Missed
+    from shmmap.client.event_stream import EventStream, MissedEvents
     from shmmap.client.map_listing import CellInfo, MapListing
     from shmmap.client.points_around import PointsAround
     from shmmap.client.window.map_window import MapWindow
-    from shmmap.client.window.retention import Departed, Retention, RetentionPolicy
+    from shmmap.client.window.retention import Retention, RetentionCandidate, RetentionPolicy
     from shmmap.client.window.state import WindowUpdate
 
 __all__ = [
@@ -37,14 +37,14 @@ __all__ = [
     "CellInfo",
     "CellSet",
     "Client",
-    "Departed",
     "EventStream",
     "MapListing",
     "MapWindow",
-    "Missed",
+    "MissedEvents",
     "PendingLayer",
     "PointsAround",
     "Retention",
+    "RetentionCandidate",
     "RetentionPolicy",
     "WindowUpdate",
     "connect",

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from threading import TIMEOUT_MAX
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
 
-import shmmap.geometry as geometry
 from shmmap.errors import BadRequest
 from shmmap.protocol.messages import Intent
 
@@ -25,18 +24,20 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAX_ROUTE_PLACES",
-    "checked_intent",
     "checked_seconds",
-    "heights",
+    "given_intent",
     "names",
     "number",
     "pose_intent",
+    "request_waits",
     "thinned",
     "timeout_s",
 ]
 
 MAX_ROUTE_PLACES: Final = 512
 """The daemon keeps no more: of a longer route this many places are sent, equally far apart along it."""
+MAX_WAIT_S: Final = 60.0
+"""One request waits no longer: so a daemon that hangs is noticed, however long a program waits for cells."""
 FARTHEST_M: Final = 1e8
 """Coordinates beyond this count as this, as in the daemon."""
 
@@ -94,15 +95,19 @@ def names(what: str, given: str | Iterable[str]) -> tuple[str, ...]:
     return found
 
 
-def heights(z: tuple[float, float] | None) -> geometry.ZRange | None:
-    """Return heights of interest, (lowest, highest) in metres; None: all."""
-    if z is None or isinstance(z, geometry.ZRange):
-        return z
-    try:
-        lowest, highest = z
-    except (TypeError, ValueError):
-        raise BadRequest(f"z must be (lowest, highest) in metres, not {z!r}") from None
-    return geometry.ZRange(lowest, highest)
+def request_waits(wait: float | None) -> Iterator[float | None]:
+    """Yield the seconds that each request for the same cells may wait: several where ``wait`` is long.
+
+    Raises
+    ------
+    BadRequest
+        It is no number of seconds, or negative.
+    """
+    left_s = None if wait is None else number("wait", wait)
+    while left_s is not None and left_s > MAX_WAIT_S:
+        yield MAX_WAIT_S
+        left_s -= MAX_WAIT_S
+    yield left_s
 
 
 # --- where a vehicle is and goes ------------------------------------------------------------------
@@ -137,25 +142,30 @@ def pose_intent(
     return _with_route(pose, path) if path.size else pose
 
 
-def checked_intent(intent: Intent | None) -> Intent | None:
-    """Return an intent whose route is short enough to be sent.
+def given_intent(
+    pose: Sequence[float] | None,
+    velocity: Sequence[float],
+    heading: float | None,
+    route: Sequence[tuple[float, float]] | NDArray[Any],
+) -> Intent | None:
+    """Return where a vehicle is and goes, as `shmmap.Client.area` takes it; None where no pose is given.
 
     Raises
     ------
     BadRequest
-        It is none, or a place of a long route is not two finite numbers.
+        There is a velocity, a heading or a route without a pose, or one of them makes no sense.
     """
-    if intent is not None and not isinstance(intent, Intent):
-        raise BadRequest(f"intent must be an Intent, not {intent!r}")
-    if intent is None or len(intent.route) <= MAX_ROUTE_PLACES:
-        return intent
+    if pose is None:
+        if heading is not None or len(route) or tuple(velocity) != (0.0, 0.0):
+            raise BadRequest("velocity, heading and route need a pose", hint="give pose=(x, y), too")
+        return None
     try:
-        route = np.array(intent.route, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadRequest(f"route: two numbers are needed for each place: {error}") from None
-    if route.ndim != 2 or route.shape[1] != 2 or not np.isfinite(route).all():
-        raise BadRequest("route: each place is two finite numbers")
-    return _with_route(intent, route)
+        (x, y), (vx, vy) = pose, velocity
+    except (TypeError, ValueError):
+        raise BadRequest(
+            f"pose and velocity are two numbers each, (x, y), not {pose!r} and {velocity!r}"
+        ) from None
+    return pose_intent(x, y, vx, vy, heading, route)
 
 
 def thinned(route: NDArray[np.float64]) -> NDArray[np.float64]:

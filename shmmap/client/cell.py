@@ -102,6 +102,14 @@ class Cell:
         self._access = access  # None: memory of this process
         self._views: dict[str, NDArray[Any]] = {}
 
+    def __len__(self) -> int:
+        """How many points, or rows of a computed layer."""
+        return self.points
+
+    def __bool__(self) -> bool:
+        """True: a cell without points is a cell, too."""
+        return True
+
     def __repr__(self) -> str:
         return f"<Cell {self.id} {self.layer} version {self.version_hex}, {self.points} points>"
 

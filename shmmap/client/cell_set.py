@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, overload
 
 import numpy as np
 
@@ -12,10 +12,13 @@ from shmmap.client.cell import Cell
 from shmmap.errors import BadRequest, CellError
 from shmmap.protocol.messages import FailedCell, HeldCell
 
-__all__ = ["CellSet", "Held", "HeldCells", "PendingLayer", "cell_error"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-Held: TypeAlias = Cell | HeldCell | str | tuple[str, int]
-"""An attached cell, or an id (which means its current version), or id and version."""
+__all__ = ["CellSet", "Held", "HeldCells", "PendingLayer", "cell_error", "gather"]
+
+Held: TypeAlias = Cell | str | tuple[str, int | None] | tuple[str, int | None, tuple[str, ...]]
+"""An attached cell, or an id (which means its current version), id and version, or these and layers."""
 
 
 class PendingLayer(NamedTuple):
@@ -109,6 +112,38 @@ class CellSet(Sequence[Cell]):
             raise self.failed[0]
         return self
 
+    @overload
+    def gather(self, column: str = "xyz", /) -> NDArray[Any]: ...
+
+    @overload
+    def gather(self, column: str, other: str, /, *others: str) -> dict[str, NDArray[Any]]: ...
+
+    def gather(self, column: str = "xyz", /, *others: str) -> NDArray[Any] | dict[str, NDArray[Any]]:
+        """Copy columns of all points of the cells, cell after cell; as `PointsAround.gather`.
+
+        ::
+
+            points = cells.gather()  # (N, 3)
+            columns = cells.gather("xyz", "intensity")  # {"xyz": (N, 3), "intensity": (N,)}
+
+        Cells that failed or are pending have no points here: see `complete`.
+
+        Raises
+        ------
+        NoColumn
+            A cell has no such column.
+        BadRequest
+            Coordinates of cells with different origins cannot be put into one array, or the set has several
+            layers of a cell.
+        """
+        if len({cell.layer for cell in self.cells}) > 1:
+            raise BadRequest(
+                "the cells are of several layers, and do not fit into one array",
+                hint="take those of one, [cell for cell in cells if cell.layer == ...]",
+            )
+        gathered = gather(self.cells, (column, *others), [None] * len(self.cells))
+        return gathered if others else gathered[column]
+
     def __len__(self) -> int:
         return len(self.cells)
 
@@ -123,6 +158,33 @@ class CellSet(Sequence[Cell]):
 
     def __getitem__(self, index: int | slice) -> Cell | tuple[Cell, ...]:
         return self.cells[index]
+
+
+def gather(
+    cells: Sequence[Cell], columns: Sequence[str], masks: Iterable[NDArray[np.bool_] | None]
+) -> dict[str, NDArray[Any]]:
+    """Copy columns of cells into one array each, cell after cell; a mask says which rows, None all.
+
+    Raises
+    ------
+    NoColumn
+        A cell has no such column.
+    BadRequest
+        Coordinates of cells with different origins cannot be put into one array.
+    """
+    if "xyz" in columns and len({cell.origin for cell in cells}) > 1:
+        raise BadRequest(
+            "the cells' coordinates have different origins, and do not fit into one array",
+            hint="use the columns and the origin of each of its cells",
+        )
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in columns}
+    for cell, mask in zip(cells, masks, strict=True):
+        for name, found in parts.items():
+            found.append(cell[name] if mask is None else cell[name][mask])
+    return {
+        name: np.concatenate(found) if found else np.empty((0, 3) if name == "xyz" else (0,), np.float32)
+        for name, found in parts.items()
+    }
 
 
 def _kinds(root: type[CellError]) -> dict[str, type[CellError]]:
@@ -171,13 +233,13 @@ class HeldCells:
                     self._packed.setdefault(one.id, []).append(one.version)
                 continue
             if isinstance(one, str):
-                one = HeldCell(one)
-            elif isinstance(one, tuple) and len(one) == 2:
-                one = HeldCell(one[0], one[1])
-            elif not isinstance(one, HeldCell):
+                said = HeldCell(one)
+            elif isinstance(one, tuple) and 2 <= len(one) <= 3:
+                said = HeldCell(*one)
+            else:
                 raise BadRequest(f"held must be cells, ids, or ids with versions, and {one!r} is none")
-            self._order[one.id] = None
-            named.append(one)
+            self._order[said.id] = None
+            named.append(said)
         versions = [version for some in self._packed.values() for version in some]
         self.packed = np.array(versions, "<u8").tobytes() if versions else b""
         self.named = tuple(named)

@@ -4,22 +4,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
 import numpy as np
 
 import shmmap.geometry as geometry
-from shmmap.client.arguments import checked_intent, heights, names, timeout_s
+from shmmap.client.arguments import given_intent, names, request_waits, timeout_s
 from shmmap.client.cell_set import CellSet, Held, HeldCells
 from shmmap.client.connection import until_served
 from shmmap.client.discovery import candidates
 from shmmap.client.session import Session
 from shmmap.protocol import messages
-from shmmap.protocol.messages import Intent, Welcome
+from shmmap.protocol.messages import Welcome
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from shmmap.client.live.live_map import LiveMap
     from shmmap.client.map_listing import MapListing
     from shmmap.client.points_around import PointsAround
@@ -143,6 +145,19 @@ class Client:
         return self._session.map_version
 
     @property
+    def frame_id(self) -> str:
+        """Name of the map frame, as of when the session began."""
+        return self._session.welcome.frame_id
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float] | None:
+        """Box around all cells of the map, (min_x, min_y, max_x, max_y), metres, map frame.
+
+        As of when the session began; None where the map has no cells.
+        """
+        return self._session.welcome.bounds
+
+    @property
     def map_origin(self) -> MapOrigin:
         """Where the map frame lies in the world, as of when the session began."""
         welcome = self._session.welcome
@@ -167,7 +182,7 @@ class Client:
         strict: bool | None = False,
     ) -> CellSet:
         """Cells within ``radius`` metres of a place, whole: `area` with a circle."""
-        return self.area(geometry.Circle(x, y, radius, heights(z)), layers, wait=wait, strict=strict)
+        return self.area(geometry.Circle(x, y, radius, z), layers, wait=wait, strict=strict)
 
     def area(
         self,
@@ -175,7 +190,10 @@ class Client:
         layers: str | Sequence[str] = ("points",),
         *,
         wait: float | None = DEFAULT_WAIT_S,
-        intent: Intent | None = None,
+        pose: Sequence[float] | None = None,
+        velocity: Sequence[float] = (0.0, 0.0),
+        heading: float | None = None,
+        route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         strict: bool | None = False,
     ) -> CellSet:
         """Cells that touch an area, in id order.
@@ -190,11 +208,11 @@ class Client:
         layers
             What to have of each cell.
         wait
-            Seconds the daemon may take to load what is not in memory; None: take what is there, the
-            rest is `CellSet.pending`.
-        intent
-            Where this process is and goes: the daemon fetches what it will ask for next, and keeps what is
-            near.
+            Seconds the daemon may take to load what is not in memory; 0 or None: take what is there, the
+            rest is `CellSet.pending`.  `math.inf`: until nothing is pending.
+        pose, velocity, heading, route
+            Where this process is and goes, (x, y) in metres, map frame, and as in `MapWindow.move_to`: the
+            daemon fetches what it will ask for next, and keeps what is near.
         strict
             True: raise an error instead of a warning.  None: neither, the program looks at `CellSet.failed`
             and `CellSet.pending`.
@@ -211,9 +229,14 @@ class Client:
         SegmentError
             This user may not read the segments, or the process has no room for more mappings.
         """
-        specs = names("layers", layers)
-        message, sent = messages.area_to_message(area), checked_intent(intent)
-        found = self._session.ask_cells(lambda n: messages.Area(n, message, specs, wait, sent), wait)
+        specs, message = names("layers", layers), messages.area_to_message(area)
+        sent = given_intent(pose, velocity, heading, route)
+        found = _waited(
+            wait,
+            lambda wait_s: self._session.ask_cells(
+                lambda n: messages.Area(n, message, specs, wait_s, sent), wait_s
+            ),
+        )
         return found if strict is None else self._judged(found, area, wait, strict)
 
     def points_around(
@@ -247,7 +270,7 @@ class Client:
         """
         from shmmap.client.points_around import points_around  # windows need it, and few others
 
-        found = self.area(geometry.Circle(x, y, radius, heights(z)), layer, wait=wait, strict=strict)
+        found = self.area(geometry.Circle(x, y, radius, z), layer, wait=wait, strict=strict)
         boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
         return points_around(found.cells, boxes, x, y, radius, covered=found.complete)
 
@@ -258,7 +281,10 @@ class Client:
         layers: str | Sequence[str] = ("points",),
         *,
         wait: float | None = DEFAULT_WAIT_S,
-        intent: Intent | None = None,
+        pose: Sequence[float] | None = None,
+        velocity: Sequence[float] = (0.0, 0.0),
+        heading: float | None = None,
+        route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         by_name: bool = False,
         populate: bool = False,
         timeout: float | None = None,
@@ -272,7 +298,8 @@ class Client:
         Parameters
         ----------
         held
-            Cells of earlier answers; or ids, alone (meaning the current version) or with a version.
+            Cells of earlier answers; or ids: alone (meaning the current version), with a version,
+            ``(id, version)``, or with the layers that have it, too, ``(id, version, layers)``.
         by_name
             Send held cells by name and version, not by version alone: for the first request to a
             restarted daemon, which cannot know what the versions of a previous run belonged to.
@@ -283,15 +310,13 @@ class Client:
 
         Other parameters and errors are those of `area`.
         """
-        specs = names("layers", layers)
-        message, sent = messages.area_to_message(area), checked_intent(intent)
-        mine = HeldCells(held, by_name=by_name)
-        found = self._session.ask_cells(
-            lambda n: messages.Differential(n, message, specs, mine.named, mine.packed, wait, sent),
+        specs, mine = names("layers", layers), HeldCells(held, by_name=by_name)
+        sent = given_intent(pose, velocity, heading, route)
+        found = _waited(
             wait,
-            removed=mine.removed,
-            populate=populate,
-            timeout_s=timeout,
+            lambda wait_s: self._session.ask_differential(
+                area, mine, specs, wait_s, sent, populate=populate, timeout_s=timeout
+            ),
         )
         if strict is None:
             return found
@@ -303,7 +328,10 @@ class Client:
         layers: str | Sequence[str] = ("points",),
         *,
         wait: float | None = DEFAULT_WAIT_S,
-        intent: Intent | None = None,
+        pose: Sequence[float] | None = None,
+        velocity: Sequence[float] = (0.0, 0.0),
+        heading: float | None = None,
+        route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         strict: bool | None = False,
     ) -> CellSet:
         """Cells by id, in the order asked for, duplicates preserved.
@@ -312,8 +340,13 @@ class Client:
         parameters and errors are those of `area`.
         """
         specs = names("layers", layers)
-        wanted, sent = names("ids", ids), checked_intent(intent)
-        found = self._session.ask_cells(lambda n: messages.Selected(n, wanted, specs, wait, sent), wait)
+        wanted, sent = names("ids", ids), given_intent(pose, velocity, heading, route)
+        found = _waited(
+            wait,
+            lambda wait_s: self._session.ask_cells(
+                lambda n: messages.Selected(n, wanted, specs, wait_s, sent), wait_s
+            ),
+        )
         return found if strict is None else self._judged(found, None, wait, strict)
 
     def _judged(
@@ -463,6 +496,16 @@ class Client:
             The daemon lets only administrators do this.
         """
         self._session.ask(messages.Shutdown, messages.Stopping)
+
+
+def _waited(wait: float | None, ask: Callable[[float | None], CellSet]) -> CellSet:
+    """Repeat a request while cells are pending and ``wait`` is not over; returns the last answer."""
+    found = CellSet()
+    for wait_s in request_waits(wait):
+        found = ask(wait_s)
+        if not found.pending:
+            break
+    return found
 
 
 def connect(

@@ -3,7 +3,7 @@
 
 Events arrive on a SUB socket, numbered.  Whatever is missing between two of them is asked for on the
 request socket, where the daemon remembers the last few thousand; what it does not remember any more
-is reported as `Missed`.
+is reported as `MissedEvents`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from shmmap.errors import NoAnswer, ProtocolMismatch
 from shmmap.protocol.endpoint import endpoint_path
 from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, decode_event
 
-__all__ = ["EventStream", "Missed"]
+__all__ = ["EventStream", "MissedEvents"]
 
 _TIMEOUT_S: Final = 5.0
 _SLICE_MS: Final = 100  # how often a wait looks whether another thread has closed the stream
@@ -47,7 +47,7 @@ _OPTIONS: Final = (
 )
 
 
-class Missed(msgspec.Struct, frozen=True):
+class MissedEvents(msgspec.Struct, frozen=True):
     """Events that are lost: numbers ``first`` to ``last`` of ``epoch``.
 
     What they reported has to be found out by asking for cells or metadata again.
@@ -58,7 +58,7 @@ class Missed(msgspec.Struct, frozen=True):
     last: int
 
 
-Happening: TypeAlias = Event | Missed
+Happening: TypeAlias = Event | MissedEvents
 
 
 class EventStream:
@@ -157,7 +157,7 @@ class EventStream:
                 yield happening
 
     def next(self, timeout: float | None = None) -> Happening | None:
-        """Return the next event, or `Missed`; None when nothing happened within ``timeout`` seconds.
+        """Return the next event, or `MissedEvents`; None when nothing happened within ``timeout`` seconds.
 
         None waits without bound, 0 takes what is there.
         """
@@ -213,7 +213,7 @@ class EventStream:
     def _miss(self, last: int) -> None:
         """Report that what is missing up to this number is lost: its epoch has ended."""
         if last >= self._expected:
-            self._ready.append(Missed(self.epoch, self._expected, last))
+            self._ready.append(MissedEvents(self.epoch, self._expected, last))
             self._expected = last + 1
 
     def _try_to_catch_up(self) -> bool:
@@ -232,7 +232,7 @@ class EventStream:
             if page.epoch != self.epoch:
                 return False
             if page.first > after + 1 and not since_ns:
-                self._ready.append(Missed(page.epoch, after + 1, page.first - 1))
+                self._ready.append(MissedEvents(page.epoch, after + 1, page.first - 1))
                 after = page.first - 1
             for data in page.events:
                 event = decode_event(data)

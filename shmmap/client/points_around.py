@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from shmmap.client.cell import Cell
-from shmmap.errors import BadRequest, NoColumn
+from shmmap.client.cell_set import gather
+from shmmap.errors import NoColumn
 from shmmap.geometry import Circle, distance_to_boxes
 
 if TYPE_CHECKING:
@@ -158,25 +159,9 @@ class PointsAround:
             Coordinates of cells with different origins cannot be put into one array.
         """
         self._check_points()
-        names = (column, *others)
-        if "xyz" in names and len({cell.origin for cell in self.cells}) > 1:
-            raise BadRequest(
-                "the cells' coordinates have different origins, and do not fit into one array",
-                hint="use views() and the origin of each of its cells",
-            )
-        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
-        for index, (cell, whole) in enumerate(zip(self.cells, self.whole, strict=True)):
-            inside = None if whole else self.mask(index)
-            for name, found in parts.items():
-                found.append(cell[name] if inside is None else cell[name][inside])
-        gathered = {name: _joined(name, found) for name, found in parts.items()}
+        masks = (None if whole else self.mask(index) for index, whole in enumerate(self.whole))
+        gathered = gather(self.cells, (column, *others), masks)
         return gathered if others else gathered[column]
-
-
-def _joined(column: str, parts: list[NDArray[Any]]) -> NDArray[Any]:
-    if not parts:
-        return np.empty((0, 3) if column == "xyz" else (0,), np.float32)
-    return np.concatenate(parts)
 
 
 def _farthest_in_boxes(x: float, y: float, boxes: NDArray[np.float64]) -> NDArray[np.float64]:

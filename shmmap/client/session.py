@@ -6,7 +6,6 @@ A request for cells is over when its handles are attached: what went stale on th
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 import threading
@@ -19,13 +18,13 @@ from typing import Any, Final, NoReturn, TypeVar
 
 import numpy as np
 
-from shmmap.client.arguments import number
 from shmmap.client.attaching import Attacher, check_visible, owner_of_segments
 from shmmap.client.cell import Access, Cell
-from shmmap.client.cell_set import CellSet, PendingLayer, cell_error
+from shmmap.client.cell_set import CellSet, HeldCells, PendingLayer, cell_error
 from shmmap.client.connection import Connection, closed
 from shmmap.errors import BadRequest, CellError, LoadFailed, NoAnswer, SegmentCorrupt, StaleHandle
 from shmmap.failpoints import step
+from shmmap.geometry import Area
 from shmmap.protocol import messages
 from shmmap.protocol.messages import Handle
 
@@ -202,10 +201,6 @@ class Session:
         timeout_s
             Instead of the session's own.
         """
-        if wait_s is not None:
-            wait_s = number("wait", wait_s)
-            if wait_s == math.inf:
-                raise BadRequest("wait must be a finite number of seconds")
         quiet_s = wait_s or 0.0
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
         deadline_s = time.monotonic() + all_s
@@ -230,6 +225,27 @@ class Session:
             return answer.result(reply, removed)
 
         return self._in_turn(all_s, work)
+
+    def ask_differential(
+        self,
+        area: Area,
+        held: HeldCells,
+        layers: tuple[str, ...],
+        wait_s: float | None,
+        intent: messages.Intent | None,
+        *,
+        populate: bool = False,
+        timeout_s: float | None = None,
+    ) -> CellSet:
+        """Ask for the cells of an area that are not held, see `shmmap.Client.differential`."""
+        message = messages.area_to_message(area)
+        return self.ask_cells(
+            lambda n: messages.Differential(n, message, layers, held.named, held.packed, wait_s, intent),
+            wait_s,
+            removed=held.removed,
+            populate=populate,
+            timeout_s=timeout_s,
+        )
 
     def report_unmapped(self) -> int:
         """Report to the daemon what was unmapped since the last request; returns how many versions."""

@@ -3,7 +3,7 @@
 
 `build_layer` runs the same builders as the daemon's loaders, without a daemon::
 
-    from shmmap import build_layer
+    from shmmap.layers import build_layer
 
     ndt = build_layer("ndt(leaf=2.0)", xyz)
     ndt["mean"], ndt["inverse_covariance"], ndt.lattice

@@ -65,7 +65,7 @@ def area_from_message(message: AreaMessage) -> geometry.Area:
     if (message.z_min is None) != (message.z_max is None):
         raise BadRequest("a z range needs both bounds", hint="give z_min and z_max, or neither")
     if message.z_min is not None and message.z_max is not None:
-        z = geometry.ZRange(message.z_min, message.z_max)
+        z = (message.z_min, message.z_max)
     if isinstance(message, CircleMessage):
         return geometry.Circle(message.x, message.y, message.radius, z)
     if isinstance(message, SquareMessage):
@@ -77,7 +77,7 @@ def area_to_message(area: geometry.Area) -> AreaMessage:
     """Return the message that describes an area."""
     if not isinstance(area, (geometry.Circle, geometry.AutowareSquare, geometry.Box)):
         raise TypeError(f"an area is a Circle, a Box or an AutowareSquare, not {area!r}")
-    z = (area.z.min, area.z.max) if area.z is not None else (None, None)
+    z = area.z if area.z is not None else (None, None)
     if isinstance(area, geometry.Circle):
         return CircleMessage(area.x, area.y, area.radius, *z)
     if isinstance(area, geometry.AutowareSquare):

@@ -41,7 +41,7 @@ time.sleep(after_s)
 SCENES: Final = {
     "shared client": ("client = shmmap.connect(endpoint)", "client.around(0, 0, 50)"),
     "own client": (
-        "own = threading.local()",
+        "from shmmap.events import EventStream; own = threading.local()",
         "own.client = getattr(own, 'client', None) or shmmap.connect(endpoint); own.client.around(0, 0, 50)",
     ),
     "client after client": ("", "shmmap.connect(endpoint).around(0, 0, 50)"),
@@ -54,8 +54,8 @@ SCENES: Final = {
         "window.move_to(time.monotonic() % 20, 0.0, wait=1.0)",
     ),
     "events": (
-        "own = threading.local()",
-        "own.events = getattr(own, 'events', None) or shmmap.EventStream(endpoint); own.events.next(0.01)",
+        "from shmmap.events import EventStream; own = threading.local()",
+        "own.events = getattr(own, 'events', None) or EventStream(endpoint); own.events.next(0.01)",
     ),
 }
 

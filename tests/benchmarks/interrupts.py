@@ -120,7 +120,7 @@ def main(argv: list[str] | None = None) -> int:
         with shmmap.MapWindow(one.endpoint, 30) as first:
             first.move_to(0, 0, wait=60)
         del first
-        shmmap.EventStream(one.endpoint).close()
+        shmmap.events.EventStream(one.endpoint).close()
         begun = holdings(one.shm_dir)
         interrupter, chance = Interrupter(options.seed), random.Random(options.seed)
         client: Any = shmmap.connect(one.endpoint, timeout=20)
@@ -138,7 +138,7 @@ def main(argv: list[str] | None = None) -> int:
             "blocking window moved": (lambda: moved(blocking), 2e-3, 15),
             "connecting": (lambda: shmmap.connect(one.endpoint), 2e-2, 4),
             "window opened": (lambda: shmmap.MapWindow(one.endpoint, 30).close(), 2e-2, 1),
-            "events followed": (lambda: shmmap.EventStream(one.endpoint).close(), 2e-2, 1),
+            "events followed": (lambda: shmmap.events.EventStream(one.endpoint).close(), 2e-2, 1),
         }
         names, shares = list(scenes), [share for _, _, share in scenes.values()]
         refused: Counter[str] = Counter()

@@ -139,8 +139,8 @@ def vehicle(client: shmmap.Client, kind: str, origin: Origin, args: argparse.Nam
     for step in range(int(args.seconds * args.speed / STEP_M)):
         time.sleep(max(0.0, begin_s + step * STEP_M / args.speed - time.monotonic()))
         x, y, _, _ = at(step * STEP_M)
-        intent = shmmap.Intent(x, y, route=CORNERS if kind == "route" else ())
-        answer = client.area(shmmap.Circle(x, y, RADIUS_M), wait=0, intent=intent)
+        route = CORNERS if kind == "route" else ()
+        answer = client.area(shmmap.Circle(x, y, RADIUS_M), wait=0, pose=(x, y), route=route)
         client.release()
         if time.monotonic() - begin_s > LEAVE_OUT_S:
             missing = len(answer.pending) + len(answer.failed) + (not answer.covered)

@@ -172,10 +172,9 @@ class Vehicle:
     def ask(self, x: float, y: float, along_m: float, begin_s: float, until_s: float) -> None:
         """Ask for the cells around; if some are missing, wait for them until ``until_s``."""
         route = self._sent.at(along_m) if self._sent is not None else ()
-        intent = shmmap.Intent(x, y, route=route)
         area = shmmap.Circle(x, y, RADIUS_M)
         asked_s = time.monotonic()
-        answer = self._client.area(area, wait=0, intent=intent, strict=None)
+        answer = self._client.area(area, wait=0, pose=(x, y), route=route, strict=None)
         query = Query(asked_s - begin_s, x, y, self._missing(answer))
         self._day.queries.append(query)
         self._note(answer, query, asked_s)

@@ -21,7 +21,8 @@ from shmmap_clients.ndt_scan_matcher.cli import main as ndt
 from shmmap_clients.pose_initializer.cli import main as pose_init
 from shmmap_clients.rolling_map.cli import main as rolling
 
-from shmmap import CannotWrite, read_cloud, write_pcd
+from shmmap import read_cloud, write_pcd
+from shmmap.errors import CannotWrite
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:

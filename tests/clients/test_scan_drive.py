@@ -17,7 +17,8 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import matrix_of, tum_line
 
-from shmmap import BadRequest, CannotWrite
+from shmmap import BadRequest
+from shmmap.errors import CannotWrite
 
 
 @pytest.fixture

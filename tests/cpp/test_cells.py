@@ -123,9 +123,9 @@ def test_a_hoarder_meets_its_quota_and_others_get_theirs(
 
 
 def test_errors_say_where_nobody_answers(cpp_program: Path) -> None:
-    with pytest.raises(shmmap.NoSocket, match=r"/nowhere/shmmap\.sock"):
+    with pytest.raises(shmmap.errors.NoSocket, match=r"/nowhere/shmmap\.sock"):
         CppClient(cpp_program, "/nowhere/shmmap.sock")
-    with pytest.raises(shmmap.NoSocket, match="107 bytes"):
+    with pytest.raises(shmmap.errors.NoSocket, match="107 bytes"):
         CppClient(cpp_program, "/" + "x" * 200)
 
 
@@ -138,7 +138,7 @@ def test_requests_that_make_no_sense_cost_nothing_else(
             client.program.told("area", "circle 0 0 -1", "points", 1.0)
         with pytest.raises(shmmap.BadRequest):
             client.around(0, 0, 10, "no such layer")
-        with pytest.raises(shmmap.NoColumn, match=r"no column no such .there are: xyz, intensity"):
+        with pytest.raises(shmmap.errors.NoColumn, match=r"no column no such .there are: xyz, intensity"):
             client.around(0, 0, 10, wait=30.0)[0]["no such"]
         assert client.around(0, 0, 500, wait=30.0).complete
 

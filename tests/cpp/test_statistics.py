@@ -40,8 +40,10 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
     """Of a daemon that was stopped: nothing changes between the two readers."""
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint, name="somebody") as client:
-        going = shmmap.Intent(1.5, 2.0, vx=5.0, route=((0.0, 0.0), (60.0, 0.0)))
-        client.area(shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, intent=going)
+        route = [(0.0, 0.0), (60.0, 0.0)]
+        client.area(
+            shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, pose=(1.5, 2.0), velocity=(5.0, 0.0), route=route
+        )
         waiting = Deadline()
         seen = read_statistics(one.instance, one.shm_dir)
         while waiting(not (seen.clients and any(row.ahead for row in seen.cells))):

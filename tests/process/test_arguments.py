@@ -48,7 +48,6 @@ ARGUMENTS: dict[str, Callable[[shmmap.Client], object]] = {
     "z three": lambda c: c.points_around(0, 0, 5, z=(1, 2, 3)),  # type: ignore[arg-type]
     "wait nan": lambda c: c.around(0, 0, wait=NAN),
     "wait text": lambda c: c.around(0, 0, wait="1"[:0] or "long"),  # type: ignore[arg-type]
-    "wait infinite": lambda c: c.around(0, 0, wait=math.inf),
     "layers none": lambda c: c.around(0, 0, layers=None),  # type: ignore[arg-type]
     "layers numbers": lambda c: c.around(0, 0, layers=[1, 2]),  # type: ignore[list-item]
     "ids none": lambda c: c.selected(None),  # type: ignore[arg-type]
@@ -56,8 +55,9 @@ ARGUMENTS: dict[str, Callable[[shmmap.Client], object]] = {
     "held numbers": lambda c: c.differential(shmmap.Circle(0, 0, 5), [1]),  # type: ignore[list-item]
     "held triples": lambda c: c.differential(shmmap.Circle(0, 0, 5), [("a", 1, 2)]),  # type: ignore[list-item]
     "held beyond": lambda c: c.differential(shmmap.Circle(0, 0, 5), [("a", 1 << 70)]),
-    "intent tuple": lambda c: c.area(shmmap.Circle(0, 0, 5), intent=(1, 2)),  # type: ignore[arg-type]
-    "intent object": lambda c: c.area(shmmap.Circle(0, 0, 5), intent=shmmap.Intent(object(), 0)),  # type: ignore[arg-type]
+    "pose number": lambda c: c.area(shmmap.Circle(0, 0, 5), pose=1.0),  # type: ignore[arg-type]
+    "pose object": lambda c: c.area(shmmap.Circle(0, 0, 5), pose=(object(), 0)),  # type: ignore[arg-type]
+    "route alone": lambda c: c.selected(["0_0.pcd"], route=[(0.0, 0.0), (5.0, 0.0)]),
     "box text": lambda c: c.area(shmmap.Box("a", 0, 1, 1)),  # type: ignore[arg-type]
     "window radius": lambda c: shmmap.MapWindow(c, None),  # type: ignore[arg-type]
     "window layers": lambda c: shmmap.MapWindow(c, 5.0, layers=5),  # type: ignore[arg-type]
@@ -70,8 +70,8 @@ ARGUMENTS: dict[str, Callable[[shmmap.Client], object]] = {
     "move wait": lambda c: shmmap.MapWindow(c, 5.0, background=False).move_to(0, 0, wait=[1]),  # type: ignore[arg-type]
     "wait until": lambda c: shmmap.MapWindow(c, 5.0, background=False).wait_until_current(None),  # type: ignore[arg-type]
     "covers": lambda c: shmmap.MapWindow(c, 5.0, background=False).covers("a", 0),  # type: ignore[arg-type]
-    "events since": lambda c: shmmap.EventStream(c.endpoint, since="x"),  # type: ignore[arg-type]
-    "events timeout": lambda c: shmmap.EventStream(c.endpoint, timeout=None),  # type: ignore[arg-type]
+    "events since": lambda c: shmmap.events.EventStream(c.endpoint, since="x"),  # type: ignore[arg-type]
+    "events timeout": lambda c: shmmap.events.EventStream(c.endpoint, timeout=None),  # type: ignore[arg-type]
 }
 
 
@@ -95,6 +95,7 @@ def test_an_argument_that_makes_no_sense(client: shmmap.Client, name: str) -> No
 
 def test_numbers_of_any_kind_are_numbers(client: shmmap.Client) -> None:
     whole = client.around(0.0, 0.0, 5.0)
+    assert len(client.around(0, 0, 5, wait=math.inf)) == len(whole)
     kinds: tuple[Any, ...] = (int, np.float32, np.float64, np.int16, np.array)
     for kind in kinds:
         assert len(client.around(kind(0), kind(0), kind(5), wait=kind(5))) == len(whole)
@@ -125,7 +126,7 @@ def test_an_instance_by_its_name(daemon: Factory, tmp_path: Path, monkeypatch: p
             assert client.endpoint == one.endpoint
     with shmmap.MapWindow(name, 5.0) as window, shmmap.MapWindow(radius=5.0, instance=name) as other:
         assert window.client.endpoint == other.client.endpoint == one.endpoint
-    for stream in (shmmap.EventStream(name), shmmap.EventStream(instance=name)):
+    for stream in (shmmap.events.EventStream(name), shmmap.events.EventStream(instance=name)):
         assert stream.path == one.endpoint
         stream.close()
     monkeypatch.setenv("SHMMAP_ENDPOINT", "/nobody/is/here.sock")
@@ -142,7 +143,7 @@ def test_an_instance_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     for ask in (
         lambda: shmmap.connect("u1"),
         lambda: shmmap.MapWindow("u1"),
-        lambda: shmmap.EventStream("u1"),
+        lambda: shmmap.events.EventStream("u1"),
     ):
         with pytest.raises(NoSocket, match=r"/u1\.sock: there is no socket \(.*connect\(instance=") as caught:
             ask()

@@ -551,7 +551,7 @@ def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(
                 with pytest.raises(BadRequest, match="bytes; 4,194,304 are the most") as refused:
                     ask(ids)
                 assert "some ids at a time" in refused.value.hint
-        held = [shmmap.HeldCell(f"{number:0100}.pcd", 1) for number in range(45_000)]
+        held = [(f"{number:0100}.pcd", 1) for number in range(45_000)]
         with pytest.raises(BadRequest, match="4,194,304"):
             client.differential(shmmap.Circle(0.0, 0.0, 5.0), held)
         assert len(client.selected(["0_0.pcd"])) == 1

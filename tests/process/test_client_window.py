@@ -23,7 +23,7 @@ import pytest
 import shmmap
 from shmmap.client.connection_watch import running
 from shmmap.client.window.follower import WindowFollower
-from shmmap.client.window.retention import Departed
+from shmmap.client.window.retention import RetentionCandidate
 from shmmap.errors import BadRequest, ConnectionLost, DaemonUnreachable, NoAnswer
 from tests.support.cpp_client import CppWindow
 from tests.support.daemon_process import DaemonProcess, Deadline
@@ -437,7 +437,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
     class Collects:
         """A policy that is asked in the window's thread."""
 
-        def keep(self, departed: Sequence[Departed]) -> list[bool]:
+        def keep(self, departed: Sequence[RetentionCandidate]) -> list[bool]:
             assert dropped.wait(LONG_S)
             gc.collect()
             collected.set()
@@ -476,7 +476,7 @@ def test_a_window_whose_thread_ended(
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
 
     class Fails:
-        def keep(self, departed: Sequence[Departed]) -> list[bool]:
+        def keep(self, departed: Sequence[RetentionCandidate]) -> list[bool]:
             raise ZeroDivisionError(len(departed))
 
     with shmmap.connect(one.endpoint) as client:

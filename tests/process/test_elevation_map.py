@@ -150,7 +150,7 @@ def test_two_runs_do_not_write_over_each_other(
 
         def another_run(progress: BuildProgress) -> None:
             if progress.done == 5:
-                with pytest.raises(shmmap.InstanceBusy):
+                with pytest.raises(shmmap.errors.InstanceBusy):
                     build_elevation_map(other, rule, cache, wait_s=LONG_S)
                 build_elevation_map(other, rule, tmp_path / "other", wait_s=LONG_S)
 

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 import zmq
 
-from shmmap import BadRequest, EventStream, Missed
+from shmmap import BadRequest
+from shmmap.events import EventStream, MissedEvents
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.cpp_client import CppEventStream
@@ -144,7 +145,7 @@ def test_a_beginning_that_makes_no_sense(since: float) -> None:
 def test_a_gap_is_noticed_and_closed(
     daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
-    """More happens than any queue holds while the listener does not read; what is too old is `Missed`."""
+    """More happens than any queue holds while the listener does not read: the oldest are `MissedEvents`."""
     one = daemon(divided_map.root)
     client, stream = connect(one), listen(one)
     client.selected(["0_0.pcd"])
@@ -157,10 +158,10 @@ def test_a_gap_is_noticed_and_closed(
     expected = None
     missed = 0
     for happening in found:
-        first = happening.first if isinstance(happening, Missed) else happening.seq
+        first = happening.first if isinstance(happening, MissedEvents) else happening.seq
         assert expected is None or first == expected
-        expected = (happening.last if isinstance(happening, Missed) else happening.seq) + 1
-        missed += isinstance(happening, Missed)
+        expected = (happening.last if isinstance(happening, MissedEvents) else happening.seq) + 1
+        missed += isinstance(happening, MissedEvents)
     assert missed <= 1
     assert len(found) >= 4096
 
@@ -195,7 +196,7 @@ def test_a_stopped_listener_delays_nobody(
             client.selected(["0_0.pcd"])
         client.selected(["20_20.pcd"])
         found = until(stream, lambda h: isinstance(h, e.Loaded) and h.id == "20_20.pcd")
-        assert not [h for h in found if isinstance(h, Missed)]
+        assert not [h for h in found if isinstance(h, MissedEvents)]
         listener.kill()
 
 

@@ -83,7 +83,7 @@ def test_a_function_for_the_end_may_ask_and_gets_a_clear_error_of_a_closed_clien
 
 
 def test_closing_a_stream_that_another_thread_waits_on(one: DaemonProcess) -> None:
-    stream = shmmap.EventStream(one.endpoint)
+    stream = shmmap.events.EventStream(one.endpoint)
     failures: list[BaseException] = []
 
     def wait() -> None:

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from shmmap import Circle, EventStream, MapWindow, connect
+from shmmap import Circle, MapWindow, connect
+from shmmap.events import EventStream
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap

@@ -221,17 +221,17 @@ def test_connecting(daemon: Factory, divided_map: DividedMap) -> None:
 
 def test_following_events(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
-    check = leaves_nothing(one, lambda: shmmap.EventStream(one.endpoint).close())
+    check = leaves_nothing(one, lambda: shmmap.events.EventStream(one.endpoint).close())
 
     def follow() -> None:
-        shmmap.EventStream(one.endpoint, name="x", timeout=LONG_S).close()
+        shmmap.events.EventStream(one.endpoint, name="x", timeout=LONG_S).close()
 
     assert interrupted_everywhere(follow, check) > 100
 
 
 OPENS: dict[str, Callable[[str], Any]] = {
     "client": shmmap.connect,
-    "events": shmmap.EventStream,
+    "events": shmmap.events.EventStream,
     "window": lambda endpoint: shmmap.MapWindow(endpoint, 15),
 }
 
@@ -274,7 +274,7 @@ def test_a_signal_while_libzmq_ends(daemon: Factory, divided_map: DividedMap, wh
 
     def made() -> tuple[Callable[[], None], zmq.Socket[bytes]]:
         if what == "events":
-            stream = shmmap.EventStream(one.endpoint, timeout=LONG_S)
+            stream = shmmap.events.EventStream(one.endpoint, timeout=LONG_S)
             return stream.close, stream._socket
         client = shmmap.connect(one.endpoint, timeout=LONG_S)
         connection = client.session._connection

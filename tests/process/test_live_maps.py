@@ -119,7 +119,7 @@ def test_voxels_of_an_area_and_since_a_change(live_daemon: LiveDaemon) -> None:
             inside = np.linalg.norm((free + 0.5) * RESOLUTION - [1.0, 1.0, 0.0], axis=1) <= 3.0
             assert sorted(found.indices.tolist()) == sorted(free[inside].tolist())
             assert (found.probability < 0.5).all()
-            box = shmmap.Box(-2.0, -2.0, 2.0, 2.0, shmmap.ZRange(-1.0, 1.0))
+            box = shmmap.Box(-2.0, -2.0, 2.0, 2.0, (-1.0, 1.0))
             occupied = live.occupied(box)
             assert (np.abs(occupied) <= [2.0, 2.0, 1.0]).all()
             assert len(occupied)

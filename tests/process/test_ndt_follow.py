@@ -227,7 +227,7 @@ def test_the_daemon_fetches_what_lies_ahead(
     x, y = 25.0, 125.0
     with (
         shmmap.connect(one.endpoint) as client,
-        shmmap.EventStream(one.endpoint) as stream,
+        shmmap.events.EventStream(one.endpoint) as stream,
         StatisticsReader(one.instance, one.shm_dir) as statistics,
         MapUpdater(one.endpoint, rules, route=route) as maps,
     ):

@@ -279,7 +279,7 @@ def test_what_cannot_be_pickled_says_what_to_do(client: shmmap.Client, what: str
     makers: dict[str, Callable[[], Any]] = {
         "client": lambda: client,
         "window": lambda: shmmap.MapWindow(client, 20.0),
-        "events": lambda: shmmap.EventStream(client.endpoint),
+        "events": lambda: shmmap.events.EventStream(client.endpoint),
         "session": lambda: client.session,
     }
     made = makers[what]()

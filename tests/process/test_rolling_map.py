@@ -54,7 +54,7 @@ def read_drive(directory: Path) -> list[Scan]:
     return list(ScanSequence(directory / "scans", read_trajectory(directory / "poses.txt")))
 
 
-def expected(scans: Sequence[Scan], scan_filter: shmmap.ScanFilter = FILTER) -> dict[Voxel, int]:
+def expected(scans: Sequence[Scan], scan_filter: shmmap.live.ScanFilter = FILTER) -> dict[Voxel, int]:
     """What the map must have."""
     posed = [(scan.xyz, scan.T_map_sensor) for scan in scans if scan.T_map_sensor is not None]
     assert len(posed) == len(scans)
@@ -200,7 +200,7 @@ def test_options_count_before_the_parameter_file(
         start.remove(limit)
     done = run(*start, "--params", str(params), "--max-range", "6", "--max-z", "-0.5")
     assert done.returncode == 0, done.stderr
-    scan_filter = shmmap.ScanFilter(max_range=6.0, min_z=-1.0, max_z=-0.5)
+    scan_filter = shmmap.live.ScanFilter(max_range=6.0, min_z=-1.0, max_z=-0.5)
     assert on_disk(one) == expected(read_drive(tmp_path / "drive3"), scan_filter)
     lines = done.stderr.splitlines()
     assert [line for line in lines if "warning" in line] == lines[:1]
@@ -285,7 +285,7 @@ def test_more_voxels_than_a_list_may_have(live_daemon: LiveDaemon, words: Words,
     right = expected(read_drive(tmp_path / "drive60"))
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
-        with pytest.raises(shmmap.OverBudget):
+        with pytest.raises(shmmap.errors.OverBudget):
             live.voxels("free", scope="all")
         for kind, sign in (("free", -1), ("occupied", 1)):
             found = np.floor(all_voxels(live, kind, "all") / RESOLUTION).astype(int).tolist()

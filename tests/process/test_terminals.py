@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap import EventStream
+from shmmap.events import EventStream
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess, next_reload, until
 from tests.support.divided_map import DividedMap

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap import CellSet, EventStream, connect
+from shmmap import CellSet, connect
+from shmmap.events import EventStream
 from shmmap.protocol import events as e
 from tests.process.conftest import DaemonFactory
 from tests.support.divided_map import DividedMap, make_map, random_points

@@ -264,7 +264,7 @@ def _area(area: shmmap.Circle | shmmap.AutowareSquare | shmmap.Box) -> str:
     if isinstance(area, shmmap.Box):
         return _words("box", *area.bounds)
     kind = "circle" if isinstance(area, shmmap.Circle) else "square"
-    heights = (area.z.min, area.z.max) if area.z is not None else ()
+    heights = area.z or ()
     return _words(kind, area.x, area.y, area.radius, *heights)
 
 
@@ -329,7 +329,7 @@ class CppClient:
         z: Any = None,
     ) -> CppCells:
         """As `shmmap.Client.around`."""
-        circle = shmmap.Circle(float(x), float(y), float(radius), shmmap.ZRange(*z) if z else None)
+        circle = shmmap.Circle(float(x), float(y), float(radius), z)
         return self.area(circle, layers, wait)
 
     def differential(
@@ -464,7 +464,7 @@ class CppWindow:
 
 
 class CppEventStream:
-    """As `shmmap.EventStream`."""
+    """As `shmmap.events.EventStream`."""
 
     def __init__(
         self,
@@ -486,14 +486,14 @@ class CppEventStream:
         """The daemon's present life."""
         return int(self._program.told("epoch")[0][1])
 
-    def next(self, timeout: float | None = None) -> events.Event | shmmap.Missed | None:
-        """As `shmmap.EventStream.next`."""
+    def next(self, timeout: float | None = None) -> events.Event | shmmap.events.MissedEvents | None:
+        """As `shmmap.events.EventStream.next`."""
         lines = self._program.told("next", 1e6 if timeout is None else timeout)
         if not lines:
             return None
         what, *words = lines[0]
         if what == "missed":
-            return shmmap.Missed(*map(int, words))
+            return shmmap.events.MissedEvents(*map(int, words))
         named = words[:4] + [word.partition("=")[2] for word in words[4:]]
         found: events.Event = msgspec.convert(named, events.Event, strict=False)
         return found

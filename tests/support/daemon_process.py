@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from shmmap import EventStream
+from shmmap.events import EventStream
 from shmmap.protocol import events as e
 from shmmap.statistics.reader import read_statistics
 from shmmap.testing import daemon_process

@@ -23,7 +23,7 @@ from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, SlowOccupancy
 Scan = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def reference(scans: Iterable[Scan], scan_filter: shmmap.ScanFilter = FILTER) -> dict[Voxel, int]:
+def reference(scans: Iterable[Scan], scan_filter: shmmap.live.ScanFilter = FILTER) -> dict[Voxel, int]:
     """Log-odds of all known voxels after these scans."""
     slow = SlowOccupancy(
         RESOLUTION, min_range=scan_filter.min_range, max_range=scan_filter.max_range,

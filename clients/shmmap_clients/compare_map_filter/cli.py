@@ -261,7 +261,7 @@ def _apply(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from shmmap import build_layer
+    from shmmap.layers import build_layer
     from shmmap_clients.compare_map_filter.drive import ComparedScan
     from shmmap_clients.compare_map_filter.filter import CompareMapFilter
     from shmmap_clients.compare_map_filter.output import PcdDirectory, TopView

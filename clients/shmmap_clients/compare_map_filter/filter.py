@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Cell, LayerTable, MapWindow, canonical_layer
+from shmmap import BadRequest, Cell, MapWindow
+from shmmap.layers import LayerTable, canonical_layer
 from shmmap_clients.compare_map_filter.rule import CompareRule, explain, to_map
 from shmmap_clients.compare_map_filter.search_table import SearchCell, SearchTable
 
@@ -125,7 +126,7 @@ class CompareMapFilter:
         return self
 
     def use_tables(self, tables: Iterable[LayerTable]) -> CompareMapFilter:
-        """Compare with tables made by `shmmap.build_layer`, without a daemon; errors as in `use_cells`."""
+        """Compare with tables of `shmmap.layers.build_layer`, without a daemon; errors as in `use_cells`."""
         self._use(
             {
                 id(table): SearchCell.of_table(table.columns, table.lattice, table)

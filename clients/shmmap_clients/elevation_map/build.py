@@ -18,18 +18,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import (
-    BadRequest,
-    Cell,
-    CellError,
-    CellInfo,
-    Client,
-    InstanceBusy,
-    LoadTimeout,
-    MapListing,
-    MapMissing,
-    ShmmapError,
-)
+from shmmap import BadRequest, Cell, CellError, CellInfo, Client, LoadTimeout, MapListing, ShmmapError
+from shmmap.errors import InstanceBusy, MapMissing
 from shmmap.formats.npz_writer import write_npz
 from shmmap_clients.elevation_map.grid import ElevationGrid
 from shmmap_clients.elevation_map.heights import ElevationRule

@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapWindow, canonical_layer
+from shmmap import BadRequest, MapWindow
+from shmmap.layers import canonical_layer
 
 __all__ = ["RULES", "ElevationRule", "WindowHeights"]
 

@@ -14,7 +14,8 @@ from typing import Any, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Client, MapWindow, NoAnswer, ShmmapError, canonical_layer, ground_height
+from shmmap import BadRequest, Client, MapWindow, NoAnswer, ShmmapError
+from shmmap.layers import canonical_layer, ground_height
 from shmmap_clients.map_extent import NoMapHere, map_extent
 from shmmap_clients.ndt_scan_matcher import (
     DeviceError,

@@ -11,7 +11,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from shmmap import BadRequest, ConfigError
+from shmmap import BadRequest
+from shmmap.errors import ConfigError
 from shmmap_clients.command_line import (
     add_allow_empty,
     add_daemon_options,
@@ -38,7 +39,7 @@ from shmmap_clients.shared_options import (
 )
 
 if TYPE_CHECKING:
-    from shmmap import LiveMap, LiveMapper, ScanFilter
+    from shmmap.live import LiveMap, LiveMapper, ScanFilter
     from shmmap_clients.rolling_map.live_map import DriveStatistics
     from shmmap_clients.rolling_map.parameters import Parameters, Shown
     from shmmap_clients.scan_drive import ScanDrive
@@ -183,7 +184,7 @@ def _scan_filter_from(args: argparse.Namespace, parameters: Parameters | None) -
     """
     import msgspec
 
-    from shmmap import ScanFilter
+    from shmmap.live import ScanFilter
 
     base = parameters.scan_filter if parameters is not None else ScanFilter()
     given = {name: getattr(args, name) for name in _LIMITS if getattr(args, name) is not None}

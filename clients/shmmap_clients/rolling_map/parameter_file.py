@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import yaml
 
-from shmmap import ConfigError, MapMissing
+from shmmap.errors import ConfigError, MapMissing
 
 __all__ = ["Entry", "Value", "read_parameter_file"]
 

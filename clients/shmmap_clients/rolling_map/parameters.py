@@ -16,7 +16,9 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from shmmap import BadRequest, ConfigError, LiveMap, Occupancy, ScanFilter
+from shmmap import BadRequest
+from shmmap.errors import ConfigError
+from shmmap.live import LiveMap, Occupancy, ScanFilter
 from shmmap_clients.rolling_map.parameter_file import Entry, Value, read_parameter_file
 
 __all__ = ["LiveSettings", "Parameters", "Shown", "live_section", "read_parameters"]

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import ChunkInfo
 from shmmap.formats.png import png_bytes
 from shmmap.formats.svg import PALE, Axes, BoxTuple, Page, dash, element, swatch
+from shmmap.live import ChunkInfo
 
 __all__ = ["STATES", "HeightColours", "MapContent", "map_picture"]
 

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import CellInfo, Client, HeldCell
+from shmmap import CellInfo, Client
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 
 __all__ = ["MOST_REQUESTERS", "Catalogue", "Requesters"]
@@ -94,7 +94,9 @@ class Requesters:
     def __len__(self) -> int:
         return len(self._versions)
 
-    def held(self, requester: str, ids: Iterable[str], current: Mapping[str, int]) -> list[HeldCell]:
+    def held(
+        self, requester: str, ids: Iterable[str], current: Mapping[str, int]
+    ) -> list[tuple[str, int | None]]:
         """Return what a client has: ids with versions.
 
         Parameters
@@ -111,10 +113,14 @@ class Requesters:
         One for each id, unknown ones included: in the order given, without repetitions.
         """
         known = self._versions.get(requester, {})
-        return [HeldCell(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
+        return [(one, known.get(one, current.get(one))) for one in dict.fromkeys(ids)]
 
     def answered(
-        self, requester: str, held: Iterable[HeldCell], removed: Collection[str], sent: Mapping[str, int]
+        self,
+        requester: str,
+        held: Iterable[tuple[str, int | None]],
+        removed: Collection[str],
+        sent: Mapping[str, int],
     ) -> None:
         """Remember what a client has after an answer.
 
@@ -124,7 +130,7 @@ class Requesters:
             What it had; what it was asked to drop; the versions of what it was sent.
         """
         gone = set(removed)
-        versions = {one.id: one.version for one in held if one.version is not None and one.id not in gone}
+        versions = {one: version for one, version in held if version is not None and one not in gone}
         versions.update(sent)
         self._versions[requester] = versions
         self._versions.move_to_end(requester)

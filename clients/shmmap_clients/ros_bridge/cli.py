@@ -135,7 +135,7 @@ def _renamed(text: str) -> tuple[str, str]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from shmmap import ConfigError
+    from shmmap.errors import ConfigError
     from shmmap_clients.ros_bridge.node import BridgeSettings, RosBridge
 
     domain = args.domain

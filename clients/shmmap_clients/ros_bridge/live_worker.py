@@ -16,7 +16,7 @@ import numpy as np
 from cyclonedds.pub import DataWriter
 from numpy.typing import NDArray
 
-from shmmap import LiveMap
+from shmmap.live import LiveMap
 from shmmap_clients.rolling_map.live_map import all_voxels
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 from shmmap_clients.ros_bridge.messages import FREE, OCCUPIED, PointCloud2, ServiceKind, ready_made

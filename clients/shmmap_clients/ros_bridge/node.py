@@ -20,7 +20,8 @@ import msgspec
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
-from shmmap import Client, LiveMap
+from shmmap import Client
+from shmmap.live import LiveMap
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker

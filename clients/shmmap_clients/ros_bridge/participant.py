@@ -20,7 +20,8 @@ from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.util import duration
 
-from shmmap import BadRequest, CannotStart
+from shmmap import BadRequest
+from shmmap.errors import CannotStart
 
 __all__ = [
     "MOST_DOMAIN",

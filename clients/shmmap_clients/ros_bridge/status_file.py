@@ -19,7 +19,7 @@ import stat
 from collections.abc import Mapping
 from typing import Any, Final
 
-from shmmap import Busy
+from shmmap.errors import Busy
 
 __all__ = ["StatusFile", "status_name"]
 

@@ -16,7 +16,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, Final
 
-from shmmap import BadRequest, Busy, DaemonUnreachable, LiveInterrupted, NoSession, ShmmapError, StaleHandle
+from shmmap import BadRequest, DaemonUnreachable, ShmmapError, StaleHandle
+from shmmap.errors import Busy, LiveInterrupted, NoSession
 from shmmap_clients.ros_bridge.cdr import Content
 from shmmap_clients.ros_bridge.service_server import Listening, Request, Tries
 

@@ -14,7 +14,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import MapDataError, MapMissing, build_layer, read_cloud
+from shmmap import MapDataError, read_cloud
+from shmmap.errors import MapMissing
+from shmmap.layers import build_layer
 from shmmap_clients.scans.bin_layout import BinLayout, guess_layout
 
 __all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "read_scan_fields", "thinned"]

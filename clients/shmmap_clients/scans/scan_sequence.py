@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapDataError, MapMissing
+from shmmap import BadRequest, MapDataError
+from shmmap.errors import MapMissing
 from shmmap_clients.scans.scan_file import SCAN_SUFFIXES, ScanReader
 from shmmap_clients.scans.scan_names import in_order, pair_with_poses, stem
 from shmmap_clients.scans.trajectory import Trajectory

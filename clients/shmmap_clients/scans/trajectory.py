@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, MapDataError, MapMissing
+from shmmap import BadRequest, MapDataError
+from shmmap.errors import MapMissing
 
 __all__ = ["Trajectory", "matrix_of", "pose_of", "quaternion_of", "read_route", "read_trajectory", "tum_line"]
 

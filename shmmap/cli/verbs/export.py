@@ -180,7 +180,7 @@ def _inside(area: Area, cell: Cell) -> NDArray[np.bool_]:
     x, y, z = (cell.xyz[:, axis].astype(np.float64) + cell.origin[axis] for axis in range(3))
     inside = area.overlaps(np.column_stack((x, y, x, y)))
     if area.z is not None:
-        inside &= (z >= area.z.min) & (z <= area.z.max)
+        inside &= (z >= area.z[0]) & (z <= area.z[1])
     return inside
 
 

@@ -110,10 +110,10 @@ def _is_me(happening: Happening) -> bool:
 def _fields(happening: Happening) -> dict[str, Any]:
     import msgspec
 
-    from shmmap.client.event_stream import Missed
+    from shmmap.client.event_stream import MissedEvents
 
     fields = msgspec.structs.asdict(happening)
-    if isinstance(happening, Missed):
+    if isinstance(happening, MissedEvents):
         return {"event": "missed", **fields}
     kind = happening.__struct_config__.tag
     return {"event": kind, **fields}

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from shmmap.chunks.marking import Counts, Marker, ScanFilter
+from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
 from shmmap.chunks.marks import encode_marks
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import SERVED_PAUSE_S, Connection, until_served
@@ -211,7 +211,7 @@ class LiveMapper:
     ----------
     name
         Under which it maps.
-    counts : Counts
+    counts : ScanCounts
         What became of the points of the last scan.
     """
 
@@ -222,7 +222,7 @@ class LiveMapper:
         if not name:
             raise BadRequest("a mapper needs a name", hint="one that the program keeps: 'front_lidar'")
         self.name = name
-        self.counts = Counts(0, 0, 0, 0, 0)
+        self.counts = ScanCounts(0, 0, 0, 0, 0)
         timeout_s = self._timeout_s = checked_seconds("timeout_s", timeout_s)
         sender = self._sender = _Sender(
             session.path, live_map, name, frame_id, session.timeout_s, timeout_s, resume=resume

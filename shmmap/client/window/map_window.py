@@ -9,7 +9,7 @@ from collections.abc import Collection, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from shmmap.client.arguments import heights, names, number, pose_intent, timeout_s
+from shmmap.client.arguments import names, number, pose_intent, timeout_s
 from shmmap.client.cell import Cell
 from shmmap.client.client import Client, connect
 from shmmap.client.points_around import PointsAround, points_around
@@ -18,7 +18,7 @@ from shmmap.client.window.refresh import WindowRefresher
 from shmmap.client.window.retention import Retention, RetentionPolicy
 from shmmap.client.window.state import EMPTY, LayerKey, WindowUpdate, update_between
 from shmmap.errors import BadRequest, ConnectionLost, ShmmapError
-from shmmap.geometry import Circle
+from shmmap.geometry import Circle, checked_heights
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -119,7 +119,7 @@ class MapWindow:
                 radius,
                 layers=self._layers,
                 shape=shape,
-                z=heights(z),
+                z=checked_heights(z),
                 retention=retention if retention is not None else Retention(),
                 populate=background,  # page faults, too, are better taken by the thread
                 timeout_s=timeout,
@@ -325,7 +325,7 @@ class MapWindow:
             Metres, map frame; what lies beyond the window is not there, and not ``covered``.
         layer
             Which of the window's layers, as it was asked for or as `Cell.layer` names it; by default the
-            first.  Of two layers of one kind, the name is that of `Cell.layer` (`shmmap.canonical_layer`).
+            first.  Of two layers of one kind, the name is that of `Cell.layer` (`layers.canonical_layer`).
 
         Raises
         ------

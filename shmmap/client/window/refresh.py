@@ -12,9 +12,9 @@ import numpy as np
 
 import shmmap.geometry as geometry
 from shmmap.client.cell import Cell
-from shmmap.client.cell_set import CellSet
+from shmmap.client.cell_set import CellSet, HeldCells
 from shmmap.client.client import Client
-from shmmap.client.window.retention import Departed, RetentionPolicy
+from shmmap.client.window.retention import RetentionCandidate, RetentionPolicy
 from shmmap.client.window.state import LayerKey, WindowState
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.geometry import distance_to_boxes
@@ -67,7 +67,7 @@ class WindowRefresher:
         *,
         layers: Sequence[str],
         shape: str,
-        z: geometry.ZRange | None,
+        z: tuple[float, float] | None,
         retention: RetentionPolicy,
         populate: bool,
         timeout_s: float | None = None,
@@ -137,16 +137,9 @@ class WindowRefresher:
     def _ask(
         self, state: WindowState, area: geometry.Area, pose: Intent, wait_s: float | None, *, by_name: bool
     ) -> CellSet:
-        return self._client.differential(
-            area,
-            state.cells.values(),
-            self._layers,
-            wait=wait_s,
-            intent=pose,
-            by_name=by_name,
-            populate=self._populate,
-            timeout=self._timeout_s,
-            strict=None,  # `WindowUpdate` says what is missing
+        held = HeldCells(state.cells.values(), by_name=by_name)
+        return self._client.session.ask_differential(
+            area, held, self._layers, wait_s, pose, populate=self._populate, timeout_s=self._timeout_s
         )
 
     def _apply(
@@ -178,7 +171,7 @@ class WindowRefresher:
         boxes = np.array([cell.box for cell, _ in self.retained.values()])
         distances = distance_to_boxes(pose.x, pose.y, boxes).tolist()
         departed = [
-            Departed(distance, cell.nbytes, now_s - since_s)
+            RetentionCandidate(distance, cell.nbytes, now_s - since_s)
             for distance, (cell, since_s) in zip(distances, self.retained.values(), strict=True)
         ]
         keep = self._retention.keep(departed)

@@ -15,10 +15,10 @@ import msgspec
 
 from shmmap.errors import BadRequest
 
-__all__ = ["Departed", "Retention", "RetentionPolicy"]
+__all__ = ["Retention", "RetentionCandidate", "RetentionPolicy"]
 
 
-class Departed(NamedTuple):
+class RetentionCandidate(NamedTuple):
     """A cell outside the window that is still attached.
 
     ``distance`` is from the present pose to the nearest point of its box, metres; ``nbytes`` its
@@ -33,7 +33,7 @@ class Departed(NamedTuple):
 class RetentionPolicy(Protocol):
     """What a window asks after each answer of the daemon."""
 
-    def keep(self, departed: Sequence[Departed]) -> Sequence[bool]:
+    def keep(self, departed: Sequence[RetentionCandidate]) -> Sequence[bool]:
         """Whether to keep each of the departed cells."""
 
 
@@ -66,7 +66,7 @@ class Retention(msgspec.Struct, frozen=True):
             if not value >= 0:
                 raise BadRequest(f"retention: {name} must not be negative, it is {value!r}")
 
-    def keep(self, departed: Sequence[Departed]) -> list[bool]:
+    def keep(self, departed: Sequence[RetentionCandidate]) -> list[bool]:
         """Whether to keep each of the departed cells."""
         kept = [False] * len(departed)
         if not self.distance:

@@ -27,7 +27,6 @@ from shmmap.daemon.events.log import EventLog, PressureEvents
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.records import Key, Resident
 from shmmap.failpoints import step
-from shmmap.geometry import ZRange
 from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
@@ -146,7 +145,7 @@ class CellCache:
                 self.tell(self.events.revived, resident)
         return resident
 
-    def at_height(self, indices: list[int], z: ZRange | None) -> list[int]:
+    def at_height(self, indices: list[int], z: tuple[float, float] | None) -> list[int]:
         """Leave out cells whose heights, known once they were loaded, lie outside the range."""
         if z is None:
             return indices

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.records import Key, Resident
-from shmmap.geometry import ZRange
 from shmmap.large_tables import ShardedDict, sparse_zeros
 from shmmap.protocol.codec import encode_handle
 from shmmap.protocol.messages import Handle
@@ -56,11 +55,11 @@ class Heights:
         z_min, z_max = self._z[index].tolist()
         return z_min, z_max
 
-    def overlapping(self, indices: list[int], z: ZRange) -> list[int]:
+    def overlapping(self, indices: list[int], z: tuple[float, float]) -> list[int]:
         """Those cells of which it is not known that they lie outside a range."""
         cells = np.array(indices, dtype=np.intp)
         z_min, z_max = self._z[cells].T
-        outside = self._known[cells] & ((z_max < z.min) | (z_min > z.max))
+        outside = self._known[cells] & ((z_max < z[0]) | (z_min > z[1]))
         inside: list[int] = cells[~outside].tolist()
         return inside
 

@@ -99,8 +99,7 @@ def leaves_without_a_word(
             route = tuple((x + 20.0 * math.cos(n), y + 20.0 * math.sin(n)) for n in range(64))
             try:
                 client = shmmap.connect(endpoint, name=f"silent {count}", connect_timeout=5.0)
-                area, intent = shmmap.Circle(x, y, 5.0), shmmap.Intent(x, y, route=route)
-                cells = client.area(area, wait=10.0, intent=intent)
+                cells = client.area(shmmap.Circle(x, y, 5.0), wait=10.0, pose=(x, y), route=route)
                 if count < STILL_MAPPED:
                     kept.append(cells)
                 count += 1

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from shmmap_clients.compare_map_filter import CompareMapFilter, CompareRule
 from shmmap_clients.compare_map_filter.rule import MODES
 
-from shmmap import BadRequest, LayerTable, build_layer
+from shmmap import BadRequest
+from shmmap.layers import LayerTable, build_layer
 
 ORIGINS = {
     "origin": (0.0, 0.0, 0.0),

@@ -15,7 +15,7 @@ from shmmap_clients.ndt_scan_matcher.backends import opencl_backend
 from shmmap_clients.ndt_scan_matcher.cli import device_check, main
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 
-from shmmap import voxel_covariances
+from shmmap.layers import voxel_covariances
 from tests.support.opencl_device import need_device
 
 BARE = """

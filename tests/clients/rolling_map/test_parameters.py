@@ -16,7 +16,9 @@ from shmmap_clients.rolling_map.parameters import (
     read_parameters,
 )
 
-from shmmap import BadRequest, ConfigError, MapMissing, Occupancy, ScanFilter
+from shmmap import BadRequest
+from shmmap.errors import ConfigError, MapMissing
+from shmmap.live import Occupancy, ScanFilter
 
 if sys.version_info >= (3, 11):
     import tomllib

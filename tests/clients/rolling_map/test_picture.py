@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from shmmap_clients.rolling_map.picture import STATES, HeightColours, MapContent, map_picture
 
-from shmmap import ChunkInfo
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.live import ChunkInfo
 from tests.support.pictures import SVG, rasters
 
 RESOLUTION = 0.5

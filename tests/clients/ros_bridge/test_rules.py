@@ -57,13 +57,13 @@ def test_what_a_client_was_sent_is_what_it_holds() -> None:
     requesters = Requesters(most=2)
     now = {"a": 1, "b": 2, "c": 3}
     held = requesters.held("one", ["a", "x", "a"], now)
-    assert held == [shmmap.HeldCell("a", 1), shmmap.HeldCell("x", None)], "ours to know are current, once"
+    assert held == [("a", 1), ("x", None)], "ours to know are current, once"
     requesters.answered("one", held, ["x"], {"b": 2})
     now = {"a": 10, "b": 20}
-    assert requesters.held("one", ["b", "a"], now) == [shmmap.HeldCell("b", 2), shmmap.HeldCell("a", 1)]
-    assert requesters.held("two", ["b"], now) == [shmmap.HeldCell("b", 20)], "another client's"
+    assert requesters.held("one", ["b", "a"], now) == [("b", 2), ("a", 1)]
+    assert requesters.held("two", ["b"], now) == [("b", 20)], "another client's"
     requesters.answered("one", requesters.held("one", ["b"], now), ["b"], {"a": 10})
-    assert requesters.held("one", ["a", "b"], now) == [shmmap.HeldCell("a", 10), shmmap.HeldCell("b", 20)]
+    assert requesters.held("one", ["a", "b"], now) == [("a", 10), ("b", 20)]
 
 
 def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:

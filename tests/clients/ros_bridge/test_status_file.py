@@ -81,7 +81,7 @@ def test_doctor_survives_what_is_no_bridge_s_file(socket: str, tmp_path: Path, s
 
 def test_one_bridge_for_a_domain(socket: str) -> None:
     with bridge(socket, 0, {}) as one:
-        with pytest.raises(shmmap.Busy, match="another bridge of this daemon"):
+        with pytest.raises(shmmap.errors.Busy, match="another bridge of this daemon"):
             StatusFile(socket, "town", 0)
         other = StatusFile(socket, "town", 1)
         other.close()

@@ -23,7 +23,8 @@ from shmmap_clients.scans.trajectory import (
     tum_line,
 )
 
-from shmmap import BadRequest, MapDataError, MapMissing
+from shmmap import BadRequest, MapDataError
+from shmmap.errors import MapMissing
 
 
 def test_rotations_there_and_back() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shmmap.chunks import marking
-from shmmap.chunks.marking import Counts, Marker, ScanFilter
+from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import voxels_of
 from shmmap.errors import BadRequest
@@ -143,7 +143,7 @@ def test_what_becomes_of_each_point_is_counted() -> None:
         np.float32,
     )
     marks, counts = Marker(0.1).mark(points, pose_at((0.0, 0.0, 0.0)))
-    assert counts == Counts(near=1, far=2, too_near=1, outside_z=1, not_finite=3)
+    assert counts == ScanCounts(near=1, far=2, too_near=1, outside_z=1, not_finite=3)
     assert sets_of(marks)[0] == {(10, 0, 0)}
 
 

@@ -13,7 +13,7 @@ from shmmap.cli.options import numbers, seconds
 from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
 from shmmap.cli.program import join_negative_values
 from shmmap.errors import BadRequest
-from shmmap.geometry import AutowareSquare, Box, Circle, ZRange
+from shmmap.geometry import AutowareSquare, Box, Circle
 
 CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evict"]
 CONTRACT += ["pin", "unpin", "stop"]
@@ -158,9 +158,7 @@ def test_help_fits_the_terminal(
 
 def test_area_from_options() -> None:
     assert area_from(parse("query", "--circle", "1,2,3")) == Circle(1, 2, 3)
-    assert area_from(parse("query", "--square", "1,2,3", "--z", "-4,5")) == AutowareSquare(
-        1, 2, 3, ZRange(-4, 5)
-    )
+    assert area_from(parse("query", "--square", "1,2,3", "--z", "-4,5")) == AutowareSquare(1, 2, 3, (-4, 5))
     assert area_from(parse("query", "--box", "-1,-2,3,4")) == Box(-1, -2, 3, 4)
     assert area_from(parse("query", "--id", "a")) is None
     with pytest.raises(BadRequest, match="--z needs an area"):

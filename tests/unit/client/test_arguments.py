@@ -11,8 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap import BadRequest, Intent
-from shmmap.client.arguments import FARTHEST_M, MAX_ROUTE_PLACES, checked_intent, pose_intent, thinned
+from shmmap import BadRequest
+from shmmap.client.arguments import (
+    FARTHEST_M,
+    MAX_ROUTE_PLACES,
+    MAX_WAIT_S,
+    given_intent,
+    pose_intent,
+    request_waits,
+    thinned,
+)
+from shmmap.protocol.messages import Intent
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -26,9 +35,8 @@ def test_a_short_one_is_sent_as_it_is() -> None:
     route = spiral(MAX_ROUTE_PLACES)
     assert thinned(route) is route
     assert pose_intent(1, 2, 0, 0, None, route).route == tuple(map(tuple, route.tolist()))
-    intent = Intent(1.0, 2.0, route=((3.0, 4.0),))
-    assert checked_intent(intent) is intent
-    assert checked_intent(None) is None
+    assert given_intent((1.0, 2.0), (0.0, 0.0), None, [(3.0, 4.0)]) == Intent(1.0, 2.0, route=((3.0, 4.0),))
+    assert given_intent(None, (0.0, 0.0), None, ()) is None
 
 
 def test_of_a_long_one_places_equally_far_apart() -> None:
@@ -41,7 +49,7 @@ def test_of_a_long_one_places_equally_far_apart() -> None:
     assert apart.max() / apart.min() < 1.01
     nearest = np.hypot(*(found[:, np.newaxis] - route[np.newaxis]).transpose(2, 0, 1)).min(axis=1)
     assert nearest.max() < 0.15, "they lie on the route"
-    sent = checked_intent(Intent(1.0, 2.0, 3.0, 4.0, 0.5, tuple(map(tuple, route.tolist()))))
+    sent = given_intent((1, 2), (3, 4), 0.5, route)
     assert sent is not None
     assert sent == pose_intent(1, 2, 3, 4, 0.5, route)
     assert sent.route == tuple(map(tuple, found.tolist()))
@@ -72,9 +80,26 @@ def test_whatever_is_finite_stays_so(some: list[tuple[float, float]], repeats: i
 def test_what_is_no_route_is_refused(route: Any) -> None:
     with pytest.raises(BadRequest):
         pose_intent(0, 0, 0, 0, None, route)
-    if not isinstance(route[0], float):
-        with pytest.raises(BadRequest):
-            checked_intent(Intent(0.0, 0.0, route=tuple(route) * 600))
+    with pytest.raises(BadRequest):
+        given_intent((0.0, 0.0), (0.0, 0.0), None, route)
+
+
+@pytest.mark.parametrize(
+    "intent",
+    [((1, 2, 3), (0, 0), None, ()), (5, (0, 0), None, ()), ((1, 2), 5.0, None, ()), (None, (1, 0), None, ())],
+)
+def test_poses_and_velocities_that_make_no_sense(intent: Any) -> None:
+    with pytest.raises(BadRequest, match="pose"):
+        given_intent(*intent)
+
+
+def test_a_long_wait_is_several_requests() -> None:
+    """Each of them notices a daemon that hangs."""
+    assert list(request_waits(None)) == [None]
+    assert list(request_waits(0)) == [0.0]
+    assert list(request_waits(2.5 * MAX_WAIT_S)) == [MAX_WAIT_S, MAX_WAIT_S, 0.5 * MAX_WAIT_S]
+    endless = request_waits(math.inf)
+    assert [next(endless) for _ in range(5)] == [MAX_WAIT_S] * 5
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ def test_a_cell_is_removed_with_its_last_layer(make_cell: Callable[..., Cell]) -
 
 
 def test_ids_and_versions_may_be_given_by_hand() -> None:
-    held = HeldCells(["/a", ("/b", 7), HeldCell("/c", 8, ("points",))])
+    held = HeldCells(["/a", ("/b", 7), ("/c", 8, ("points",))])
     assert held.named == (HeldCell("/a"), HeldCell("/b", 7), HeldCell("/c", 8, ("points",)))
 
 

@@ -7,7 +7,7 @@ from collections import deque
 
 import msgspec
 
-from shmmap.client.event_stream import EventStream, Missed
+from shmmap.client.event_stream import EventStream, MissedEvents
 from shmmap.errors import NoAnswer
 from shmmap.protocol import events as e
 
@@ -37,7 +37,7 @@ class Played(EventStream):
         """Hear these; returns what `next` would: (epoch, number) of events, and what was missed."""
         for data in heard:
             self._take(data)
-        told: list[object] = [h if isinstance(h, Missed) else (h.epoch, h.seq) for h in self._ready]
+        told: list[object] = [h if isinstance(h, MissedEvents) else (h.epoch, h.seq) for h in self._ready]
         self._ready.clear()
         return told
 
@@ -47,8 +47,8 @@ def test_what_is_still_queued_of_a_life_that_ended() -> None:
     stream = Played()
     assert stream.hear(changed(1, 1)) == [(1, 1)]
     stream.life, stream.kept = 2, [1, 2, 3]
-    assert stream.hear(changed(1, 4), changed(1, 5)) == [Missed(1, 2, 3), (1, 4), (1, 5)]
-    assert stream.hear(e.encode_event(e.Beat(6, 1, 0))) == [Missed(1, 6, 6)]
+    assert stream.hear(changed(1, 4), changed(1, 5)) == [MissedEvents(1, 2, 3), (1, 4), (1, 5)]
+    assert stream.hear(e.encode_event(e.Beat(6, 1, 0))) == [MissedEvents(1, 6, 6)]
     assert stream.hear(changed(2, 2), changed(2, 3)) == [(2, 1), (2, 2), (2, 3)]
     stream.kept.append(4)
     assert stream.hear(changed(2, 4)) == [(2, 4)]
@@ -63,7 +63,7 @@ def test_a_gap_that_nobody_could_be_asked_about() -> None:
     stream.silent = True
     assert stream.hear(changed(1, 7)) == []
     stream.silent, stream.life, stream.kept = False, 2, [1]
-    assert stream.hear(changed(2, 1)) == [Missed(1, 5, 7), (2, 1)]
+    assert stream.hear(changed(2, 1)) == [MissedEvents(1, 5, 7), (2, 1)]
 
 
 def test_a_beat_tells_of_what_was_last() -> None:
@@ -72,7 +72,7 @@ def test_a_beat_tells_of_what_was_last() -> None:
     assert stream.hear(e.encode_event(e.Beat(3, 1, 0))) == [(1, 1), (1, 2), (1, 3)]
     assert stream.hear(e.encode_event(e.Beat(3, 1, 0))) == []
     stream.kept = [9, 10]
-    assert stream.hear(changed(1, 10)) == [Missed(1, 4, 8), (1, 9), (1, 10)]
+    assert stream.hear(changed(1, 10)) == [MissedEvents(1, 4, 8), (1, 9), (1, 10)]
 
 
 def test_what_takes_no_number_comes_after_all_that_was_before_it() -> None:

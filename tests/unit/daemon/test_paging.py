@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from shmmap import AutowareSquare, Box, HeldCell, MapWindow, Offline, connect
+from shmmap import AutowareSquare, Box, MapWindow, Offline, connect
 from shmmap.daemon.loading.loads import PREFETCH
 from shmmap.daemon.map.catalogue_view import Ready
 from shmmap.daemon.requests import limits, map_queries
@@ -27,6 +27,7 @@ from shmmap.origin.map_directory import open_map
 from shmmap.protocol import events
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import pack_versions, unpack_versions
+from shmmap.protocol.messages import HeldCell
 from tests.support.cpp_client import CppClient
 from tests.support.divided_map import DividedMap
 from tests.support.skips import open3d_or_skip

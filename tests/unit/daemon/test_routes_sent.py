@@ -134,11 +134,11 @@ def test_long_routes_beside_a_window(
     whole: Callable[..., WholeDaemon], small_map: DividedMap, received: list[Intent]
 ) -> None:
     """Each request of a client takes a route of any length."""
-    intent = Intent(0.0, 0.0, route=tuple((float(x), 0.0) for x in range(5000)))
+    route = [(float(x), 0.0) for x in range(5000)]
     area = shmmap.Circle(0.0, 0.0, 5.0)
     with serving(whole, small_map) as one, shmmap.connect(one.endpoint) as client:
-        client.area(area, intent=intent)
-        client.differential(area, [], intent=intent)
-        client.selected(["0_0.pcd"], intent=intent)
+        client.area(area, pose=(0.0, 0.0), route=route)
+        client.differential(area, [], pose=(0.0, 0.0), route=route)
+        client.selected(["0_0.pcd"], pose=(0.0, 0.0), route=route)
     assert [len(each.route) for each in received] == [MAX_ROUTE_PLACES] * 3
     assert {each.route[-1] for each in received} == {(4999.0, 0.0)}

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shmmap.errors import BadRequest
-from shmmap.geometry import AutowareSquare, Box, Circle, ZRange, distance_to_boxes
+from shmmap.geometry import AutowareSquare, Box, Circle, distance_to_boxes, heights_overlap
 from tests.support.divided_map import Rectangle, cylinder_and_box_overlap_exists, f32
 
 whole = st.integers(-1_000_000, 1_000_000).map(float)
@@ -126,19 +126,22 @@ def test_nonsense_is_refused() -> None:
         lambda: AutowareSquare(1e39, 0, 1),
         lambda: Box(1, 0, 0, 1),
         lambda: Box(0, 1, 1, 0),
-        lambda: ZRange(2, 1),
-        lambda: ZRange(math.nan, 1),
+        lambda: Circle(0, 0, 1, (2, 1)),
+        lambda: Box(0, 0, 1, 1, z=(math.nan, 1)),
+        lambda: AutowareSquare(0, 0, 1, z=(1, 2, 3)),  # type: ignore[arg-type]
+        lambda: Circle(0, 0, 1, z=5),  # type: ignore[arg-type]
     ):
         with pytest.raises(BadRequest):
             make()
 
 
 def test_heights() -> None:
-    z = ZRange(-1.0, 2.0)
-    assert z.overlaps(2.0, 5.0)
-    assert z.overlaps(-9.0, -1.0)
-    assert z.overlaps(0.0, 0.0)
-    assert not z.overlaps(2.1, 5.0)
-    assert not z.overlaps(-9.0, -1.1)
-    assert z.overlaps(math.nan, math.nan)  # not known yet
-    assert ZRange(-math.inf, math.inf).overlaps(5.0, 6.0)
+    z = Box(0, 0, 1, 1, z=(-1, 2)).z
+    assert z == (-1.0, 2.0)
+    assert heights_overlap(z, 2.0, 5.0)
+    assert heights_overlap(z, -9.0, -1.0)
+    assert heights_overlap(z, 0.0, 0.0)
+    assert not heights_overlap(z, 2.1, 5.0)
+    assert not heights_overlap(z, -9.0, -1.1)
+    assert heights_overlap(z, math.nan, math.nan)  # not known yet
+    assert heights_overlap((-math.inf, math.inf), 5.0, 6.0)

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shmmap import build_layer
-from shmmap.layers import voxels
+from shmmap.layers import build_layer, voxels
 from shmmap.layers.voxels import CONVENTIONS, group_points, voxel_covariances
 from tests.support.layer_oracles import covariance_of, voxels_of
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, LayerTable, MapDataError, build_layer
+from shmmap import BadRequest, MapDataError
+from shmmap.layers import LayerTable, build_layer
 
 
 def rows_of_column(table: LayerTable, column: tuple[int, int]) -> NDArray[Any]:

@@ -26,7 +26,7 @@ from tests.support.message_pack import pack
 
 coordinate = st.floats(-1e7, 1e7)
 length = st.floats(0, 1e5)
-z_range = st.none() | st.tuples(coordinate, length).map(lambda p: geometry.ZRange(p[0], p[0] + p[1]))
+z_range = st.none() | st.tuples(coordinate, length).map(lambda p: (p[0], p[0] + p[1]))
 areas = (
     st.builds(geometry.Circle, coordinate, coordinate, length, z_range)
     | st.builds(geometry.AutowareSquare, coordinate, coordinate, length, z_range)

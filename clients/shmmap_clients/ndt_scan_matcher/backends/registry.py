@@ -13,7 +13,8 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, needed_packages
+from shmmap import BadRequest
+from shmmap.layers import needed_packages
 from shmmap_clients.ndt_scan_matcher.backends.backend import (
     Backend,
     DeviceError,

@@ -395,7 +395,7 @@ def _voxels(points: NDArray[np.float64], leaf: float) -> VoxelMap:
 
 
 def _inverse(scatter: NDArray[np.float64], count: NDArray[np.int64], kind: Covariance) -> NDArray[np.float64]:
-    """Return (V, 6) inverse covariances of a kind, see `shmmap.voxel_covariances`, which needs numba."""
+    """Return (V, 6) inverse covariances of a kind; `shmmap.layers.voxel_covariances` needs numba."""
     full = scatter[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     n = count[:, None, None]
     covariance = full / (n - 1) if kind == "pcl" else (full + np.eye(3)) / (n - 1)

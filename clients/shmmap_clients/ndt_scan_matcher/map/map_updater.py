@@ -21,7 +21,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import BadRequest, Cell, Client, InternalError, MapWindow, NoAnswer, ShmmapError, canonical_layer
+from shmmap import BadRequest, Cell, Client, MapWindow, NoAnswer, ShmmapError
+from shmmap.errors import InternalError
+from shmmap.layers import canonical_layer
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelCell, VoxelMap, cell_from_layer
 from shmmap_clients.spread import RunningSpread

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from shmmap import BadRequest
 
 if TYPE_CHECKING:
-    from shmmap import Cell, LayerTable
+    from shmmap import Cell
+    from shmmap.layers import LayerTable
 
 __all__ = ["TABLE_COLUMNS", "Covariance", "VoxelCell", "VoxelMap", "cell_from_layer", "voxel_cell"]
 
@@ -93,9 +94,9 @@ def voxel_cell(points: NDArray[np.generic], leaf: float, *, min_points: int = 6)
     Raises
     ------
     BadRequest, MapDataError
-        As `shmmap.build_layer`.
+        As `shmmap.layers.build_layer`.
     """
-    from shmmap import build_layer
+    from shmmap.layers import build_layer
 
     return cell_from_layer(build_layer(f"ndt(leaf={leaf!r},min_points={min_points})", points))
 
@@ -106,7 +107,7 @@ def cell_from_layer(layer: LayerTable | Cell) -> VoxelCell:
     Parameters
     ----------
     layer
-        As `shmmap.build_layer` or the daemon gave it.
+        As `shmmap.layers.build_layer` or the daemon gave it.
 
     Raises
     ------
@@ -223,7 +224,7 @@ class VoxelMap:
             return cell.inverse
         derived = self._derived.setdefault(key, {})
         if covariance not in derived:
-            from shmmap import voxel_covariances
+            from shmmap.layers import voxel_covariances
 
             derived[covariance] = voxel_covariances(cell.count, cell.scatter, covariance)[1]
         return derived[covariance]

@@ -23,12 +23,12 @@ from shmmap.protocol.live import SphereMessage
 )  # fmt: skip
 def test_spheres_that_make_no_sense(numbers: tuple[float, float, float, float]) -> None:
     with pytest.raises(BadRequest, match="finite"):
-        _area(shmmap.Sphere(*numbers))
+        _area(shmmap.live.Sphere(*numbers))
 
 
 def test_spheres_that_do() -> None:
-    assert _area(shmmap.Sphere(1, -2, 3, 0)) == SphereMessage(1.0, -2.0, 3.0, 0.0)
-    assert _area(shmmap.Sphere(0, 0, 0, 9e149)) == SphereMessage(0.0, 0.0, 0.0, 9e149)
+    assert _area(shmmap.live.Sphere(1, -2, 3, 0)) == SphereMessage(1.0, -2.0, 3.0, 0.0)
+    assert _area(shmmap.live.Sphere(0, 0, 0, 9e149)) == SphereMessage(0.0, 0.0, 0.0, 9e149)
     assert _area(None) is None
 
 

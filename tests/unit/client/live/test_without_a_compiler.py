@@ -11,10 +11,10 @@ import sys
 for name in ("numba", "xxhash", "zstandard"):
     sys.modules[name] = None
 import shmmap
-assert shmmap.LiveMap and shmmap.Voxels and shmmap.ScanFilter
+assert shmmap.live.LiveMap and shmmap.live.Voxels and shmmap.live.ScanFilter
 try:
-    shmmap.LiveMap.mapper(None, "front")
-except shmmap.PackageMissing as error:
+    shmmap.live.LiveMap.mapper(None, "front")
+except shmmap.errors.PackageMissing as error:
     print(error.message)
 """
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.client.window.retention import Departed, Retention
+from shmmap.client.window.retention import Retention, RetentionCandidate
 from shmmap.errors import BadRequest
 
 departed = st.lists(
     st.builds(
-        Departed,
+        RetentionCandidate,
         distance=st.floats(0, 500),
         nbytes=st.integers(0, 10_000),
         age=st.floats(0, 1000),
@@ -30,7 +30,7 @@ policies = st.builds(
 
 
 @given(policies, departed)
-def test_limits_hold_and_the_nearest_come_first(policy: Retention, cells: list[Departed]) -> None:
+def test_limits_hold_and_the_nearest_come_first(policy: Retention, cells: list[RetentionCandidate]) -> None:
     kept = policy.keep(cells)
     assert len(kept) == len(cells)
     held = [cell for cell, keep in zip(cells, kept, strict=True) if keep]
@@ -45,7 +45,7 @@ def test_limits_hold_and_the_nearest_come_first(policy: Retention, cells: list[D
 
 
 def test_the_default_keeps_nothing() -> None:
-    assert Retention().keep([Departed(0.0, 0, 0.0)]) == [False]
+    assert Retention().keep([RetentionCandidate(0.0, 0, 0.0)]) == [False]
 
 
 @pytest.mark.parametrize("limit", ["distance", "max_bytes", "max_age"])

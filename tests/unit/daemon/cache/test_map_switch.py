@@ -11,7 +11,6 @@ import pytest
 from shmmap.daemon.cache import map_switch
 from shmmap.daemon.cache.map_switch import SEGMENTS_A_STEP
 from shmmap.daemon.cache.warm_index import Heights
-from shmmap.geometry import ZRange
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Area, CircleMessage, Differential, Metadata
 from tests.support.divided_map import DividedMap, make_map
@@ -145,4 +144,4 @@ def test_heights() -> None:
     heights.learn(4, 5.0, 6.0)
     heights.forget(np.array([4]))
     assert (heights.get(1), heights.get(0), heights.get(4)) == ((-1.0, 2.0), None, None)
-    assert heights.overlapping([4, 3, 2, 1, 0], ZRange(2.0, 4.0)) == [4, 3, 1, 0]
+    assert heights.overlapping([4, 3, 2, 1, 0], (2.0, 4.0)) == [4, 3, 1, 0]

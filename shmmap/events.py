@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What happens in the daemon, as it happens: cells loaded, changed, evicted; clients that join and leave.
+
+::
+
+    from shmmap.events import EventStream
+
+    with EventStream() as stream:
+        for event in stream:
+            print(event)
+
+`EventStream` iterates over events, which are the other classes here, by kind; `MissedEvents` is what it gives
+where some are lost.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from shmmap.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap.client.event_stream import EventStream, MissedEvents
+    from shmmap.protocol.events import (
+        Beat,
+        Changed,
+        Epoch,
+        Event,
+        Evicted,
+        Failed,
+        Joined,
+        Left,
+        LiveChanged,
+        LiveDamaged,
+        LiveEnded,
+        LiveProblem,
+        LiveStarted,
+        Loaded,
+        LongTurn,
+        PrefetchMiss,
+        Pressure,
+        Reloaded,
+        Retried,
+    )
+
+__all__ = [
+    "Beat",
+    "Changed",
+    "Epoch",
+    "Event",
+    "EventStream",
+    "Evicted",
+    "Failed",
+    "Joined",
+    "Left",
+    "LiveChanged",
+    "LiveDamaged",
+    "LiveEnded",
+    "LiveProblem",
+    "LiveStarted",
+    "Loaded",
+    "LongTurn",
+    "MissedEvents",
+    "PrefetchMiss",
+    "Pressure",
+    "Reloaded",
+    "Retried",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy_names(__name__)

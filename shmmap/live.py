@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Live maps: made while driving, by processes that write them, for those that read them (``LIVE_MAPS.md``).
+
+`shmmap.Client.live` returns a `LiveMap`; `LiveMap.mapper` the `LiveMapper` that scans are inserted with.
+
+================  ==============================================================================
+`LiveMap`         a live map as readers see it: voxels of an area, states of points, changes
+`LiveMapper`      inserts scans into a live map
+`ScanFilter`      which points of a scan count
+`ScanCounts`      what became of the points of a scan
+`Occupancy`       the parameters of the occupancy model: log odds of a hit, a miss, the thresholds
+`Sphere`          an area in space
+`Voxels`          what `LiveMap.voxels` returns
+`ChunkInfo`       what `LiveMap.chunks` says of one chunk
+`LiveMapRow`      what `shmmap.Client.live_maps` says of one map
+================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from shmmap.lazy_names import lazy_names
+
+if TYPE_CHECKING:
+    from shmmap.chunks.occupancy import Occupancy
+    from shmmap.chunks.scan_filter import ScanCounts, ScanFilter
+    from shmmap.client.live.chunk_reader import ChunkInfo
+    from shmmap.client.live.live_map import LiveMap, Sphere, Voxels
+    from shmmap.client.live.mapper import LiveMapper
+    from shmmap.protocol.live import LiveMapRow
+
+__all__ = [
+    "ChunkInfo",
+    "LiveMap",
+    "LiveMapRow",
+    "LiveMapper",
+    "Occupancy",
+    "ScanCounts",
+    "ScanFilter",
+    "Sphere",
+    "Voxels",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy_names(__name__)
