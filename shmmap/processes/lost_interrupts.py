@@ -15,7 +15,9 @@ from typing import Any, Final
 __all__ = ["keep_interrupts"]
 
 LATER_S: Final = 0.005
-"""By then the callback is over."""
+"""By then the callback is over, as a rule."""
+AGAIN_S: Final = 0.02
+"""By then it is, where it was not."""
 
 
 def keep_interrupts() -> None:
@@ -28,8 +30,13 @@ def keep_interrupts() -> None:
             return
         number = signal.SIGINT if issubclass(what.exc_type, KeyboardInterrupt) else signal.SIGTERM
 
-        def again(_alarm: int, _frame: FrameType | None) -> None:
-            signal.raise_signal(number)
+        def again(_alarm: int, frame: FrameType | None) -> None:
+            while frame is not None and frame.f_code is not ignored.__code__:
+                frame = frame.f_back
+            if frame is None:
+                signal.raise_signal(number)
+            else:  # in here Python would ignore it for good
+                signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
 
         signal.signal(signal.SIGALRM, again)
         signal.setitimer(signal.ITIMER_REAL, LATER_S)
