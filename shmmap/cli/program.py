@@ -21,7 +21,9 @@ _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _LATER_S: Final = 0.005
-"""By then the callback that an interrupt came in is over."""
+"""By then the callback that an interrupt came in is over, as a rule."""
+_AGAIN_S: Final = 0.02
+"""By then it is, where it was not."""
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 
@@ -195,8 +197,13 @@ def keep_interrupts() -> None:
             return
         number = signal.SIGINT if issubclass(what.exc_type, KeyboardInterrupt) else signal.SIGTERM
 
-        def again(_alarm: int, _frame: FrameType | None) -> None:
-            signal.raise_signal(number)
+        def again(_alarm: int, frame: FrameType | None) -> None:
+            while frame is not None and frame.f_code is not ignored.__code__:
+                frame = frame.f_back
+            if frame is None:
+                signal.raise_signal(number)
+            else:  # in here Python would ignore it for good
+                signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
 
         signal.signal(signal.SIGALRM, again)
         signal.setitimer(signal.ITIMER_REAL, _LATER_S)

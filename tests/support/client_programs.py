@@ -184,11 +184,10 @@ def _wander(endpoint: str, seed: str, half_size: str, pause: str) -> None:
             for _ in range(rng.randrange(20, 400)):
                 x = max(-half, min(half, x + rng.gauss(0, 5)))
                 y = max(-half, min(half, y + rng.gauss(0, 5)))
-                intent = shmmap.Intent(x, y)
                 cells = [cell for cell, _ in held.values()]
                 area = shmmap.Circle(x, y, radius)
                 wait = rng.choice([None, 1.0])
-                reply = client.differential(area, cells, wait=wait, intent=intent, strict=None)
+                reply = client.differential(area, cells, wait=wait, pose=(x, y), strict=None)
                 del cells
                 for cell_id in reply.removed:
                     _check(*held.pop(cell_id))

@@ -194,11 +194,11 @@ class MapAnswers:
             removed: Collection[str] = found.removed
         else:
             wanted = self._touched(message.area)
-            versions = {one.id: one.version for one in held}
+            versions = dict(held)
             current = self._catalogue.versions
             cells = self._selected([one for one in wanted if versions.get(one) != current[one]])
             inside = set(wanted)
-            removed = [one.id for one in held if one.id not in inside]
+            removed = [one for one, _version in held if one not in inside]
         sent = {cell.id: cell.version for cell in cells}
 
         def done() -> None:
