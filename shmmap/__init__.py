@@ -23,8 +23,7 @@ from shmmap.segment.process_limits import no_files_left
 from shmmap.version import __version__
 
 if TYPE_CHECKING:
-    from shmmap.chunks.occupancy import Occupancy
-    from shmmap.chunks.scan_filter import Counts, ScanFilter
+    from shmmap.chunks.occupancy import Occupancy, ScanCounts, ScanFilter
     from shmmap.client import (
         Cell,
         CellInfo,
@@ -109,7 +108,6 @@ __all__ = [
     "Client",
     "ConfigError",
     "ConnectionLost",
-    "Counts",
     "DaemonUnreachable",
     "Departed",
     "EventStream",
@@ -147,6 +145,7 @@ __all__ = [
     "ProtocolMismatch",
     "Retention",
     "RetentionPolicy",
+    "ScanCounts",
     "ScanFilter",
     "SegmentCorrupt",
     "SegmentError",

@@ -11,12 +11,12 @@ from typing import Any
 
 from shmmap import (
     ChunkInfo,
-    Counts,
     DaemonUnreachable,
     LiveInterrupted,
     LiveMap,
     LiveMapper,
     LiveMapRow,
+    ScanCounts,
 )
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import Decimated, RunningSpread
@@ -44,7 +44,7 @@ class MappedScan:
 
     scan: Scan
     number: int
-    counts: Counts
+    counts: ScanCounts
     on_their_way: int
     add_s: float
 
@@ -80,7 +80,7 @@ class DriveStatistics:
         self.points = 0
         self.first: int | None = None
         self.last: int | None = None
-        self._counts: Counter[str] = Counter(dict.fromkeys(Counts.__struct_fields__, 0))
+        self._counts: Counter[str] = Counter(dict.fromkeys(ScanCounts.__struct_fields__, 0))
         self._path: Decimated[tuple[float, float, float]] = Decimated()
         self._position: tuple[float, float, float] | None = None
         self._add_ms = RunningSpread()
@@ -91,7 +91,7 @@ class DriveStatistics:
         self.points += len(mapped.scan.xyz)
         self.first = mapped.number if self.first is None else self.first
         self.last = mapped.number
-        self._counts.update({name: getattr(mapped.counts, name) for name in Counts.__struct_fields__})
+        self._counts.update({name: getattr(mapped.counts, name) for name in ScanCounts.__struct_fields__})
         self._add_ms.add(mapped.add_s * 1e3)
         x, y, z = mapped.scan.pose[:3, 3].tolist()
         self._position = (x, y, z)
@@ -115,7 +115,7 @@ class DriveStatistics:
 
     def line(self, mapped: MappedScan) -> str:
         """One line about the latest scan."""
-        counts = {name: getattr(mapped.counts, name) for name in Counts.__struct_fields__}
+        counts = {name: getattr(mapped.counts, name) for name in ScanCounts.__struct_fields__}
         left_out = _left_out(counts)
         return (
             f"{mapped.scan.name}: {len(mapped.scan.xyz)} points, {counts['near']} in range,"

@@ -8,13 +8,13 @@ from shmmap_clients.rolling_map.drive import DriveStatistics, MappedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import KEPT
 
-from shmmap import Counts
+from shmmap import ScanCounts
 
 
 def test_the_path_of_a_long_drive_keeps_its_ends() -> None:
     statistics = DriveStatistics()
     assert list(statistics.path) == []
-    counts, points = Counts(1, 0, 0, 0, 0), {"xyz": np.zeros((1, 3), np.float32)}
+    counts, points = ScanCounts(1, 0, 0, 0, 0), {"xyz": np.zeros((1, 3), np.float32)}
     for number in range(KEPT + 2):
         T = np.eye(4)
         T[:3, 3] = number, -number, 1.0

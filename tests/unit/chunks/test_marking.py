@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shmmap.chunks import marking
-from shmmap.chunks.marking import Counts, Marker, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.chunks.voxels import voxels_of
 from shmmap.errors import BadRequest
 from tests.support.slow_occupancy import SlowOccupancy, Voxel
@@ -143,7 +144,7 @@ def test_what_becomes_of_each_point_is_counted() -> None:
         np.float32,
     )
     marks, counts = Marker(0.1).mark(points, pose_at((0.0, 0.0, 0.0)))
-    assert counts == Counts(near=1, far=2, too_near=1, outside_z=1, not_finite=3)
+    assert counts == ScanCounts(near=1, far=2, too_near=1, outside_z=1, not_finite=3)
     assert sets_of(marks)[0] == {(10, 0, 0)}
 
 
@@ -165,7 +166,7 @@ def test_more_chunks_than_there_was_memory_for(monkeypatch: pytest.MonkeyPatch) 
     marker = Marker(0.1, ScanFilter(0.5, 30.0, -30.0, 30.0))
     marks = assert_equal_to_the_slow_one(marker, points, pose_at((0.0, 0.0, 0.0)))
     assert len(marks.keys) > 8
-    monkeypatch.setattr(marking, "MOST_CHUNKS", 4)
+    monkeypatch.setattr(marking, "MAX_CHUNKS", 4)
     small = Marker(0.1, ScanFilter(0.5, 30.0, -30.0, 30.0))
     with pytest.raises(BadRequest, match="more than 4 chunks"):
         small.mark(points, pose_at((0.0, 0.0, 0.0)))

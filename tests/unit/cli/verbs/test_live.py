@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shmmap.cli.entry import main
-from shmmap.daemon.live.folder import Folder
+from shmmap.daemon.live.disk.folder import Folder
 from tests.support.pcd_files import read_pcd
 from tests.support.stored_live_map import contents, stored_drive
 
