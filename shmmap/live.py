@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING
 from shmmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from shmmap.chunks.occupancy import Occupancy
-    from shmmap.chunks.scan_filter import ScanCounts, ScanFilter
+    from shmmap.chunks.occupancy import Occupancy, ScanCounts, ScanFilter
     from shmmap.client.live.chunk_reader import ChunkInfo
     from shmmap.client.live.live_map import LiveMap, Sphere, Voxels
     from shmmap.client.live.mapper import LiveMapper

@@ -4,8 +4,7 @@
 Pure: nothing here knows a daemon, a socket or a directory.  ``CHUNKS.md`` is the byte-exact document.
 
 - `voxels`: which voxel, chunk and brick a point lies in
-- `occupancy`: what a hit and a miss are worth
-- `scan_filter`: which points of a scan count
+- `occupancy`: which points of a scan count, and what a hit and a miss are worth
 - `marking`: a scan becomes the lists of voxels that it hits and passes through
 - `marks`: these lists as bytes, from the mapper to the daemon's worker
 - `layout`: a chunk in shared memory

@@ -20,7 +20,7 @@ from shmmap.chunks import applying_kernels as kernels
 from shmmap.chunks.layout import (
     HEADER_BYTES,
     MAPPERS,
-    MOST_BYTES,
+    MAX_BYTES,
     STATE_AT,
     ChunkView,
 )
@@ -40,7 +40,7 @@ _MAGIC: Final = b"SHMUNDO\0"
 _UNDO: Final = struct.Struct("<8sQQ3iI")
 _IN_FORCE_AT: Final = 8
 _BODY_AT: Final = 64
-UNDO_BYTES: Final = _BODY_AT + 2 * BRICKS + MOST_BYTES
+UNDO_BYTES: Final = _BODY_AT + 2 * BRICKS + MAX_BYTES
 
 
 class UndoRecord:
@@ -70,7 +70,7 @@ class UndoRecord:
         return (ChunkKey(x, y, z), generation) if magic == _MAGIC and in_force & 1 else None
 
     def keep(self, view: ChunkView, touched: NDArray[np.uint16]) -> None:
-        """Copy a chunk's header and the bricks at these places, and be in force."""
+        """Copy a chunk's header and the bricks at these places, and put the record in force."""
         identity = view.identity
         count = len(touched)
         _UNDO.pack_into(self._data, 0, _MAGIC, 0, identity.generation, *identity.key, count)
@@ -82,7 +82,7 @@ class UndoRecord:
         kernels.begin_writing(self._in_force)
 
     def drop(self) -> None:
-        """Be out of force: what was changed is whole."""
+        """Discard the undo record: the change is complete."""
         kernels.end_writing(self._in_force)
 
     def restore(self, view: ChunkView) -> None:
@@ -192,13 +192,13 @@ class ChunkWriter:
 
     @staticmethod
     def _row(view: ChunkView, mapper: int) -> int | None:
-        """Where a chunk remembers the last scan of a mapper; None where it has none of it."""
+        """Return the row of a mapper's last scan; None if the chunk has none."""
         found = np.flatnonzero(view.state["mappers"]["number"] == mapper)
         return int(found[0]) if len(found) else None
 
     @staticmethod
     def _row_for(view: ChunkView, known: Container[int]) -> int:
-        """A row that is free, or of a mapper that the map does not know any more."""
+        """Return a row that is free, or of a mapper that the map does not know any more."""
         numbers = view.state["mappers"]["number"].tolist()
         for row, number in enumerate(numbers):
             if number == 0 or number not in known:

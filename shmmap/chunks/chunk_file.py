@@ -118,7 +118,7 @@ def _compressor(codec: int) -> Callable[[bytes], bytes]:
 
 
 def _decompress(codec: int, data: memoryview, expected: int) -> bytes:
-    """What was compressed, if that comes to so many bytes; never much more than these are made."""
+    """Return what was compressed, or nothing if it has another length; never make much more than expected."""
     if codec == CODECS["raw"]:
         return bytes(data)
     if codec == CODECS["zlib"]:
@@ -136,7 +136,7 @@ def _decompress(codec: int, data: memoryview, expected: int) -> bytes:
 
 
 def encode_chunk(view: ChunkView, codec: str = "zlib") -> bytes:
-    """Return the file of a chunk that nobody is writing: a copy, or one under the writer's own eyes.
+    """Return the file of a chunk that is not being written: a copy, or one in the writer's own thread.
 
     Raises
     ------

@@ -28,7 +28,7 @@ __all__ = [
     "HEADER_BYTES",
     "IN_SERVICE",
     "MAPPERS",
-    "MOST_BYTES",
+    "MAX_BYTES",
     "OUT_OF_SERVICE",
     "STATE_AT",
     "ChunkIdentity",
@@ -44,7 +44,7 @@ MAJORS_READ: Final = (1, 2)
 """The same bytes; those of version 1 were not cut when they were given up, so that readers could map them."""
 HEADER_BYTES: Final = 4096
 BRICK_BYTES: Final = 2 * BRICK_VOXELS
-MOST_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES
+MAX_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES
 MAPPERS: Final = 32
 """Mappers whose last scan a chunk remembers."""
 IN_SERVICE: Final = 0
@@ -53,7 +53,7 @@ OUT_OF_SERVICE: Final = 1
 
 MAGIC: Final = b"SHMCHUNK"
 BYTE_ORDER: Final = 0x01020304
-MOST_FRAME_BYTES: Final = 40
+MAX_FRAME_BYTES: Final = 40
 
 _CONSTANT: Final = struct.Struct("<8sHHI16s3iId4hQ8x40s")
 _CRC: Final = struct.Struct("<II")
@@ -93,8 +93,8 @@ class ChunkIdentity(msgspec.Struct, frozen=True):
         Log-odds in thousandths: all voxels lie between the first two; those beyond the others count as
         occupied and as free.
     generation
-        Raised each time that this map's worker brings a chunk into memory: who has the key in an older one
-        has something else.
+        Rises each time that this map's worker brings a chunk into memory: the same key in an older generation
+        is another chunk.
     frame_id
         Frame of the map, at most 40 bytes of UTF-8.
     """
@@ -119,7 +119,7 @@ def new_header(identity: ChunkIdentity) -> bytearray:
         The frame's name is longer than 40 bytes, or the map's number not 16.
     """
     frame = identity.frame_id.encode()
-    if len(frame) > MOST_FRAME_BYTES or len(identity.map_id) != 16:
+    if len(frame) > MAX_FRAME_BYTES or len(identity.map_id) != 16:
         raise ValueError(f"frame {identity.frame_id!r} or map number does not fit a chunk's header")
     page = bytearray(HEADER_BYTES)
     _CONSTANT.pack_into(
@@ -178,7 +178,7 @@ def read_identity(page: bytes | bytearray | memoryview, name: str = "chunk") -> 
 
 
 def chunk_bytes(bricks: int) -> int:
-    """Bytes of a chunk with so many bricks."""
+    """Return the length of a chunk with this many bricks, bytes."""
     return HEADER_BYTES + bricks * BRICK_BYTES
 
 
@@ -224,7 +224,7 @@ class ChunkView:
 
 
 def check_consistent(view: ChunkView, name: str = "chunk") -> None:
-    """Check that index, bricks and counters of a chunk agree, which nobody is writing.
+    """Check that index, bricks and counters of a chunk agree while it is not being written.
 
     Raises
     ------

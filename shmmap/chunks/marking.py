@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from shmmap.chunks import marking_kernels as kernels
-from shmmap.chunks.marks import MOST_CHUNKS, Marks
-from shmmap.chunks.scan_filter import ScanCounts, ScanFilter
+from shmmap.chunks.marks import MAX_CHUNKS, Marks
+from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.chunks.voxels import CHUNK_SHIFT, CHUNK_SIDE, FURTHEST_SENSOR, WORDS, voxel_indices
 from shmmap.errors import BadRequest, ConfigError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Marker", "ScanCounts", "ScanFilter"]
+__all__ = ["Marker"]
 
 FIRST_SLOTS: Final = 64
-MOST_REACH: Final = 64
+MAX_REACH: Final = 64
 """Chunks from the sensor to the end of the longest ray; the window's table is then 9 MB."""
 
 
@@ -50,9 +50,9 @@ class Marker:
         self.resolution = resolution
         self.filter = scan_filter if scan_filter is not None else ScanFilter()
         voxels = self.filter.max_range / resolution
-        self._reach = math.ceil(voxels / CHUNK_SIDE) + 1 if math.isfinite(voxels) else MOST_REACH + 1
-        if self._reach > MOST_REACH:
-            most = (MOST_REACH - 1) * CHUNK_SIDE * resolution
+        self._reach = math.ceil(voxels / CHUNK_SIDE) + 1 if math.isfinite(voxels) else MAX_REACH + 1
+        if self._reach > MAX_REACH:
+            most = (MAX_REACH - 1) * CHUNK_SIDE * resolution
             raise ConfigError(
                 f"max_range = {self.filter.max_range!r}: with voxels of {resolution} m at most {most:g} m",
                 key="max_range",
@@ -105,12 +105,12 @@ class Marker:
             self._ends = np.empty((len(points), 3), np.int32)
         while (counts := self._try(points, rigid, corner, sensor - corner)) is None:
             self._forget()
-            if self._slots == MOST_CHUNKS:
+            if self._slots == MAX_CHUNKS:
                 raise BadRequest(
-                    f"the scan touches more than {MOST_CHUNKS} chunks",
+                    f"the scan touches more than {MAX_CHUNKS} chunks",
                     hint="lower max_range, or make the map with larger voxels",
                 )
-            self._make_slots(min(2 * self._slots, MOST_CHUNKS))
+            self._make_slots(min(2 * self._slots, MAX_CHUNKS))
         return self._collect(corner), counts
 
     def _try(

@@ -43,7 +43,7 @@ _NEAR, _FAR, _TOO_NEAR, _OUTSIDE_Z, _NOT_FINITE = range(5)
 
 
 def window_codes(side: int) -> NDArray[np.uint64]:
-    """Codes, (3, side * 64), of the voxels along each axis of a window of so many chunks a side."""
+    """Return codes, (3, side * 64), of the voxels along each axis of a window with ``side`` chunks a side."""
     voxels = np.arange(side * CHUNK_SIDE)
     chunks, within = voxels >> CHUNK_SHIFT, voxels & (CHUNK_SIDE - 1)
     places = (PLACE_X, PLACE_Y, PLACE_Z)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one scan says of voxels, as bytes: for each chunk the words with hits, then those with misses.
+"""Marks of one scan, as bytes: for each chunk the words with hits, then those with misses.
 
-``CHUNKS.md`` is the byte-exact document.  Whoever decodes marks trusts nothing in them.
+``CHUNKS.md`` is the byte-exact document.  Decoding trusts nothing in the bytes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from shmmap.errors import BadRequest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["MARKS_VERSION", "MOST_CHUNKS", "Marks", "decode_marks", "encode_marks", "marks_bytes"]
+__all__ = ["MARKS_VERSION", "MAX_CHUNKS", "Marks", "decode_marks", "encode_marks", "marks_bytes"]
 
 MARKS_VERSION: Final = (1, 0)
-MOST_CHUNKS: Final = 4096
+MAX_CHUNKS: Final = 4096
 """Chunks that one scan may touch."""
 
 _MAGIC: Final = b"SHMMARKS"
@@ -64,7 +64,7 @@ class Marks(msgspec.Struct, frozen=True, eq=False):
 
 
 def marks_bytes(chunks: int, words: int) -> int:
-    """Bytes of marks with so many chunks and words."""
+    """Return the length of marks with this many chunks and words, bytes."""
     return _HEADER.size + chunks * _ROW.itemsize + words * _WORD_BYTES
 
 
@@ -91,7 +91,7 @@ def decode_marks(data: bytes | memoryview, map_id: bytes, mapper: int, scan: int
     Parameters
     ----------
     data
-        Memory that nobody else writes to.
+        Memory that no other process writes to.
     map_id, mapper, scan
         What they must be for.
 
@@ -109,8 +109,8 @@ def decode_marks(data: bytes | memoryview, map_id: bytes, mapper: int, scan: int
         raise BadRequest(f"marks: version {major}.{minor}; this daemon reads {MARKS_VERSION[0]}")
     if (for_map, of, number) != (map_id, mapper, scan):
         raise BadRequest(f"marks: they are scan {number} of mapper {of}, not scan {scan} of mapper {mapper}")
-    if chunks > MOST_CHUNKS:
-        raise BadRequest(f"marks: {chunks} chunks; {MOST_CHUNKS} is the most one scan may touch")
+    if chunks > MAX_CHUNKS:
+        raise BadRequest(f"marks: {chunks} chunks; {MAX_CHUNKS} is the most one scan may touch")
     if count > 2 * chunks * WORDS or len(data) != marks_bytes(chunks, count):
         raise BadRequest(f"marks: {len(data)} bytes, not those of {chunks} chunks and {count} words")
     at = _HEADER.size

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a hit and a miss are worth, and which voxels count as occupied or free.
+"""Which points of a scan count, what a hit and a miss are worth, and which voxels are occupied or free.
 
 A voxel holds log-odds in thousandths, ``int16(1000 * ln(p / (1 - p)))`` cut towards zero, between two clamps;
 0 is *unknown*.  A hit adds, a miss takes away (Bonxai's ``ProbabilisticMap`` has the same in millionths).  A
@@ -15,20 +15,20 @@ import msgspec
 
 from shmmap.errors import ConfigError
 
-__all__ = ["UNIT", "Occupancy", "log_odds", "probability"]
+__all__ = ["UNIT", "Occupancy", "ScanCounts", "ScanFilter", "log_odds", "probability"]
 
 UNIT: Final = 1000
-HARDLY: Final = 1e-9
+NEAREST: Final = 1e-9
 """Probabilities nearer to 0 and 1 than this have log-odds that do not fit."""
 
 
 def log_odds(probability: float) -> int:
-    """Log-odds in thousandths, cut towards zero."""
+    """Return log-odds in thousandths, cut towards zero."""
     return int(UNIT * math.log(probability / (1.0 - probability)))
 
 
 def probability(log_odds: float) -> float:
-    """The probability that log-odds in thousandths stand for."""
+    """Return the probability that log-odds in thousandths stand for."""
     return 1.0 / (1.0 + math.exp(-log_odds / UNIT))
 
 
@@ -62,7 +62,7 @@ class Occupancy(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             value = getattr(self, name)
-            if not HARDLY <= value <= 1.0 - HARDLY:
+            if not NEAREST <= value <= 1.0 - NEAREST:
                 raise ConfigError(f"{name} = {value!r}: need a probability between 0 and 1", key=name)
         for name, upward in (("hit", True), ("clamp_max", True), ("miss", False), ("clamp_min", False)):
             value = getattr(self, name)
@@ -87,3 +87,49 @@ class Occupancy(msgspec.Struct, frozen=True):
     def thresholds(self) -> tuple[int, int]:
         """A voxel above the first is occupied, one below the second is free; log-odds in thousandths."""
         return log_odds(self.occupied_above), log_odds(self.free_below)
+
+
+class ScanFilter(msgspec.Struct, frozen=True):
+    """Which points of a scan count; metres, in the sensor's frame.
+
+    The defaults are those of Rolling-Bonxai's parameter file.
+
+    Attributes
+    ----------
+    min_range, max_range
+        Nearer points are left out; rays to further ones are cut at ``max_range`` and end in nothing.
+    min_z, max_z
+        Points below and above are left out.
+
+    Raises
+    ------
+    ConfigError
+        Nothing lies between two of them, or one is no finite number.
+    """
+
+    min_range: float = 0.5
+    max_range: float = 5.0
+    min_z: float = -2.0
+    max_z: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if not math.isfinite(value):
+                raise ConfigError(f"{name} = {value!r}: need a finite number of metres", key=name)
+        if self.min_range < 0.0:
+            raise ConfigError(f"min_range = {self.min_range!r}: it must not be negative", key="min_range")
+        for least, most in (("min_range", "max_range"), ("min_z", "max_z")):
+            low, high = getattr(self, least), getattr(self, most)
+            if not low < high:
+                raise ConfigError(f"{most} = {high!r}: need more than {least} = {low!r}", key=most)
+
+
+class ScanCounts(msgspec.Struct, frozen=True):
+    """Points of a scan in range, cut at the greatest range, and left out for each reason."""
+
+    near: int
+    far: int
+    too_near: int
+    outside_z: int
+    not_finite: int

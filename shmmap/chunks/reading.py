@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading chunks that somebody writes: a copy that is whole, and the voxels in it.
+"""Read chunks while they are written: a consistent copy, and the voxels in it.
 
 A reader copies a chunk by `os.pread`, and the copy counts if the chunk's ``sequence`` was even and the same
 before and after.  On x86 the processor keeps the order of reads; elsewhere a barrier of the kernel does.
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from shmmap.chunks.layout import HEADER_BYTES, MOST_BYTES, OUT_OF_SERVICE, STATE_AT, ChunkView, chunk_bytes
+from shmmap.chunks.layout import HEADER_BYTES, MAX_BYTES, OUT_OF_SERVICE, STATE_AT, ChunkView, chunk_bytes
 from shmmap.chunks.voxels import BRICK_VOXELS, ChunkKey, voxels_of
 from shmmap.errors import BadRequest, SegmentCorrupt, StaleHandle
 
@@ -93,7 +93,7 @@ def read_chunk(fd: int, name: str = "chunk") -> ChunkView | None:
             continue
         _fence()
         size = os.fstat(fd).st_size
-        if size > MOST_BYTES:
+        if size > MAX_BYTES:
             raise SegmentCorrupt(f"{name}: {size} bytes cannot be a chunk")
         data = os.pread(fd, size, 0)
         _fence()
@@ -112,7 +112,7 @@ def read_chunk(fd: int, name: str = "chunk") -> ChunkView | None:
 
 
 def select_voxels(view: ChunkView, kind: str) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
-    """Find the voxels of a kind in a chunk that nobody is writing.
+    """Find the voxels of a kind in a chunk that is not being written.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def select_voxels(view: ChunkView, kind: str) -> tuple[NDArray[np.int32], NDArra
 
 
 def _place_of_bricks(view: ChunkView) -> NDArray[np.int64]:
-    """Which of the chunk's 1024 bricks each one that it has is, in the order in which they lie."""
+    """Return the place of each brick among the chunk's 1024, in the order in which bricks lie."""
     there = np.flatnonzero(view.index)
     places = np.zeros(int(view.state["bricks"]), np.int64)
     places[view.index[there].astype(np.intp) - 1] = there

@@ -143,7 +143,7 @@ class Service:
         )  # fmt: skip
         self._operators = operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
-            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
+            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.on_disconnect,
             cache.events.minutes,
         )  # fmt: skip
         paging = Paging(
@@ -214,7 +214,7 @@ class Service:
                 memory.statistics.set("starting", 0)
                 memory.statistics.beat()
                 self._publish_epoch("started")
-                self._live.tell()
+                self._live.begin_events()
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
                 log.info(

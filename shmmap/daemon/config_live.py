@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from shmmap.chunks.layout import MOST_FRAME_BYTES
+from shmmap.chunks.layout import MAX_FRAME_BYTES
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.daemon.config_table import Allowed, near_hint, rows_of, setting, within
 from shmmap.errors import ConfigError
@@ -38,7 +38,7 @@ class LiveSettings:
     """Settings of one live map, which clients call ``name``.
 
     Those of voxels are fixed when the map is made, see `shmmap.chunks.occupancy.Occupancy`.  What stays in
-    memory, and for how long changes are there alone: see `shmmap.daemon.live.paging.records.Limits`.
+    memory, and for how long changes are there alone: see `shmmap.daemon.live.paging.durability.Limits`.
     """
 
     name: str
@@ -57,8 +57,8 @@ class LiveSettings:
         "map",
         "name of the map's frame",
         allowed=Allowed(
-            lambda frame: 0 < len(frame.encode()) <= MOST_FRAME_BYTES,
-            f"1 to {MOST_FRAME_BYTES} bytes of UTF-8",
+            lambda frame: 0 < len(frame.encode()) <= MAX_FRAME_BYTES,
+            f"1 to {MAX_FRAME_BYTES} bytes of UTF-8",
         ),
     )
     hit: float = setting(_OCCUPANCY.hit, "what one hit says, a probability above a half")

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from shmmap.chunks.scan_filter import ScanFilter
+from shmmap.chunks.occupancy import ScanFilter
 from shmmap.errors import InternalError
 
 __all__ = ["FILTER", "main"]

@@ -14,7 +14,7 @@ from shmmap.chunks.voxels import CHUNK_VOXELS, WORDS, ChunkKey
 from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
 
 if TYPE_CHECKING:
-    from shmmap.chunks.scan_filter import ScanFilter
+    from shmmap.chunks.occupancy import ScanFilter
 
 __all__ = ["Comparison", "UnboundedMap"]
 

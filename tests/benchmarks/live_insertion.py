@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 
 from shmmap.chunks.applying import UNDO_BYTES, ChunkWriter, UndoRecord
 from shmmap.chunks.layout import ChunkIdentity, new_header
-from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import decode_marks, encode_marks
-from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.occupancy import Occupancy, ScanFilter
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from tests.benchmarks.street_data import data_dir, street

@@ -391,7 +391,7 @@ def reading_disk(endpoint: str, readers: int, pipe: Any) -> None:
 SLOW_DISK = """
 import os, sys, time
 if any("live.worker" in word for word in sys.orig_argv):
-    from shmmap.daemon.live import folder
+    from shmmap.daemon.live.disk import folder
     read = folder.FolderToRead.read
     def slow(self, name, *arguments, **options):
         if name.endswith(".chunk") and os.path.exists(__file__ + ".slow"):

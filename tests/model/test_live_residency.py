@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.paging.durability import Chunk, Scan, State
 from shmmap.daemon.live.paging.key_index import EVERYWHERE
-from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.paging.residency import RETRY_S, Residency
+from shmmap.daemon.live.paging.residency import RETRY_S, Limits, Residency
 
 NEW = 10
 MOST = 60
@@ -65,7 +65,7 @@ class LiveMap(RuleBasedStateMachine):
     def begin(self, chunks: int, *, reserve: bool, active: int, radius: int, waiting: int, most: int) -> None:
         budget = chunks * MOST
         self.limits = Limits(
-            budget_bytes=budget, reserve_bytes=budget * 3 // 4 if reserve else 0, most_chunks=most,
+            budget_bytes=budget, reserve_bytes=budget * 3 // 4 if reserve else 0, max_chunks=most,
             most_active=active, radius=radius, waiting_bytes=waiting, loads=2, saves=2, checkpoint_s=5.0,
         )  # fmt: skip
         self.map = Residency(self.limits, new_bytes=NEW)
@@ -216,7 +216,7 @@ class LiveMap(RuleBasedStateMachine):
         assert self.map.chunk_bytes + self.map.beside_bytes <= self.limits.budget_bytes
         assert list(self.map.index.part(None, EVERYWHERE, 10**9)[0]) == sorted(self.map.chunks)
         held = len(sizes) + len(loading)
-        assert not self.limits.most_chunks or held <= self.limits.most_chunks
+        assert not self.limits.max_chunks or held <= self.limits.max_chunks
         around = [center for one in (1, 2) if (center := self.map.windows.center(one)) is not None]
         assert set(self.map.windows.near) == {
             ChunkKey(*key)
@@ -244,7 +244,7 @@ class LiveMap(RuleBasedStateMachine):
                     assert scan.number not in scans or scan.number in self.safe[key].scans
 
     def teardown(self) -> None:
-        """Left alone, with a disk that works and readers that let go, all of it comes to rest on the disk."""
+        """Left alone, with a disk that works and lists that are released, all comes to rest on the disk."""
         if not hasattr(self, "map"):
             return
         for _ in range(2000):
@@ -271,9 +271,9 @@ class LiveMap(RuleBasedStateMachine):
         else:
             raise AssertionError("it never comes to rest")
         assert {key: content.scans for key, content in self.disk.items() if content.scans} == self.reference
-        told = {id(scan) for scan in self.durable}
-        assert all(id(scan) in told or scan.durable for scan in self.scans)
-        assert len(told) == len(self.durable), "each is told once"
+        reported = {id(scan) for scan in self.durable}
+        assert all(id(scan) in reported or scan.durable for scan in self.scans)
+        assert len(reported) == len(self.durable), "each is reported once"
         for chunk in self.map.chunks.values():
             assert chunk.state in (State.CLEAN, State.LOADING)
 

@@ -205,7 +205,7 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
     one.start()
     with shmmap.connect(one.endpoint) as client:
         assert held(client.live("lidar")) == before
-    assert "somebody else's files left alone count=2" in one.log
+    assert "foreign files ignored count=2" in one.log
     one.stop()
     for path in theirs[:2]:
         assert Path(path).read_bytes() == content

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The disk of a live map is full: mapping goes on in memory, it is told, and what is there is saved later."""
+"""The disk of a live map is full: mapping goes on in memory, status shows it, and all is saved later."""
 
 from __future__ import annotations
 
@@ -48,5 +48,5 @@ def test_a_disk_that_is_full(
         status = live.status()
         assert (status.problem, status.dirty, status.saving) == ("", 0, 0)
         assert held(live, "disk") == reference([*scans, scans[0]])
-    assert one.log.count("chunk not saved") < 20, "it is tried again and again, and told once"
+    assert one.log.count("chunk not saved") < 20, "it is tried again and again, and logged once"
     assert one.stop() == 0

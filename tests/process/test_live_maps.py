@@ -284,21 +284,21 @@ def test_a_daemon_without_live_maps_says_so(daemon: DaemonFactory, divided_map: 
         client.live("lidar")
 
 
-def test_requests_that_wait_when_the_worker_dies_are_told(live_daemon: LiveDaemon) -> None:
+def test_requests_that_wait_when_the_worker_dies_are_refused(live_daemon: LiveDaemon) -> None:
     one = live_daemon()
     with shmmap.connect(one.endpoint) as client:
         client.live("lidar")
         worker = worker_of(one)
         os.kill(worker, signal.SIGSTOP)
         asked = threading.Event()
-        told: list[Exception] = []
+        refused: list[Exception] = []
 
         def ask() -> None:
             asked.set()
             try:
                 client.session.ask(lambda n: messages.LiveOpen(n, "lidar"), messages.LiveOpened, quiet_s=60.0)
             except LiveInterrupted as error:
-                told.append(error)
+                refused.append(error)
 
         thread = threading.Thread(target=ask)
         thread.start()
@@ -310,7 +310,7 @@ def test_requests_that_wait_when_the_worker_dies_are_told(live_daemon: LiveDaemo
             assert second.metadata() is not None  # nobody else waits for the worker
         os.kill(worker, signal.SIGKILL)
         thread.join()
-        assert len(told) == 1
+        assert len(refused) == 1
     with shmmap.connect(one.endpoint, timeout=60.0) as client:
         assert client.live("lidar").name == "lidar"
 

@@ -149,7 +149,7 @@ def test_events_tell_of_changes_and_of_the_worker(
     assert re.search(r"  live      the live worker ended \(1 time by now\)", tail)
 
 
-def test_a_damaged_file_is_told_and_named(
+def test_a_damaged_file_is_reported_and_named(
     live_daemon: LiveDaemon, listen: Callable[[DaemonProcess], EventStream], tmp_path: Path
 ) -> None:
     one = live_daemon()

@@ -14,7 +14,7 @@ import time
 
 from shmmap.chunks.applying_kernels import begin_writing, end_writing
 from shmmap.chunks.layout import chunk_bytes
-from shmmap.chunks.mapping import map_chunk, view_at
+from shmmap.daemon.live.chunk_memory import map_chunk, view_at
 
 BETWEEN_S = 50e-6
 """About as long as from one scan to the next, seen from a chunk that is copied in 5 us."""
@@ -24,7 +24,7 @@ def main() -> None:
     """Write until the end."""
     path, bricks = sys.argv[1], int(sys.argv[2])
     fd = os.open(path, os.O_RDWR)
-    view = view_at(map_chunk(fd, path, writable=True), chunk_bytes(bricks))
+    view = view_at(map_chunk(fd, path), chunk_bytes(bricks))
     sequence = view.state["sequence"].reshape(1)
     number = 0
     begin_writing(sequence)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import shmmap
-from shmmap.chunks.marking import ScanFilter
+from shmmap.chunks.occupancy import ScanFilter
 from tests.benchmarks.street_data import street
 from tests.support.daemon_process import DaemonProcess
 

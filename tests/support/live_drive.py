@@ -10,8 +10,6 @@ given up and the most bytes that all took, and ``done``.
 from __future__ import annotations
 
 import math
-import mmap
-import os
 import sys
 import time
 from collections.abc import Iterable
@@ -21,18 +19,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
 from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView, check_consistent
-from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import ScanFilter
 from shmmap.chunks.voxels import ChunkKey, voxels_of
-from shmmap.daemon.live.adopting import adopt
 from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.live_map import LiveMap
-from shmmap.daemon.live.map_files import MapFiles, MapSettings
-from shmmap.daemon.live.paging.records import Limits
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.daemon.live.disk.map_record import MapSettings
+from shmmap.daemon.live.paged_map import Observer, PagedMap
+from shmmap.daemon.live.paging.durability import Scan
+from shmmap.daemon.live.paging.residency import Limits
 
 RESOLUTION = 0.2
 SETTINGS = MapSettings(resolution=RESOLUTION)
@@ -60,27 +59,38 @@ def marked(scans: int = SCANS) -> list[Marks]:
     return [marker.mark(points, pose)[0] for points, pose in drive(scans)]
 
 
-def record_in(shm: Path, name: str, nbytes: int) -> mmap.mmap:
-    """Something in shared memory that outlives whoever writes it, made of zeros if there is none."""
-    fd = os.open(shm / name, os.O_RDWR | os.O_CREAT, 0o600)
-    os.ftruncate(fd, nbytes)
-    data = mmap.mmap(fd, nbytes)
-    os.close(fd)
-    return data
+class Observed:
+    """Notes what happens to a map; it may print it, too."""
+
+    def __init__(self, *, prints: bool = False) -> None:
+        self.gone: list[ChunkKey] = []
+        self._prints = prints
+
+    def scan_applied(self, scan: Scan) -> None:
+        if self._prints:
+            print(f"applied {scan.number}", flush=True)
+
+    def scan_durable(self, scan: Scan) -> None:
+        if self._prints:
+            print(f"durable {scan.number}", flush=True)
+
+    def chunk_changed(self, key: ChunkKey) -> None:
+        """Nothing is noted."""
+
+    def chunk_gone(self, key: ChunkKey) -> None:
+        self.gone.append(key)
 
 
-def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tuple[LiveMap, Folder]:
-    """The map, with what an earlier process left."""
+def opened(
+    shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0, observer: Observer | None = None
+) -> tuple[PagedMap, Folder]:
+    """Open the map, with what a previous process left."""
     folder = Folder(disk)
     limits = Limits(budget, linger_s=0.05, checkpoint_s=checkpoint_s, waiting_bytes=1)
-    made = LiveMap(
-        MapFiles(folder, SETTINGS),
-        ChunkMemory(str(shm), live_prefix("test", "lidar")),
-        UndoRecord(record_in(shm, "undo", UNDO_BYTES)),
-        limits,
-    )
+    memory = ChunkMemory(str(shm), live_prefix("test", "lidar"))
+    made = PagedMap(MapFiles(folder, SETTINGS), memory, limits, observer or Observed())
     try:
-        adopt(made, time.monotonic())
+        made.adopt(time.monotonic())
     except OSError:
         made.close()
         folder.close()
@@ -88,7 +98,7 @@ def opened(shm: Path, disk: Path, budget: int, checkpoint_s: float = 1.0) -> tup
     return made, folder
 
 
-def voxels_on_disk(files: MapFiles, made: LiveMap) -> dict[Voxel, int]:
+def voxels_on_disk(files: MapFiles, made: PagedMap) -> dict[Voxel, int]:
     """All known voxels, by the chunks' files; every one of them can be read."""
     found: dict[Voxel, int] = {}
     for key in files.rows:
@@ -106,13 +116,10 @@ def voxels_on_disk(files: MapFiles, made: LiveMap) -> dict[Voxel, int]:
 def main() -> None:
     """Take in the drive from a scan on, and save everything."""
     shm, disk = map(Path, sys.argv[1:3])
-    made, folder = opened(shm, disk, int(sys.argv[3]), float(sys.argv[4]))
+    observer = Observed(prints=True)
+    made, folder = opened(shm, disk, int(sys.argv[3]), float(sys.argv[4]), observer)
     first = int(sys.argv[5])
-    made.on_applied = lambda scan: print(f"applied {scan.number}", flush=True)
-    made.on_durable = lambda scan: print(f"durable {scan.number}", flush=True)
     waiting = list(enumerate(marked(), 1))[first - 1 :]
-    given_up: list[ChunkKey] = []
-    made.on_gone = given_up.append
     most = 0
     poses = [pose for _, pose in drive()]
     while waiting or not made.all_durable:
@@ -120,13 +127,13 @@ def main() -> None:
             number, marks = waiting.pop(0)
             made.move("mapper", tuple(poses[number - 1][:3, 3].tolist()))
             made.add(1, number, marks, 1)
-        made.turn(time.monotonic(), time.time_ns(), save_all=not waiting)
+        made.run_turn(time.monotonic(), time.time_ns(), save_all=not waiting)
         most = max(most, made.residency.chunk_bytes + made.residency.beside_bytes)
         made.wait(0.05)
     made.files.write_manifest()
     made.close()
     folder.close()
-    print(f"evicted {len(given_up)}\nmost {most}\ndone", flush=True)
+    print(f"evicted {len(observer.gone)}\nmost {most}\ndone", flush=True)
 
 
 # -- a rolling map that is right because it is slow: one dictionary, one voxel after the other, no chunks

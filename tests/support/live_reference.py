@@ -14,8 +14,9 @@ from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.client.live.live_map import ChunkInfo, LiveMap
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.map_files import MapFiles, MapSettings
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.daemon.live.disk.map_record import MapSettings
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, SlowOccupancy, Voxel, drive

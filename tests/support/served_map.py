@@ -8,28 +8,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
 from shmmap.chunks.marks import Marks, encode_marks
 from shmmap.chunks.voxels import voxels_of
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.live.adopting import adopt
 from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.live_map import LiveMap
-from shmmap.daemon.live.map_files import MapFiles
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.messages import Ask
-from shmmap.daemon.live.paging.records import Limits
-from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
+from shmmap.daemon.live.paging.residency import Limits
 from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.served_map import ServedMap
-from shmmap.daemon.live.worker.voxel_lists import VoxelLists
 from shmmap.protocol import live as messages
 from tests.support.daemon_process import Deadline
-from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel, record_in
+from tests.support.live_drive import RESOLUTION, SETTINGS, Voxel
 
 
 class Served:
-    """One life of a map's worker.
+    """One run of a map's worker.
 
     Attributes
     ----------
@@ -45,17 +40,14 @@ class Served:
         self.answers: dict[int, Any] = {}
         self._files = 0
         self._folder = Folder(disk)
-        self.live = LiveMap(
-            MapFiles(self._folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")),
-            UndoRecord(record_in(shm, "undo", UNDO_BYTES)), Limits(budget_bytes, **limits),
-        )  # fmt: skip
-        lists = VoxelLists(self.live, str(shm), 0o600, -1)
-        lists.remove_all()
-        adopt(self.live, 0.0)
         self.marks = MarksDirectory(str(shm / "marks"))
         settings = LiveSettings("lidar", str(disk), resolution=RESOLUTION)
-        applied = AppliedScans(record_in(shm, "applied", APPLIED_BYTES))
-        self.map = ServedMap(settings, self.live, lists, self.marks, applied, self._answer)
+        files, memory = MapFiles(self._folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar"))
+        self.map = ServedMap(
+            settings, files, memory, Limits(budget_bytes, **limits), self.marks, self._answer
+        )
+        self.live = self.map.live
+        self.map.adopt(0.0)
 
     def _answer(self, ticket: int, reply: Any) -> None:
         assert ticket not in self.answers, "nothing is answered twice"
@@ -86,7 +78,7 @@ class Served:
     def turn(self, *, save_all: bool = False) -> None:
         """A turn, some time after the last one."""
         self.now_s += 0.2
-        self.map.turn(self.now_s, save_all=save_all)
+        self.map.run_turn(self.now_s, save_all=save_all)
 
     def until(self, done: Callable[[], object], *, save_all: bool = False) -> None:
         """Turn until something is so."""
@@ -101,7 +93,7 @@ class Served:
         return self.answers[ticket]
 
     def end(self, *, keep: bool = False) -> None:
-        """End this life; with ``keep`` what is in memory is left to the next one."""
+        """End this run; with ``keep`` what is in memory is left to the next one."""
         if not keep:
             self.until(lambda: self.map.is_saved, save_all=True)
         self.map.end(keep=keep)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxels and rays, looked up in copies of chunks; the daemon says which chunks there are.
+"""Look up voxels and rays in copies of chunks; the daemon lists which chunks there are.
 
 A chunk is opened, read and closed each time that it is looked at: nothing is held that its writer might wait
 for, or whose memory it could not free.
@@ -22,12 +22,12 @@ from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 
 __all__ = ["ChunkInfo", "ChunkReader", "Place"]
 
-MOST_COPIES: Final = 512
+MAX_COPIES: Final = 512
 """Chunks of which copies are kept; the longest unused go first."""
-VOXELS_AT_ONCE: Final = 1 << 20
-"""Of rays, that are looked up at a time."""
+VOXELS_PER_STEP: Final = 1 << 20
+"""Voxels of rays that are looked up at a time."""
 ROUNDS: Final = 8
-"""How often a chunk that is gone before it is read is looked for again."""
+"""How often to look again for a chunk that is gone before it is read."""
 _FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
@@ -36,19 +36,17 @@ class ChunkInfo(msgspec.Struct, frozen=True):
 
     Attributes
     ----------
-    key
-        Which one.
     state
         ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, or ``saved``:
         on disk alone.
     active, occupied, free
         Known voxels, and of these occupied and free ones.
     bytes
-        Its memory, or its file.
+        Of its memory, or of its file.
     version
         Rises with each scan that it takes in.
     generation
-        Another one each time that it comes into memory; 0 where it is not.
+        Changes each time that it comes into memory; 0 where it is not.
     """
 
     key: ChunkKey
@@ -62,7 +60,7 @@ class ChunkInfo(msgspec.Struct, frozen=True):
 
 
 class Place(NamedTuple):
-    """Where the chunks of a map are, and what they say; ``prefix`` is what their paths begin with."""
+    """Where the chunks of a map are: their paths begin with ``prefix``; and what they must be."""
 
     prefix: str
     map_id: bytes
@@ -71,7 +69,7 @@ class Place(NamedTuple):
 
 
 Changed: TypeAlias = tuple[dict[ChunkKey, ChunkInfo], list[ChunkKey], int, bool]
-"""Chunks that changed, and that left memory; number of the last change; whether the one before was known."""
+"""Chunks that changed; those that left memory; the number of the last change; whether ``since`` was known."""
 
 
 class _Copy(NamedTuple):
@@ -89,9 +87,9 @@ class ChunkReader:
     Parameters
     ----------
     place
-        Gives where they are now.
+        Returns where they are now.
     changes
-        Given the number of a change, gives what came after it; 0: everything.
+        Returns what came after the change of a number; 0: everything.
     """
 
     def __init__(self, place: Callable[[], Place], changes: Callable[[int], Changed]) -> None:
@@ -102,18 +100,18 @@ class ChunkReader:
         self._change = 0
 
     def look_up(self, xyz: NDArray[np.float64]) -> NDArray[np.int16]:
-        """Log-odds of the voxels in which points lie, (N,) thousandths; 0 where nothing is known."""
+        """Return log-odds of the voxels in which points lie, (N,) thousandths; 0 where nothing is known."""
         self._refresh()
         return self._look_up(voxel_indices(xyz, self._place().resolution))
 
     def first_hits(self, origins: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres to the middle of the first occupied voxel of each ray, (N,); infinity for none."""
+        """Return metres to the centre of the first occupied voxel of each ray, (N,); infinity for none."""
         resolution = self._place().resolution
         first, last = voxel_indices(origins, resolution), voxel_indices(ends, resolution)
         steps = np.abs(last.astype(np.int64) - first).max(axis=1, initial=0)
         found = np.full(len(ends), np.inf)
         self._refresh()
-        size = max(1, VOXELS_AT_ONCE // (int(steps.max(initial=0)) + 1))
+        size = max(1, VOXELS_PER_STEP // (int(steps.max(initial=0)) + 1))
         for begin in range(0, len(ends), size):
             part = slice(begin, begin + size)
             found[part] = self._hits(origins[part], first[part], last[part], steps[part])
@@ -131,13 +129,12 @@ class ChunkReader:
         self._change = change
 
     def _read(self, key: ChunkKey) -> ChunkView | None:
-        """A chunk in memory, as it is now; None where there is none.
+        """Return a chunk in memory as it is now; None where there is none.
 
         Raises
         ------
         StaleHandle
-            It is gone, or its writer died in the middle of a change: the next one mends it, or has another
-            chunk in its place.
+            It is gone, or its writer died in the middle of a change: the next writer repairs or replaces it.
         SegmentError
             This user may not read it.
         SegmentCorrupt
@@ -157,7 +154,7 @@ class ChunkReader:
             raise SegmentError(f"{path}: {error.strerror}", hint="see `shmmap doctor`") from error
         try:
             inode = os.fstat(fd).st_ino
-            # not its version: what a writer had changed when it died is undone, and may come again otherwise
+            # not its version: a change that a writer's death undid may come again with other content
             if copy is None or copy[:3] != (row.generation, inode, sequence_of(fd, path)):
                 view = read_chunk(fd, path)
                 if view is None:
@@ -175,7 +172,7 @@ class ChunkReader:
         finally:
             os.close(fd)
         self._copies[key] = copy  # the last used comes last
-        while len(self._copies) > MOST_COPIES:
+        while len(self._copies) > MAX_COPIES:
             self._copies.pop(next(iter(self._copies)))
         return copy.view
 
@@ -198,7 +195,7 @@ class ChunkReader:
         return found
 
     def _now(self, key: ChunkKey) -> ChunkView | None:
-        """A chunk in memory, wherever it is now; None where there is none."""
+        """Return a chunk in memory, in its newest generation; None where there is none."""
         for _ in range(ROUNDS):
             try:
                 return self._read(key)

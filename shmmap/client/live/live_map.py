@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`LiveMap`: what a program sees of a map that others write, and where it asks to write itself."""
+"""`LiveMap`: a program's view of a live map, which others may be writing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from shmmap.protocol import live as messages
 from shmmap.protocol.areas import BoxMessage, area_to_message
 
 if TYPE_CHECKING:
-    from shmmap.chunks.marking import ScanFilter
+    from shmmap.chunks.occupancy import ScanFilter
     from shmmap.client.live.mapper import LiveMapper
 
 __all__ = ["ChunkInfo", "LiveMap", "Sphere", "Voxels"]
@@ -34,17 +34,17 @@ __all__ = ["ChunkInfo", "LiveMap", "Sphere", "Voxels"]
 R = TypeVar("R")
 
 LIST_S: Final = 60.0
-"""How long putting voxels together may take, beside what any request may."""
+"""How long a list of voxels may take, beyond the timeout of any request."""
 SAVE_S: Final = 300.0
-MOST_RAY_VOXELS: Final = 100_000
-"""Along an axis, of a ray that is followed: 5 km of voxels of 5 cm take about half a second."""
-LISTS: Final = 4
-"""Lists of voxels that are asked for, one after the other, until one is there while it is read."""
+MAX_RAY_VOXELS: Final = 100_000
+"""Length of a ray along an axis: 5 km of voxels of 5 cm take about half a second."""
+LIST_TRIES: Final = 4
+"""How often a list of voxels is requested until one is not removed while it is read."""
 _VOXEL_BYTES: Final = 14
 
 
 class Sphere(msgspec.Struct, frozen=True):
-    """All voxels whose middles are within ``radius`` metres of a place in the map's frame."""
+    """All voxels whose centres are within ``radius`` metres of a place in the map's frame."""
 
     x: float
     y: float
@@ -65,7 +65,7 @@ class Voxels:
     resolution
         Edge of a voxel, metres.
     change
-        Number of the map's last change before: send it as ``since`` to get what came after.
+        Number of the map's last change before: pass it as ``since`` to get what came after.
     """
 
     indices: NDArray[np.int32]
@@ -78,12 +78,12 @@ class Voxels:
 
     @property
     def xyz(self) -> NDArray[np.float64]:
-        """Their middles, (N, 3) metres in the map's frame."""
+        """Their centres, (N, 3) metres in the map's frame."""
         return voxel_centers(self.indices, self.resolution)
 
     @property
     def probability(self) -> NDArray[np.float64]:
-        """How surely each is occupied, (N,), between 0 and 1."""
+        """Probability that each is occupied, (N,), between 0 and 1."""
         odds = self.log_odds.astype(np.float64) / 1000.0
         chance: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-odds))
         return chance
@@ -124,7 +124,7 @@ class LiveMap:
 
     @property
     def occupancy(self) -> Occupancy:
-        """What a hit and a miss are worth, as it was set when the map was made."""
+        """What a hit and a miss are worth, as set when the map was made."""
         return Occupancy(*self._opened.probabilities)
 
     def __repr__(self) -> str:
@@ -143,13 +143,13 @@ class LiveMap:
         Parameters
         ----------
         name
-            Which mapper this is, at most 64 characters: each program that maps has its own, and keeps it.
+            Name of the mapper, at most 64 characters: each program that maps has its own, and keeps it.
         scan_filter
             Which points count.
         resume
-            For a program that gives the same scans in the same order each time, from files: the next scan is
-            the one after `LiveMapper.applied`, which the program begins with. Should it begin earlier,
-            scans get numbers that they did not have, and count again.
+            For a program that adds the same scans in the same order each time, from files: it must go on with
+            the scan after `LiveMapper.applied`. If it begins before that, scans get other numbers, and count
+            again.
         timeout_s
             How long a scan may take until it is applied, a restart of the daemon included.
 
@@ -168,12 +168,12 @@ class LiveMap:
         )
 
     def move_to(self, x: float, y: float, z: float) -> None:
-        """Say where this process is, metres in the map's frame: chunks around it stay in memory."""
+        """Set where this process is, metres in the map's frame: chunks around it stay in memory."""
         place = _points("position", [x, y, z])[0].tolist()
         self._ask(lambda n: messages.LiveMove(n, self.name, tuple(place)), messages.LiveMoved)
 
     def save(self, *, timeout_s: float = SAVE_S) -> int:
-        """Have everything that is applied by now saved; returns how many files there are.
+        """Save everything that has been applied; return how many files there are.
 
         Raises
         ------
@@ -187,7 +187,7 @@ class LiveMap:
         return reply.files
 
     def status(self) -> messages.LiveMapRow:
-        """How the map is: chunks, memory, files, problems."""
+        """Return the state of the map: chunks, memory, files, problems."""
         reply = self._ask(messages.LiveList, messages.LiveListed)
         for row in reply.maps:
             if row.name == self.name:
@@ -197,21 +197,21 @@ class LiveMap:
     # --- chunks ---------------------------------------------------------------------------------
 
     def chunks(self, area: geometry.Box | Sphere | None = None, *, saved: bool = False) -> list[ChunkInfo]:
-        """List chunks in memory, and on their way into it or out of it, in the order of their keys.
+        """List chunks that are in memory, or being loaded or saved, in the order of their keys.
 
         Parameters
         ----------
         area
             Only chunks that touch it.
         saved
-            Those that are on disk alone, too.
+            Also list those that are on disk alone.
         """
         return list(self._pages(area, 0, saved=saved)[0].values())
 
     def _pages(
         self, area: geometry.Box | Sphere | None, since: int, *, saved: bool = False
     ) -> tuple[dict[ChunkKey, ChunkInfo], list[ChunkKey], int, bool]:
-        """What changed after ``since``, what left, the number to ask with next time, if that was known."""
+        """Return chunks that changed after ``since`` and that left, the last change, and if it is known."""
         message = _area(area)
         found: dict[ChunkKey, ChunkInfo] = {}
         gone: list[ChunkKey] = []
@@ -253,18 +253,18 @@ class LiveMap:
         scope: str = "memory",
         since: int = 0,
     ) -> Voxels:
-        """Voxels of an area, which the daemon puts together.
+        """List the voxels of an area; the daemon puts them together.
 
         Parameters
         ----------
         kind
             ``occupied`` or ``free``.
         area
-            Only voxels whose middles lie in it; None: all.
+            Only voxels whose centres lie in it; None: all.
         scope
             ``memory``, ``disk`` (as last saved), or ``all``: what is not in memory as last saved.
         since
-            `Voxels.change` of an earlier answer: only voxels of chunks that have changed since.
+            `Voxels.change` of a previous list: only voxels of chunks that have changed since.
 
         Raises
         ------
@@ -276,8 +276,8 @@ class LiveMap:
         def ask(request: int) -> messages.LiveRequest:
             return messages.LiveVoxels(request, self.name, kind, message, scope, since)
 
-        for _ in range(LISTS - 1):
-            with contextlib.suppress(StaleHandle):  # its maker ended, or this process was stopped for long
+        for _ in range(LIST_TRIES - 1):
+            with contextlib.suppress(StaleHandle):  # the worker ended, or this process was stopped for long
                 return self._listed(ask)
         return self._listed(ask)
 
@@ -289,15 +289,15 @@ class LiveMap:
             self._ask(lambda n: messages.LiveRelease(n, self.name, reply.segment), messages.LiveReleased)
 
     def occupied(self, area: geometry.Box | Sphere | None = None) -> NDArray[np.float64]:
-        """Middles of the occupied voxels in memory, (N, 3) metres in the map's frame."""
+        """Return centres of the occupied voxels in memory, (N, 3) metres in the map's frame."""
         return self.voxels("occupied", area).xyz
 
     def free(self, area: geometry.Box | Sphere | None = None) -> NDArray[np.float64]:
-        """Middles of the free voxels in memory, (N, 3) metres in the map's frame."""
+        """Return centres of the free voxels in memory, (N, 3) metres in the map's frame."""
         return self.voxels("free", area).xyz
 
     def log_odds(self, xyz: ArrayLike) -> NDArray[np.int16]:
-        """What is known of the voxels in which points lie, from chunks that are in memory.
+        """Return what is known of the voxels in which points lie, from chunks in memory.
 
         Parameters
         ----------
@@ -321,7 +321,7 @@ class LiveMap:
         return self._opened.free_below
 
     def first_hits(self, origins: ArrayLike, ends: ArrayLike) -> NDArray[np.float64]:
-        """How far rays get: the distance to the first occupied voxel on each.
+        """Return how far rays get: the distance to the first occupied voxel on each.
 
         The walk is that of mapping: a ray visits as many voxels as its longest axis has steps.
 
@@ -332,8 +332,8 @@ class LiveMap:
 
         Returns
         -------
-        (N,) float64, metres from the origin to the middle of the first occupied voxel; infinity where there
-        is none on the way, the last voxel included.
+        (N,) float64, metres from the origin to the centre of the first occupied voxel; infinity where there
+        is none up to the last voxel, which is included.
 
         Raises
         ------
@@ -348,8 +348,8 @@ class LiveMap:
             )
         origins = np.broadcast_to(origins, ends.shape)
         longest = float(np.abs(ends - origins).max(initial=0.0))
-        if not longest <= MOST_RAY_VOXELS * self.resolution:  # nor NaN
-            most = f"{MOST_RAY_VOXELS * self.resolution:.6g} m for voxels of {self.resolution} m"
+        if not longest <= MAX_RAY_VOXELS * self.resolution:  # nor NaN
+            most = f"{MAX_RAY_VOXELS * self.resolution:.6g} m for voxels of {self.resolution} m"
             raise BadRequest(
                 f"a ray is {longest:.6g} m long; at most {most}", hint="cut it where the map ends"
             )
@@ -357,7 +357,7 @@ class LiveMap:
 
 
 def _points(what: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Places as (N, 3); BadRequest where they are none, or masked."""
+    """Return places as (N, 3); raise BadRequest where they are none, or masked."""
     try:
         if np.ma.is_masked(values):
             raise ValueError("some are masked")
@@ -383,7 +383,7 @@ def _area(area: geometry.Box | Sphere | None) -> messages.LiveArea | None:
 
 
 def _metres(*values: float) -> tuple[float, ...]:
-    """Numbers as they can be sent; BadRequest where one is greater than any float."""
+    """Return numbers as they can be sent; raise BadRequest where one is greater than any float."""
     try:
         return tuple(float(value) for value in values)
     except OverflowError as error:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`LiveMapper`: scans become marks here, and the daemon's live worker puts them into the map, each once.
 
-Marking is done by whoever calls `LiveMapper.add`; sending, and waiting for the answer, by a thread with a
-session of its own.  What the daemon has not answered is sent again when it, or its worker, has come back.
+The thread that calls `LiveMapper.add` marks; another one, with a session of its own, sends and waits for the
+answers.  What the daemon has not answered is sent again when it, or its worker, has come back.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numpy as np
 
 from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
 from shmmap.chunks.marks import encode_marks
+from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import SERVED_PAUSE_S, Connection, until_served
 from shmmap.client.session import Session
@@ -42,11 +43,11 @@ if TYPE_CHECKING:
 __all__ = ["LiveMapper"]
 
 PASSING: Final = (LiveInterrupted, Busy, DaemonUnreachable)
-"""What passes by itself."""
-ON_THE_WAY: Final = 3
-"""Scans that are marked and not answered; `LiveMapper.add` waits when there are more."""
+"""Errors that pass by themselves."""
+MAX_UNANSWERED: Final = 3
+"""Scans that are marked and not answered; `LiveMapper.add` waits when there are as many."""
 LAST_S: Final = 1.0
-"""How long what is on the way may take when nobody has closed the mapper."""
+"""How long unanswered scans may take at the end of a program that has not closed the mapper."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +60,12 @@ class _Marked:
 
 
 class _Sender:
-    """Sends marks in the order in which they come, each until it is answered; has a thread for it.
+    """Sends marks in order, each until it is answered, in a thread of its own.
 
     Attributes
     ----------
     opened
-        What the daemon said of the map.
+        The daemon's description of the map.
     applied, durable
         Numbers of scans, as of the last answer.
     error
@@ -72,7 +73,7 @@ class _Sender:
     trouble
         Why the next one is not in the map yet: it is sent again and again.
     changed
-        Told of changes of the three, and of `waiting`.
+        Notified when one of these changes.
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class _Sender:
         self._thread.start()
 
     def put(self, scan: _Marked) -> None:
-        """Send a scan when those before are answered; waits while too many are on the way.
+        """Send a scan when those before are answered; wait while too many are unanswered.
 
         Raises
         ------
@@ -105,7 +106,7 @@ class _Sender:
         """
         with self.changed:
             taken = self.changed.wait_for(
-                lambda: len(self._waiting) < ON_THE_WAY or self.error is not None, self._timeout_s
+                lambda: len(self._waiting) < MAX_UNANSWERED or self.error is not None, self._timeout_s
             )
             if self.error is not None:
                 raise self.error
@@ -117,15 +118,15 @@ class _Sender:
             self._waiting.append(scan)
             self.changed.notify_all()
 
-    def end(self, *, patience_s: float | None = None) -> None:
-        """Send what is on the way, then end the session; waits for that, at most so long."""
+    def end(self, *, timeout_s: float | None = None) -> None:
+        """Send what is unanswered, then end the session; wait for that, for at most these seconds."""
         with self.changed:
             self._ending = True
             self.changed.notify_all()
-        self._thread.join(patience_s)
+        self._thread.join(timeout_s)
 
     def save(self, timeout_s: float) -> int:
-        """Have everything saved, when all is applied; returns the number up to which scans are durable."""
+        """Have everything saved, when all is applied; return the number up to which scans are durable."""
         reply = until_served(
             lambda: self._connection.ask(
                 messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
@@ -133,7 +134,7 @@ class _Sender:
             ),
             timeout_s,
         )  # fmt: skip
-        # a worker that began anew does not know what came before, and has it saved all the same
+        # a restarted worker does not know what came before, and has it saved all the same
         self.durable = max(reply.scan, self.applied)
         return self.durable
 
@@ -172,7 +173,7 @@ class _Sender:
         )
 
     def _send(self, scan: _Marked) -> int:
-        """Send a scan until it is answered; returns what is durable."""
+        """Send a scan until it is answered; return the scan up to which all are durable."""
         end_s = time.monotonic() + self._timeout_s
         while True:
             try:
@@ -187,7 +188,7 @@ class _Sender:
                         self.opened = self._open()
 
     def _try(self, scan: _Marked, timeout_s: float) -> int:
-        name = f"{self._connection.welcome.session:x}.{secrets.randbits(63)}"  # nobody can be there before
+        name = f"{self._connection.welcome.session:x}.{secrets.randbits(63)}"  # no other user can guess it
         path = os.path.join(self.opened.marks_dir, name)
         try:
             _write(path, scan.data)
@@ -227,8 +228,8 @@ class LiveMapper:
         sender = self._sender = _Sender(
             session.path, live_map, name, frame_id, session.timeout_s, timeout_s, resume=resume
         )
-        # also when nobody calls close(), and at the end of the program
-        self._end = weakref.finalize(self, sender.end, patience_s=LAST_S)
+        # also without a call of close(), and at the end of the program
+        self._end = weakref.finalize(self, sender.end, timeout_s=LAST_S)
         self._marker = Marker(sender.opened.resolution, scan_filter)
         self._last = sender.applied
 
@@ -239,12 +240,12 @@ class LiveMapper:
         self.close()
 
     def close(self) -> None:
-        """Send what is on the way, wait until it is applied, and end the session; raises no error."""
+        """Send what is unanswered, wait until it is applied, and end the session; raise no error."""
         if self._end.detach() is not None:
             self._sender.end()
 
     def add(self, points: ArrayLike, pose: ArrayLike) -> int:
-        """Add a scan; waits while earlier ones are still on the way.
+        """Add a scan; wait while too many are unanswered.
 
         Parameters
         ----------
@@ -295,7 +296,7 @@ class LiveMapper:
         return self._sender.durable
 
     def wait_applied(self, timeout_s: float | None = None) -> int:
-        """Wait until every scan that was added is applied; returns the last one's number.
+        """Wait until every scan that was added is applied; return the last one's number.
 
         Raises
         ------
@@ -304,20 +305,20 @@ class LiveMapper:
         ShmmapError
             Why one could not be applied.
         """
-        patience_s = self._timeout_s if timeout_s is None else checked_seconds("timeout_s", timeout_s)
+        timeout_s = self._timeout_s if timeout_s is None else checked_seconds("timeout_s", timeout_s)
         sender = self._sender
         with sender.changed:
             sender.changed.wait_for(
-                lambda: sender.applied >= self._last or sender.error is not None, patience_s
+                lambda: sender.applied >= self._last or sender.error is not None, timeout_s
             )
         if sender.error is not None:
             raise sender.error
         if sender.applied < self._last:
-            raise sender.trouble or NoAnswer(f"scan {self._last} was not applied within {patience_s:.3g} s")
+            raise sender.trouble or NoAnswer(f"scan {self._last} was not applied within {timeout_s:.3g} s")
         return sender.applied
 
     def wait_durable(self, timeout_s: float = 300.0) -> int:
-        """Have everything saved; returns the number up to which all scans are on the disk.
+        """Have everything saved; return the number up to which all scans are on the disk.
 
         Raises as `wait_applied`.
         """
@@ -327,7 +328,7 @@ class LiveMapper:
 
 
 def _write(path: str, data: bytes) -> None:
-    """Make a file of marks.
+    """Create a file of marks.
 
     Raises
     ------

@@ -1,40 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks in shared memory: made, grown, given up, and found again after the writer died.
+"""Chunks in shared memory: created, grown, given up, and found again after the writer died.
 
-A chunk is a file on a tmpfs.  It is mapped once, as long as it can ever get; only as much of that as the file
-has may be touched.  Memory is taken from the kernel before it is touched: where there is none, that is an
-error here and not a signal later.  A file grows until its chunk is given up, and is cut to nothing then: its
-memory is free at once, whatever others have open or mapped.
+A chunk is a file on a tmpfs.  It is mapped once, for the greatest length that a chunk can have; only the
+bytes that the file has may be touched.  (Python's own `mmap` refuses to map more than the file has.)  Memory
+is allocated before it is touched: where there is none, that is an error here and not a signal later.  A file
+grows until its chunk is given up, and is truncated to nothing then: its memory is free at once, whatever
+other processes have open or mapped.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import mmap
 import os
 import re
+import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from shmmap.chunks.layout import (
     BRICK_BYTES,
     HEADER_BYTES,
-    MOST_BYTES,
+    MAX_BYTES,
     OUT_OF_SERVICE,
     ChunkView,
     chunk_bytes,
     read_identity,
 )
-from shmmap.chunks.mapping import map_chunk, unmap_chunk, view_at
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.errors import BadRequest, SegmentCorrupt
+from shmmap.errors import BadRequest, CannotStart, SegmentCorrupt
 
-__all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "memory_bytes"]
+__all__ = ["ChunkFile", "ChunkMemory", "live_prefix", "map_chunk", "memory_bytes", "unmap_chunk", "view_at"]
 
 _GROWTH_BRICKS: Final = 8
 """A page: memory comes in pages."""
+_RECORDS: Final = ("undo", "applied")
+"""What is kept beside the chunks for as long as any of them is in memory."""
+_PROT_READ: Final = 0x1
+_PROT_WRITE: Final = 0x2
+_MAP_SHARED: Final = 0x1
+_FAILED: Final = ctypes.c_void_p(-1).value
+
+_libc: Any = ctypes.CDLL(None, use_errno=True)
+_libc.mmap.restype = ctypes.c_void_p
+_libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
+_libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 
 
 def live_prefix(instance: str, map_name: str) -> str:
@@ -43,8 +56,33 @@ def live_prefix(instance: str, map_name: str) -> str:
 
 
 def memory_bytes(bricks: int) -> int:
-    """Memory of a chunk of so many bricks, in whole pages."""
+    """Return the memory of a chunk with this many bricks, in whole pages."""
     return chunk_bytes(-(-bricks // _GROWTH_BRICKS) * _GROWTH_BRICKS)
+
+
+def map_chunk(fd: int, name: str) -> int:
+    """Map the file of a chunk for writing; return the address.
+
+    Raises
+    ------
+    OSError
+        The process has no room for more mappings, or the file may not be mapped for writing.
+    """
+    address = _libc.mmap(None, MAX_BYTES, _PROT_READ | _PROT_WRITE, _MAP_SHARED, fd, 0)
+    if address == _FAILED:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), name)
+    return int(address)
+
+
+def view_at(address: int, size: int) -> ChunkView:
+    """Return arrays over the first bytes of a mapped chunk; they do not keep it mapped."""
+    return ChunkView((ctypes.c_char * size).from_address(address))
+
+
+def unmap_chunk(address: int) -> None:
+    """Unmap a chunk: no view of it may be used any more."""
+    _libc.munmap(address, MAX_BYTES)
 
 
 @dataclass(eq=False)
@@ -56,9 +94,9 @@ class ChunkFile:
     name
         Of the shared memory, slash included: prefix, key, generation.
     generation
-        Which time the map had this chunk in memory.
+        Rises each time that the map brings this chunk into memory.
     view
-        Arrays over as much as there is.
+        Arrays over the bytes that the file has.
     """
 
     name: str
@@ -73,7 +111,7 @@ class ChunkFile:
         return -(-len(self.view.data) // mmap.PAGESIZE) * mmap.PAGESIZE
 
     def grow(self, bricks: int) -> ChunkView:
-        """Make room for so many bricks, at least.
+        """Make room for at least this many bricks.
 
         Raises
         ------
@@ -87,13 +125,13 @@ class ChunkFile:
         return self.view
 
     def unmap(self) -> int:
-        """Unmap it; nothing of ``view`` may be used any more.  Returns its descriptor."""
+        """Unmap the chunk; nothing of ``view`` may be used any more.  Return its descriptor."""
         self.view = ChunkView(bytearray(HEADER_BYTES))
         unmap_chunk(self._address)
         return self._fd
 
     def close(self) -> None:
-        """Unmap it; nothing of ``view`` may be used any more."""
+        """Unmap and close the chunk; nothing of ``view`` may be used any more."""
         os.close(self.unmap())
 
 
@@ -112,25 +150,59 @@ class ChunkMemory:
     Attributes
     ----------
     foreign : set
-        Names like those of chunks that are somebody else's files: they are left alone.
+        Names like those of chunks, of files that belong to another user: they are ignored.
     """
 
     def __init__(self, path: str, prefix: str, *, mode: int = 0o600, gid: int = -1) -> None:
         self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC)
+        self.path = path
         self.prefix = prefix
         self._mode, self._gid = mode, gid
         self.foreign: set[str] = set()
 
     def close(self) -> None:
-        """Leave the directory; what is in it stays."""
+        """Leave the directory; chunks stay, and their records for as long as there are any."""
+        if not list(self.names()):
+            for name in _RECORDS:
+                with contextlib.suppress(FileNotFoundError):
+                    self.remove(self.prefix + name)
         os.close(self._fd)
 
     def name(self, key: ChunkKey, generation: int) -> str:
         """Return the name of a chunk of one generation."""
         return f"{self.prefix}{key.text}.{generation}"
 
+    def give_access(self, fd: int) -> None:
+        """Let those read a file who may read the chunks."""
+        if self._gid >= 0:
+            os.fchown(fd, -1, self._gid)
+        os.fchmod(fd, self._mode)
+
+    def record(self, name: str, nbytes: int) -> mmap.mmap:
+        """Map a file that outlives this process, made of zeros if it does not exist yet.
+
+        Raises
+        ------
+        CannotStart
+            What has its name is no file of this user, who alone may write it.
+        """
+        path = self.path + self.prefix + name
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        fd = os.open(path, flags, 0o600)
+        try:
+            status = os.fstat(fd)
+            if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+                raise CannotStart(
+                    f"{path} is not a file of this user, but of user {status.st_uid}",
+                    hint="remove it, or choose another name for the instance",
+                )
+            os.posix_fallocate(fd, 0, nbytes)
+            return mmap.mmap(fd, nbytes)
+        finally:
+            os.close(fd)
+
     def create(self, content: bytes | bytearray) -> ChunkFile:
-        """Put a chunk into memory; it has its name when it is whole.
+        """Put a chunk into memory; it gets its name when it is whole.
 
         Parameters
         ----------
@@ -148,25 +220,20 @@ class ChunkMemory:
         try:
             if os.pwrite(fd, content, 0) != len(content):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            if self._gid >= 0:
-                os.fchown(fd, -1, self._gid)
-            os.fchmod(fd, self._mode)
+            self.give_access(fd)
             chunk = self._mapped(name, identity.generation, fd, len(content))
         except BaseException:
             os.close(fd)
             raise
         try:
-            os.link(
-                f"/proc/self/fd/{fd}", name.lstrip("/"), src_dir_fd=self._fd, dst_dir_fd=self._fd,
-                follow_symlinks=True,
-            )  # fmt: skip
+            os.link(f"/proc/self/fd/{fd}", name.lstrip("/"), dst_dir_fd=self._fd, follow_symlinks=True)
         except BaseException:
             chunk.close()
             raise
         return chunk
 
     def open(self, name: str) -> ChunkFile:
-        """Map a chunk that an earlier writer left.
+        """Map a chunk that a previous writer left.
 
         Raises
         ------
@@ -179,7 +246,7 @@ class ChunkMemory:
         fd = os.open(name.lstrip("/"), flags, dir_fd=self._fd)
         try:
             size = os.fstat(fd).st_size
-            if not HEADER_BYTES <= size <= MOST_BYTES or (size - HEADER_BYTES) % BRICK_BYTES:
+            if not HEADER_BYTES <= size <= MAX_BYTES or (size - HEADER_BYTES) % BRICK_BYTES:
                 raise SegmentCorrupt(f"{name}: {size} bytes cannot be a chunk")
             identity = read_identity(os.pread(fd, HEADER_BYTES, 0), name)
             if name != self.name(identity.key, identity.generation):
@@ -190,13 +257,13 @@ class ChunkMemory:
             raise
 
     def _mapped(self, name: str, generation: int, fd: int, size: int) -> ChunkFile:
-        address = map_chunk(fd, name, writable=True)
+        address = map_chunk(fd, name)
         return ChunkFile(name, generation, fd, address, view_at(address, size))
 
     def give_up(self, chunk: ChunkFile) -> None:
         """Take a chunk out of service, and free its memory, whatever readers do with it.
 
-        A reader in the middle of it finds another ``sequence``, or less than it needs, and begins again.
+        A reader in the middle of it finds another ``sequence``, or too few bytes, and begins again.
         """
         state = chunk.view.state
         state["state"] = OUT_OF_SERVICE
@@ -210,11 +277,11 @@ class ChunkMemory:
             self.remove(chunk.name)
 
     def is_given_up(self, name: str) -> bool:
-        """Whether an earlier writer all but gave up what has this name: nothing is left in it."""
+        """Whether a previous writer had given the chunk of this name up, and only its name is left."""
         return os.stat(name.lstrip("/"), dir_fd=self._fd, follow_symlinks=False).st_size == 0
 
     def names(self) -> Iterator[tuple[str, ChunkKey, int]]:
-        """Chunks that there are, with key and generation; what has no such name is left out."""
+        """Yield the name, key and generation of each chunk in the directory."""
         pattern = re.compile(re.escape(self.prefix.lstrip("/")) + r"(-?\d+_-?\d+_-?\d+)\.(\d+)")
         for name in sorted(os.listdir(self._fd)):
             if found := pattern.fullmatch(name):
@@ -228,12 +295,12 @@ class ChunkMemory:
                     self.foreign.add(name)
 
     def _is_ours(self, name: str) -> bool:
-        """Whether a file belongs to this process's user; in a sticky directory nobody else can replace it."""
+        """Whether a file belongs to this process's user; in a sticky directory no other can replace it."""
         try:
             return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_uid == os.geteuid()
         except FileNotFoundError:
             return False
 
     def remove(self, name: str) -> None:
-        """Remove the name of what is of no use."""
+        """Remove the name of a file that is of no use."""
         os.unlink(name.lstrip("/"), dir_fd=self._fd)

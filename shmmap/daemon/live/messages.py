@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the daemon and its live worker say to each other.
+"""Messages between the daemon and its live worker.
 
 One packet of a SEQPACKET socket pair is one message.  Both ends are always the same version of shmmap.
 """
@@ -15,15 +15,15 @@ from shmmap.daemon.config_live import LiveSettings
 from shmmap.protocol.live import LiveMapRow
 
 __all__ = [
-    "MOST_OF_A_SESSION",
+    "MAX_PER_SESSION",
     "Answer",
     "Ask",
     "Begin",
     "Begun",
+    "Disconnected",
     "End",
     "Ended",
     "FromLive",
-    "Left",
     "Status",
     "ToLive",
     "Unsaved",
@@ -40,7 +40,7 @@ class Begin(msgspec.Struct, array_like=True, tag="begin"):
     Attributes
     ----------
     shm_dir, marks_dir
-        Where chunks are, and where mappers put marks.
+        Directories of chunks, and of mappers' marks.
     budget_bytes
         Memory of all maps together.
     gid, marks_gid
@@ -57,7 +57,7 @@ class Begin(msgspec.Struct, array_like=True, tag="begin"):
 
 
 class Ask(msgspec.Struct, array_like=True, tag="ask"):
-    """A client's request, as it came; ``maps`` says whether this client may change live maps."""
+    """A client's request as received; ``maps`` says whether this client may change live maps."""
 
     ticket: int
     session: int
@@ -66,14 +66,14 @@ class Ask(msgspec.Struct, array_like=True, tag="ask"):
     body: bytes
 
 
-class Left(msgspec.Struct, array_like=True, tag="left"):
+class Disconnected(msgspec.Struct, array_like=True, tag="disconnected"):
     """A session has ended."""
 
     session: int
 
 
 class End(msgspec.Struct, array_like=True, tag="end"):
-    """Save everything and take all names away; or, with ``keep``, leave memory to the next life."""
+    """Save everything and remove all names; or, with ``keep``, leave memory to the next run."""
 
     keep: bool
 
@@ -81,7 +81,7 @@ class End(msgspec.Struct, array_like=True, tag="end"):
 class Begun(msgspec.Struct, array_like=True, tag="begun"):
     """Each map is served, or has a problem: how many are served, how many chunks were found in memory.
 
-    The error is why none can be, as long as the settings stay and another daemon runs.
+    The error says why none can be served while the settings stay and the other daemon runs.
     """
 
     maps: int
@@ -99,13 +99,13 @@ class Answer(msgspec.Struct, array_like=True, tag="answer"):
 
 
 class Status(msgspec.Struct, array_like=True, tag="status"):
-    """How the maps are."""
+    """State of all maps."""
 
     maps: tuple[LiveMapRow, ...]
 
 
 class Unsaved(msgspec.Struct, array_like=True, frozen=True):
-    """So many chunks of a map could not be saved, and stay in memory; and why."""
+    """How many chunks of a map could not be saved and stay in memory, and why."""
 
     map: str
     chunks: int
@@ -113,27 +113,41 @@ class Unsaved(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Ended(msgspec.Struct, array_like=True, tag="ended"):
-    """The worker ends now."""
+    """The last message of the worker."""
 
     unsaved: tuple[Unsaved, ...]
 
 
-ToLive: TypeAlias = Begin | Ask | Left | End
+ToLive: TypeAlias = Begin | Ask | Disconnected | End
 FromLive: TypeAlias = Begun | Answer | Status | Ended
 
-MOST_OF_A_SESSION: Final = 64
-"""Requests that are passed on before they are answered."""
+MAX_PER_SESSION: Final = 64
+"""Requests of one session that are passed on and not yet answered."""
 
 encode: Final = msgspec.msgpack.Encoder().encode
 
 
 def not_served(one: LiveSettings, budget_bytes: int, problem: str) -> LiveMapRow:
-    """How a map is of which nothing is in memory, and why."""
+    """Return the state of a map of which nothing is in memory, and why."""
     return LiveMapRow(
-        one.name, one.path, one.resolution, one.frame_id, chunks=0, active=0, bytes=0, loading=0, dirty=0,
-        saving=0, waiting_bytes=0, files=0, file_bytes=0, scans=0, durable=0,
-        budget_bytes=budget_bytes, problem=problem,
-    )  # fmt: skip
+        one.name,
+        one.path,
+        one.resolution,
+        one.frame_id,
+        chunks=0,
+        active=0,
+        bytes=0,
+        loading=0,
+        dirty=0,
+        saving=0,
+        waiting_bytes=0,
+        files=0,
+        file_bytes=0,
+        scans=0,
+        durable=0,
+        budget_bytes=budget_bytes,
+        problem=problem,
+    )
 
 
 @cache
@@ -147,10 +161,10 @@ def _from_live() -> msgspec.msgpack.Decoder[FromLive]:
 
 
 def decode_to_live(data: bytes | memoryview) -> ToLive:
-    """Read what the daemon says."""
+    """Decode a message of the daemon."""
     return _to_live().decode(data)
 
 
 def decode_from_live(data: bytes | memoryview) -> FromLive:
-    """Read what the worker says."""
+    """Decode a message of the worker."""
     return _from_live().decode(data)

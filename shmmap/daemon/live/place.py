@@ -18,28 +18,35 @@ __all__ = ["bytes_beside_cells", "place_live_maps"]
 
 CEILING_BYTES: Final = 1 << 30
 PART: Final = 8
-"""Of the memory that is free, by default."""
+"""By default live maps get this part of the free memory."""
 LEAST_BYTES: Final = 4 << 20
-"""Of each map: some of the largest chunks, half a mebibyte each."""
+"""Least budget of a map: some of the largest chunks, half a mebibyte each."""
 
 
 def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_bytes: int) -> int:
-    """Return what this many live maps need of the file system of the cells: at least, or as set."""
+    """Return how many bytes this many live maps need in the file system of the cells, at least or as set."""
     if not maps:
         return 0
     path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
     try:
         same = os.stat(path).st_dev == os.stat(cells.path).st_dev
     except OSError:
-        same = False  # `place_live_maps` says what is wrong with it
+        same = False  # `place_live_maps` raises the error
     return (budget_bytes or LEAST_BYTES * maps) if same else 0
 
 
 def place_live_maps(
-    live: Sequence[LiveSettings], *, instance: str, cells: ShmDirectory, cells_budget_bytes: int,
-    shm_dir: str, budget_bytes: int, gid: int, marks_gid: int,
-) -> Begin:  # fmt: skip
-    """Decide where live maps are kept and what they may take.
+    live: Sequence[LiveSettings],
+    *,
+    instance: str,
+    cells: ShmDirectory,
+    cells_budget_bytes: int,
+    shm_dir: str,
+    budget_bytes: int,
+    gid: int,
+    marks_gid: int,
+) -> Begin:
+    """Decide where live maps are kept and how much memory they may take.
 
     Parameters
     ----------
@@ -48,7 +55,7 @@ def place_live_maps(
     shm_dir, budget_bytes
         As set; empty and 0 for the defaults.
     gid, marks_gid
-        Who may read chunks, and who may map.
+        Groups that may read chunks, and that may map.
 
     Raises
     ------
@@ -67,8 +74,9 @@ def place_live_maps(
     if huge := _huge_pages(directory.path):
         raise ConfigError(
             f"{directory.path} has huge pages ({huge}): a chunk of a few KiB would take 2 MiB there",
-            key="live_shm_dir", hint="name a tmpfs without them, such as /dev/shm",
-        )  # fmt: skip
+            key="live_shm_dir",
+            hint="name a tmpfs without them, such as /dev/shm",
+        )
     same = os.stat(directory.path).st_dev == os.stat(cells.path).st_dev
     beside = cells_budget_bytes if same else 0
     least = LEAST_BYTES * len(live)
@@ -76,14 +84,16 @@ def place_live_maps(
     if budget < least:
         raise ConfigError(
             f"{len(live)} live maps share {budget >> 20:,} MiB; each needs {LEAST_BYTES >> 20} MiB",
-            key="live_budget", hint=f"raise --live-budget to {least >> 20}M at least",
-        )  # fmt: skip
+            key="live_budget",
+            hint=f"raise --live-budget to {least >> 20}M at least",
+        )
     if budget + beside > size:
         raise ConfigError(
             f"live maps of {budget >> 20:,} MiB and cells of {beside >> 20:,} MiB do not fit in"
             f" {directory.path}, which has {size >> 20:,} MiB",
-            key="live_budget", hint="lower --live-budget or --budget, or enlarge the tmpfs",
-        )  # fmt: skip
+            key="live_budget",
+            hint="lower --live-budget or --budget, or enlarge the tmpfs",
+        )
     if budget_bytes and budget > free + used:
         raise CannotStart(
             f"live maps of {budget >> 20:,} MiB do not fit in {directory.path}, which has"
@@ -98,7 +108,7 @@ def place_live_maps(
 
 
 def _huge_pages(path: str) -> str | None:
-    """The mount option that gives a directory huge pages; None where it has none."""
+    """Return the mount option that gives a directory huge pages; None where it has none."""
     below = os.path.realpath(path) + "/"
     around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
     if not around:

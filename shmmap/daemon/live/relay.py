@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon's side of the live worker: requests are passed on to it, and its answers back.
+"""The daemon's side of the live worker: passes requests on to it, and its answers back.
 
-A worker that dies takes nothing with it that was answered: another one is started, which finds the chunks in
-memory.  Who waited for an answer is told to ask again.
+A worker that dies loses nothing that was answered: another one is started, which finds the chunks in memory.
+Requests that it had not answered are refused, and their clients ask again.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ import select
 import socket
 import subprocess
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
 from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.live import messages
-from shmmap.daemon.live.tickets import Tickets
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
@@ -29,37 +28,109 @@ from shmmap.processes.start_child import packet_buffer, receive_packet, start_ch
 from shmmap.protocol.codec import encode
 from shmmap.protocol.live import LiveList, LiveListed, LiveMapRow, LiveRequest
 
-__all__ = ["LiveRelay", "NoLiveMaps"]
+__all__ = ["LiveRelay", "NoLiveMaps", "Tickets"]
 
 BEAT_S: Final = 0.5
-BEGINNING_S: Final = 2.0
+START_END_S: Final = 2.0
 """How long a worker that does not serve yet may take to end."""
 END_S: Final = 60.0
 """How long saving everything may take at the end; the unit's stop timeout is longer."""
 PAUSES_S: Final = (0.0, 0.5, 2.0, 10.0, 30.0)
-"""Before another worker is started for one that ended: the first time, and later ones in a row."""
+"""Pauses before another worker is started: after the first one that ended, and the next ones in a row."""
 STARTS: Final = 2
 """Workers that may be killed before the maps are in memory."""
-END_PATIENCE_S: Final = 0.1
-"""How long the loop waits for a killed worker to end; one that hangs in the kernel may take for ever."""
-HEARD_AT_ONCE: Final = 16
+KILL_TIMEOUT_S: Final = 0.1
+"""How long the loop waits for a killed worker to end; one that hangs in the kernel may never end."""
+MESSAGES_PER_TURN: Final = 16
 """Messages of the worker that one turn of the loop takes in."""
-MOST_BYTES: Final = 1 << 12
-"""Of a request about live maps: names and numbers."""
-MOST_UNSENT: Final = 4096
-"""Messages for a worker that hears nothing just now: sessions that come and go could send without end."""
-IN_ORDER_S: Final = 1.0
+MAX_BYTES: Final = 1 << 12
+"""Length of a request about live maps: names and numbers."""
+MAX_UNSENT: Final = 4096
+"""Messages for a worker that reads nothing just now: sessions that come and go could send without end."""
+STABLE_S: Final = 1.0
 """A worker that ends sooner after its maps were in memory is not started again at once a second time."""
+MAX_PER_PROCESS: Final = 256
+MAX_WAITING: Final = 4096
+"""Requests of one process, and of all, that wait for their answers."""
+REFUSED_PER_TURN: Final = 64
+"""Requests that one turn of the loop refuses after a worker has ended."""
+
+
+class Tickets:
+    """Requests that were passed on and are not answered: bounded by session, by process, and in all."""
+
+    def __init__(self) -> None:
+        self._asked: dict[int, tuple[Session, int]] = {}
+        self._of: dict[int, set[int]] = {}  # by session
+        self._waiting: Counter[int] = Counter()  # by process
+        self._lost: deque[tuple[Session, int]] = deque()
+        self._last = 0
+
+    def __len__(self) -> int:
+        return len(self._asked) + len(self._lost)
+
+    def give(self, session: Session, request: int) -> int:
+        """Return a ticket for a request; raise Busy if too many wait."""
+        for whose, waiting, most in (
+            ("this session", len(self._of.get(session.slot, ())), messages.MAX_PER_SESSION),
+            ("this process", self._waiting[session.asker], MAX_PER_PROCESS),
+            ("all sessions", len(self), MAX_WAITING),
+        ):
+            if waiting >= most:
+                raise Busy(f"{waiting} requests of {whose} about live maps wait", hint="wait for some")
+        self._last += 1
+        self._asked[self._last] = session, request
+        self._of.setdefault(session.slot, set()).add(self._last)
+        self._waiting[session.asker] += 1
+        return self._last
+
+    def take(self, ticket: int) -> Session | None:
+        """Return the session to answer; None if it has ended."""
+        session, _ = self._asked.pop(ticket, (None, 0))
+        if session is not None:
+            self._of[session.slot].discard(ticket)
+            self._waiting[session.asker] -= 1
+            if not self._of[session.slot]:
+                del self._of[session.slot]
+            if not self._waiting[session.asker]:
+                del self._waiting[session.asker]
+        return session
+
+    def on_disconnect(self, session: Session) -> None:
+        """Drop the requests of a session that has ended."""
+        for ticket in list(self._of.get(session.slot, ())):
+            self.take(ticket)
+        if self._lost:
+            self._lost = deque(row for row in self._lost if row[0] is not session)
+
+    def lose(self) -> None:
+        """Note that the worker has ended: `refuse_some` refuses everything that waits."""
+        self._lost += self._asked.values()
+        self._asked = {}
+        self._of.clear()
+        self._waiting.clear()
+
+    @property
+    def are_lost(self) -> bool:
+        """Whether there are requests to refuse."""
+        return bool(self._lost)
+
+    def refuse_some(self) -> None:
+        """Refuse some of the requests whose worker has ended."""
+        error = LiveInterrupted("the process that keeps live maps ended, and is started anew")
+        for _ in range(min(REFUSED_PER_TURN, len(self._lost))):
+            session, request = self._lost.popleft()
+            session.connection.refuse(request, error)
 
 
 class NoLiveMaps:
-    """Where the daemon keeps none."""
+    """Stands in for `LiveRelay` in a daemon that keeps no live maps."""
 
-    def tell(self) -> None:
-        """Nothing has to be told."""
+    def begin_events(self) -> None:
+        """Do nothing."""
 
     def ask(self, session: Session, message: LiveRequest, body: bytes, now_s: float) -> None:
-        """Say that there are none."""
+        """Refuse a request, or list no maps."""
         del body, now_s
         if isinstance(message, LiveList):
             session.connection.reply(encode(LiveListed(message.request, ())))
@@ -69,42 +140,42 @@ class NoLiveMaps:
             hint="start it with --live NAME, or with [live.NAME] in its settings",
         )
 
-    def left(self, session: Session) -> None:
-        """Nobody has to be told."""
+    def on_disconnect(self, session: Session) -> None:
+        """Do nothing."""
 
     def beat(self, now_s: float) -> None:
-        """Nothing has to be done."""
+        """Do nothing."""
 
     @property
     def next_s(self) -> float:
-        """Never."""
+        """Return infinity: nothing is ever due."""
         return math.inf
 
     def turn(self, now_s: float) -> None:
-        """Nothing has to be done."""
+        """Do nothing."""
 
     def close(self, *, keep: bool) -> None:
-        """Nothing has to be ended."""
+        """Do nothing."""
 
     @property
     def unsaved(self) -> dict[str, int]:
-        """Nothing can be lost."""
+        """Return that nothing is unsaved."""
         return {}
 
 
 class LiveRelay:
-    """Has the live worker, and passes on what concerns it.
+    """Starts the live worker, and passes on what concerns it.
 
     Parameters
     ----------
     begin
-        Which maps it is to keep, and where.
+        Which maps the worker keeps, and where.
     watched
-        Told of its descriptor.
+        Watches the worker's channel.
     may_map
         Whether a process may change live maps.
     events
-        Told how the maps are, twice a second, and when the worker ends and begins.
+        Gets the state of the maps, twice a second, and when the worker ends and begins.
 
     Attributes
     ----------
@@ -132,7 +203,7 @@ class LiveRelay:
         self._buffer = packet_buffer()
         self._unsent: deque[bytes] = deque()
         self._tickets = Tickets()
-        self._askers: set[int] = set()
+        self._known_sessions: set[int] = set()
         self._serving = False
         self._failures = 0
         self._start_s = self._served_s = 0.0
@@ -140,19 +211,19 @@ class LiveRelay:
         self._rows: tuple[LiveMapRow, ...] = ()
         self._ended: messages.Ended | None = None
 
-    # --- the worker's life ----------------------------------------------------------------------
+    # --- the worker's process -------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the worker; `wait_until_serving` says what came of it."""
+        """Start the worker; `wait_until_serving` waits for its maps."""
         self._process, self._channel = start_child("shmmap.daemon.live.worker.main", new_session=True)
         self._channel.setblocking(False)
         self._serving = False
         with contextlib.suppress(ConnectionError):
             self._channel.send(messages.encode(self._begin))
-        self._watched.watch(self._channel.fileno(), self.hear, "answers")
+        self._watched.watch(self._channel.fileno(), self.on_readable, "answers")
 
     def wait_until_serving(self, seconds: float, *, alone: bool) -> None:
-        """Wait until each map is in memory or has a problem, at most so long: the rest comes by itself.
+        """Wait until each map is in memory or has a problem; maps that take longer come later.
 
         Parameters
         ----------
@@ -173,33 +244,33 @@ class LiveRelay:
                     break
                 self.start()
             self._wait(min(left_s, BEAT_S))
-            self.hear()
+            self.on_readable()
             self._events.beat()
         if alone and self._refused is not None:
             raise self._refused
         if not self._serving:
             log.warning("live maps are not ready yet", maps=len(self._begin.maps), after_s=seconds)
-            self._say_of_all("the process that keeps live maps is being started")
+            self._show_problem("the process that keeps live maps is being started")
 
-    def _say_of_all(self, problem: str) -> None:
-        """Have each map shown as one that is not served just now."""
+    def _show_problem(self, problem: str) -> None:
+        """Show each map as not served just now."""
         budget_bytes = self._begin.budget_bytes // max(1, len(self._begin.maps))
         self._rows = tuple(messages.not_served(one, budget_bytes, problem) for one in self._begin.maps)
         self._events.told(self._rows)
 
-    def tell(self) -> None:
-        """Tell events from now on: clients are heard."""
+    def begin_events(self) -> None:
+        """Emit events from now on: clients are served."""
         self._events.begin(len(self._begin.maps))
 
     def _wait(self, seconds: float) -> None:
-        """Wait until the worker says something, or takes what is to be sent."""
+        """Wait until the worker sends something, or takes what is to be sent."""
         if self._channel is not None:
             poller = select.poll()  # `select.select` takes no descriptor above 1023
             poller.register(self._channel, select.POLLIN | (select.POLLOUT if self._unsent else 0))
             poller.poll(seconds * 1000)
 
     def beat(self, now_s: float) -> None:
-        """Start another worker when it is time to."""
+        """Start another worker when it is due."""
         if self._channel is None and now_s >= self._start_s:
             try:
                 self.start()
@@ -207,9 +278,9 @@ class LiveRelay:
                 self._start_s = now_s + PAUSES_S[-1]
                 log.warning("live worker not started", reason=error.strerror)
 
-    def hear(self) -> None:
-        """Hear what the worker says, and send on what it did not take."""
-        for _ in range(HEARD_AT_ONCE):
+    def on_readable(self) -> None:
+        """Take in messages of the worker, and send what it did not take before."""
+        for _ in range(MESSAGES_PER_TURN):
             if self._channel is None:
                 return
             try:
@@ -221,10 +292,10 @@ class LiveRelay:
             if not data:
                 self._lost()
                 return
-            self._told(messages.decode_from_live(data))
+            self._take(messages.decode_from_live(data))
         self._flush()
 
-    def _told(self, message: messages.FromLive) -> None:
+    def _take(self, message: messages.FromLive) -> None:
         if isinstance(message, messages.Answer):
             session = self._tickets.take(message.ticket)
             if session is not None:
@@ -243,9 +314,9 @@ class LiveRelay:
             self._ended = message
 
     def _lost(self) -> None:
-        """The worker has ended: tell who waits, and start another one soon."""
+        """Note that the worker has ended: refuse what waits, and start another one soon."""
         now_s = time.monotonic()
-        if self._serving and now_s >= self._served_s + IN_ORDER_S:
+        if self._serving and now_s >= self._served_s + STABLE_S:
             self._failures = 0
         self._forget()
         if self._ended is not None:
@@ -256,16 +327,16 @@ class LiveRelay:
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
         if self._failures > 1:  # once is hardly noticed: the next one finds what was in memory
-            self._say_of_all("the process that keeps live maps ends again and again: see the log")
+            self._show_problem("the process that keeps live maps ends again and again: see the log")
         self._tickets.lose()
 
     @property
     def next_s(self) -> float:
-        """When those who wait for a worker that ended are told: at once, some at a time."""
+        """Return when to refuse requests to a worker that ended: at once, some at a time."""
         return 0.0 if self._tickets.are_lost else math.inf
 
     def turn(self, now_s: float) -> None:
-        """Tell some of them."""
+        """Refuse some of them."""
         del now_s
         self._tickets.refuse_some()
 
@@ -277,7 +348,7 @@ class LiveRelay:
         if self._process is not None:
             self._process.kill()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(END_PATIENCE_S)
+                self._process.wait(KILL_TIMEOUT_S)
             self._process = None
         self._unsent.clear()
         self._serving = False
@@ -290,14 +361,14 @@ class LiveRelay:
         Raises
         ------
         Busy
-            Too many of this session's wait, or of all sessions'.
+            Too many requests of this session wait, or of its process, or of all.
         BadRequest
             It is too long.
         LiveInterrupted
             There is no worker just now.
         """
-        if len(body) > MOST_BYTES:
-            raise BadRequest(f"a request about a live map has at most {MOST_BYTES} bytes")
+        if len(body) > MAX_BYTES:
+            raise BadRequest(f"a request about a live map has at most {MAX_BYTES} bytes")
         if isinstance(message, LiveList) and not self._serving:
             session.connection.reply(encode(LiveListed(message.request, self._rows)))
             return
@@ -306,27 +377,27 @@ class LiveRelay:
                 "the process that keeps live maps is being started",
                 hint="ask again: it takes long the first time",
             )
-        if len(self._unsent) >= MOST_UNSENT:
+        if len(self._unsent) >= MAX_UNSENT:
             raise Busy("the process that keeps live maps hears nothing just now", hint="ask again")
         maps = self._may_map(session.peer, now_s)
-        self._askers.add(session.slot)
+        self._known_sessions.add(session.slot)
         ticket = self._tickets.give(session, message.request)
         self._send(messages.Ask(ticket, session.slot, session.peer.uid, maps, bytes(body)))
 
-    def left(self, session: Session) -> None:
-        """A session has ended."""
-        self._tickets.left(session)
-        if session.slot in self._askers:
-            self._askers.discard(session.slot)
+    def on_disconnect(self, session: Session) -> None:
+        """Note that a session has ended."""
+        self._tickets.on_disconnect(session)
+        if session.slot in self._known_sessions:
+            self._known_sessions.discard(session.slot)
             if self._channel is not None:
-                self._send(messages.Left(session.slot))
+                self._send(messages.Disconnected(session.slot))
 
     def _send(self, message: messages.ToLive) -> None:
         self._unsent.append(messages.encode(message))
         self._flush()
 
     def _flush(self) -> None:
-        """Send what the worker takes; the rest when it has heard some."""
+        """Send what the worker takes; the rest when it has read some."""
         if self._channel is None:
             return
         try:
@@ -336,25 +407,25 @@ class LiveRelay:
         except BlockingIOError:
             pass
         except OSError:
-            return  # it has ended: `hear` hears of it
+            return  # it has ended: `on_readable` notices
         self._watched.watch_for(self._channel.fileno(), reading=True, writing=bool(self._unsent))
 
     # --- the end --------------------------------------------------------------------------------
 
     def close(self, *, keep: bool) -> None:
-        """Have everything saved and all names taken away, or leave memory to the next run.
+        """Have everything saved and all names removed, or leave memory to the next run.
 
-        What could not be saved is `unsaved` then, and stays in memory.
+        What could not be saved stays in memory, and is listed in `unsaved`.
         """
         end_s = time.monotonic() + END_S
         ended, was_serving = None, False
-        for _ in range(2):  # a worker that dies meanwhile leaves its chunks to another one
+        for _ in range(2):  # if a worker dies meanwhile, another one takes its chunks over
             if self._served_s and not self._serving and self._ended is None and not keep:
                 self._start_to_save(end_s)
             if self._channel is None:
                 break
             was_serving = self._serving
-            until_s = end_s if was_serving else min(end_s, time.monotonic() + BEGINNING_S)
+            until_s = end_s if was_serving else min(end_s, time.monotonic() + START_END_S)
             ended = self._ask_to_end(until_s, keep=keep)
             if ended is not None or self._channel is not None:
                 break
@@ -362,9 +433,11 @@ class LiveRelay:
             for one in ended.unsaved:
                 self.unsaved[one.map] = one.chunks
                 log.error(
-                    "live map not saved: its chunks stay in memory for the next start", map=one.map,
-                    chunks=one.chunks, reason=one.problem or "there was no time left",
-                )  # fmt: skip
+                    "live map not saved: its chunks stay in memory for the next start",
+                    map=one.map,
+                    chunks=one.chunks,
+                    reason=one.problem or "there was no time left",
+                )
         elif ended is None and was_serving:
             unsaved = {row.name: row.dirty + row.saving for row in self._rows if row.dirty + row.saving}
             self.unsaved = {} if keep else unsaved
@@ -372,7 +445,7 @@ class LiveRelay:
         self._forget()
 
     def _start_to_save(self, end_s: float) -> None:
-        """Have another worker take over what one that ended has left in memory."""
+        """Start another worker, which takes over what the last one left in memory."""
         if self._channel is None:
             try:
                 self.start()
@@ -380,16 +453,16 @@ class LiveRelay:
                 log.error("live worker not started", reason=error.strerror)
         while self._channel is not None and not self._serving and (left_s := end_s - time.monotonic()) > 0:
             self._wait(left_s)
-            self.hear()
+            self.on_readable()
         if not self._serving:
             log.error("live worker does not start: what is in memory stays there for the next start")
 
     def _ask_to_end(self, end_s: float, *, keep: bool) -> messages.Ended | None:
-        """Have the worker end; what it says at last, if it does by then."""
+        """Have the worker end by a time; return its last message, if there is one."""
         self._ended = None
         self._unsent.append(messages.encode(messages.End(keep)))
         while self._channel is not None and self._ended is None and (left_s := end_s - time.monotonic()) > 0:
             self._flush()
             self._wait(left_s)
-            self.hear()
+            self.on_readable()
         return self._ended

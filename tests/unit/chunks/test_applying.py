@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from shmmap.chunks import applying
 from shmmap.chunks.layout import MAPPERS, ChunkView
-from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
-from shmmap.chunks.occupancy import Occupancy
+from shmmap.chunks.occupancy import Occupancy, ScanFilter
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import SegmentCorrupt
 from tests.support.chunk_memory import ChunkMemory
@@ -209,12 +208,3 @@ def test_an_undo_record_of_something_else_is_refused() -> None:
     assert memory.undo.of == (key, 1)
     with pytest.raises(SegmentCorrupt, match="undo record"):
         memory.undo.restore(ChunkView(bytearray(view.data[: 4096 + 3 * 512])))
-
-
-def test_versions_rise_by_one_a_scan() -> None:
-    memory, marker = ChunkMemory(0.2), Marker(0.2, FILTER)
-    versions: list[int] = [0]
-    for number, (points, pose) in enumerate(drive(4), 1):
-        memory.apply(marker.mark(points, pose)[0], scan=number)
-        versions.append(sum(int(view.state["version"]) for view in memory.chunks.values()))
-    assert all(before < after for before, after in pairwise(versions))

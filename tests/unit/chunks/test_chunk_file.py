@@ -20,7 +20,8 @@ from shmmap.chunks.chunk_file import (
     usual_codec,
 )
 from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent
-from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marking import Marker
+from shmmap.chunks.occupancy import ScanFilter
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import ConfigError, MapDataError
 from tests.support.chunk_memory import MAP_ID, ChunkMemory

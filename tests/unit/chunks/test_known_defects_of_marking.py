@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import ScanFilter
 from shmmap.chunks.voxels import CHUNK_SIDE, ChunkKey, voxel_indices, voxels_of
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.live_drive import SlowOccupancy, Voxel, walk

@@ -18,7 +18,8 @@ from shmmap.chunks.layout import (
     new_header,
     read_identity,
 )
-from shmmap.chunks.marking import Marker, ScanFilter
+from shmmap.chunks.marking import Marker
+from shmmap.chunks.occupancy import ScanFilter
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.errors import SegmentCorrupt
 from tests.support.chunk_memory import MAP_ID, ChunkMemory

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shmmap.chunks import marking
 from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
 from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.chunks.voxels import voxels_of
 from shmmap.errors import BadRequest
 from tests.support.live_drive import SlowOccupancy, Voxel
@@ -165,7 +166,7 @@ def test_more_chunks_than_there_was_memory_for(monkeypatch: pytest.MonkeyPatch) 
     marker = Marker(0.1, ScanFilter(0.5, 30.0, -30.0, 30.0))
     marks = assert_equal_to_the_slow_one(marker, points, pose_at((0.0, 0.0, 0.0)))
     assert len(marks.keys) > 8
-    monkeypatch.setattr(marking, "MOST_CHUNKS", 4)
+    monkeypatch.setattr(marking, "MAX_CHUNKS", 4)
     small = Marker(0.1, ScanFilter(0.5, 30.0, -30.0, 30.0))
     with pytest.raises(BadRequest, match="more than 4 chunks"):
         small.mark(points, pose_at((0.0, 0.0, 0.0)))

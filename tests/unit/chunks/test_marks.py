@@ -95,7 +95,7 @@ def test_every_truncation_is_refused() -> None:
         decode_marks(data + b"\0", MAP, 7, 42)
 
 
-def test_words_begin_anew_with_each_list() -> None:
+def test_words_begin_again_with_each_list() -> None:
     """Rising within hits and within misses; nothing is said of one against the other."""
     marks = replace(MARKS, words=np.array([0, 0, 0, 1], np.uint16))
     assert decode_marks(encode_marks(marks, MAP, 7, 42), MAP, 7, 42).words.tolist() == [0, 0, 0, 1]

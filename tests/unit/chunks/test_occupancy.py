@@ -7,8 +7,8 @@ import math
 
 import pytest
 
-from shmmap.chunks.marking import Marker, ScanFilter
-from shmmap.chunks.occupancy import Occupancy, log_odds, probability
+from shmmap.chunks.marking import Marker
+from shmmap.chunks.occupancy import Occupancy, ScanFilter, log_odds, probability
 from shmmap.errors import ConfigError
 
 

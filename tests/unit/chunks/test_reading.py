@@ -132,6 +132,6 @@ def test_voxels_are_found_where_they_are(kind: str) -> None:
 
 
 def test_a_kind_that_there_is_not() -> None:
-    with pytest.raises(BadRequest, match="voxels are not 'unknown'") as told:
+    with pytest.raises(BadRequest, match="voxels are not 'unknown'") as caught:
         select_voxels(ChunkView(new_header(IDENTITY)), "unknown")
-    assert "occupied, free" in told.value.hint
+    assert "occupied, free" in caught.value.hint

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Three walks a reader can take, and how many files of the daemon each enters on the loop's thread.
+"""Four walks a reader can take, and how many files of the daemon each enters on the loop's thread.
 
 Start-up, what has its own time (asked for by `ServingLoop._poll_timeout_s`, done by `_do_what_is_due`) and
 loader processes do not count.
@@ -9,17 +9,28 @@ loader processes do not count.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any, cast
 
+from tests.support.patience import Patience
+
 import shmmap.daemon
+from shmmap.chunks.marks import encode_marks
+from shmmap.daemon.config_live import LiveSettings
+from shmmap.daemon.live import messages as live
+from shmmap.daemon.live.worker.main import _Worker
+from shmmap.processes.start_child import channel, packet_buffer, receive_packet
+from shmmap.protocol import live as messages
 from shmmap.protocol import messages as m
-from shmmap.protocol.codec import pack_versions
+from shmmap.protocol.codec import decode_reply, encode, pack_versions
 from tests.support.divided_map import DividedMap, make_map
+from tests.support.live_drive import RESOLUTION, marked
 from tests.unit.daemon.whole_daemon import WholeDaemon
 
 DAEMON = str(Path(shmmap.daemon.__file__).parent)
@@ -124,3 +135,47 @@ def test_eviction(whole: Callable[..., WholeDaemon], tmp_path: Path) -> None:
     files = asking.files | sweeping.files | {"loading/scheduler.py"}
     assert files == listed(3)
     assert len(files) <= 10
+
+
+def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
+    """In the live worker, from the request to the answer; its file threads do not count."""
+    ours, theirs = channel()
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as shm, ours, theirs:
+        ours.setblocking(False)
+        worker = _Worker(theirs)
+        settings = LiveSettings("lidar", str(tmp_path / "lidar"), resolution=RESOLUTION)
+        worker.begin(live.Begin("walk", (settings,), shm, f"{shm}/marks", 1 << 24, -1, -1))
+        worker.run_turn()
+
+        def answer(message: messages.LiveRequest) -> Any:
+            ours.send(live.encode(live.Ask(message.request, 1, os.geteuid(), True, encode(message))))
+            body, waiting = b"", Patience()
+            while waiting(not body):
+                worker.run_turn()
+                with contextlib.suppress(BlockingIOError):
+                    found = live.decode_from_live(receive_packet(ours, packet_buffer())[0])
+                    if isinstance(found, live.Answer) and found.ticket == message.request:
+                        body = found.body
+            return decode_reply(body)
+
+        def scan(number: int) -> messages.LiveScan:
+            data = encode_marks(marked(1)[0], opened.map_id, opened.mapper, number)
+            Path(opened.marks_dir, f"1.{number}").write_bytes(data)
+            at = (0.0, 0.0, 0.0)
+            return messages.LiveScan(number, "lidar", opened.mapper, number, f"1.{number}", len(data), at)
+
+        waiting = Patience()
+        while waiting(not worker._maps):
+            worker.run_turn()
+        opened = answer(messages.LiveOpen(1, "lidar", "front"))
+        assert answer(scan(2)).scan == 2
+        one = worker._maps["lidar"]
+        while waiting(len(one.live.chunks) < 27 or one.status().loading > 0):
+            worker.run_turn()
+        walker = Walker()
+        second = scan(3)
+        with walker.walking():
+            assert answer(second).scan == 3
+        worker.end(live.End(keep=False))
+    assert walker.files == listed(4)
+    assert len(walker.files) <= 14

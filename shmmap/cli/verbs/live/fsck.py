@@ -13,7 +13,7 @@ from shmmap.cli.verbs.live.directory import add_directory, directory_from
 from shmmap.errors import MapDataError
 
 if TYPE_CHECKING:
-    from shmmap.daemon.live.disk.checking import CheckedMap
+    from shmmap.daemon.live.disk.maintenance import CheckedMap
 
 __all__ = ["add_parser", "run"]
 
@@ -61,7 +61,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check, and repair if that was asked for."""
-    from shmmap.daemon.live.disk.checking import check, repair
+    from shmmap.daemon.live.disk.maintenance import check, repair
     from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
     from shmmap.formats.durable_file import writing_errors
 

@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     """Move or delete the files."""
     import msgspec
 
-    from shmmap.daemon.live.disk.resetting import files_of_map, reset
+    from shmmap.daemon.live.disk.maintenance import files_of_map, reset
     from shmmap.daemon.live.disk.stored_map import opened_folder
     from shmmap.formats.durable_file import writing_errors
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a live map is on the disk, and what can be done with it there without a daemon."""
+"""Files of a live map: written by the live worker, and checked, exported and reset without a daemon."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The voxels of a live map's files as a cloud, or as a divided map that can be served.
+"""Export the voxels of a live map's files as a cloud, or as a divided map that can be served.
 
 A point lies in the middle of its voxel.  Its ``intensity`` is the probability that the voxel is occupied.
 Chunks are read and written one by one.
@@ -36,29 +36,27 @@ __all__ = ["ExportedVoxels", "Format", "Voxels", "export"]
 Format = Literal["ply", "pcd", "map"]
 Voxels = Literal["occupied", "free", "both"]
 
-_MOST_POINTS: Final = (1 << 32) - 1  # of a PCD file
+_MAX_POINTS: Final = (1 << 32) - 1  # of a PCD file
 _INTENSITY: Final = "intensity"
 
 
 class ExportedVoxels(msgspec.Struct, frozen=True):
-    """What was written.
+    """Result of an export.
 
     Attributes
     ----------
-    path, format
-        Where, and as what.
     voxels, chunks
-        How many voxels, of how many chunks that have some.
+        How many voxels, and of how many chunks.
     cells
-        Of a divided map, else 0.
+        Cells of a divided map, else 0.
     resolution, frame_id
         Edge of a voxel, metres; frame of the live map.
     origin
-        To be added to a point to come back to that frame, metres.
+        Add it to a point to get back to that frame, metres.
     fields
-        Names and dtypes of what each point has.
+        Names and dtypes of the columns.
     aside
-        Files that are left out because they were put aside before.
+        Files that are left out because they were quarantined before.
     """
 
     path: str
@@ -83,7 +81,7 @@ def export(
     cell_size: float = 20.0,
     force: bool = False,
 ) -> ExportedVoxels | None:
-    """Write voxels to ``out``, which appears complete or not at all; None if there is none to write.
+    """Write voxels to ``out``, which appears complete or not at all; return None if there is none to write.
 
     Parameters
     ----------
@@ -96,7 +94,7 @@ def export(
     cell_size
         Of a divided map, metres.
     force
-        Replace what is there; in the place of a directory only a divided map.
+        Replace what exists; a directory only if it is a divided map.
 
     Raises
     ------
@@ -172,7 +170,7 @@ def _exported(
         frame_id=stored.settings.frame_id,
         origin=origin,
         fields=[(name, row[name].str) for name in row.names or ()],
-        aside=stored.aside,
+        aside=stored.names.quarantined,
     )
 
 
@@ -180,7 +178,7 @@ def _exported(
 
 
 def _keys(stored: StoredMap, voxels: Voxels) -> list[ChunkKey]:
-    """The chunks that have such voxels, by what their files say without being read whole."""
+    """Return the chunks that have such voxels, by the headers of their files."""
 
     def has_some(header: ChunkFileHeader) -> bool:
         counted = {
@@ -205,7 +203,7 @@ def _row(frame: Frame) -> np.dtype[np.void]:
 def _points(
     key: ChunkKey, view: ChunkView, resolution: float, voxels: Voxels, frame: Frame
 ) -> NDArray[np.void]:
-    """The voxels of a chunk, in the order of their places."""
+    """Return the voxels of a chunk, in the order of their places."""
     identity = view.identity
     log_odds = view.dense()
     chosen = np.zeros(len(log_odds), bool)
@@ -235,12 +233,12 @@ def _write_cloud(
     *,
     replace: bool,
 ) -> tuple[int, int]:
-    """Write a file; returns how many voxels it has, and of how many chunks.
+    """Write a file; return how many voxels it has, and of how many chunks.
 
-    Its header says how many there are, and is written last, in the room that was left for it.
+    Its header has that number, and is written last, in the room that was left for it.
     """
     header = _header_of(kind, _row(frame), stored, frame)
-    room = len(header(_MOST_POINTS, 0))
+    room = len(header(_MAX_POINTS, 0))
     count = chunks = 0
     with appearing_file(path, replace=replace) as file:
         file.write(bytes(room))
@@ -258,7 +256,7 @@ def _write_cloud(
 def _header_of(
     kind: Format, row: np.dtype[np.void], stored: StoredMap, frame: Frame
 ) -> Callable[[int, int], bytes]:
-    """What makes a header, by the number of points and its own length."""
+    """Return a function that makes a header, given the number of points and its own length."""
     fields: list[tuple[str, np.dtype[Any]]] = [(name, row[name]) for name in row.names or ()]
     if kind == "ply":
         origin = " ".join(f"{part:.17g}" for part in frame.origin)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the directory of a live map says of it: ``map.json``, ``manifest.json``, and the names of its files.
+"""The files in the directory of a live map: their names, ``map.json``, ``manifest.json``, headers of chunks.
 
-``map_files.py`` says what they are for.  Whatever is in a file, reading it is bounded, and what it cannot be
-is a `MapDataError`.
+All reading of the directory goes through here; ``map_files.py`` says what the files are for.  Whatever is in
+a file, reading it is bounded, and content that cannot be right is a `MapDataError`.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Final, TypeAlias, TypeVar
+from typing import Annotated, Final, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 
-from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader
-from shmmap.chunks.layout import MAPPERS, MOST_FRAME_BYTES, ChunkIdentity
-from shmmap.chunks.layout import MOST_BYTES as MOST_CHUNK_BYTES
+from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, read_file_header
+from shmmap.chunks.layout import MAPPERS, MAX_FRAME_BYTES, ChunkIdentity
+from shmmap.chunks.layout import MAX_BYTES as MAX_CHUNK_BYTES
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.folder import MOST_BYTES, Files, FilesToRead, replace_file
+from shmmap.daemon.live.disk.folder import DAMAGED, INTERIM, MAX_BYTES, Files, FilesToRead, replace_file
 from shmmap.errors import BadRequest, ConfigError, MapDataError
 
 __all__ = [
@@ -27,13 +27,14 @@ __all__ = [
     "MANIFEST",
     "MAP_FILE",
     "MAP_FORMAT",
+    "FileNames",
     "Manifest",
     "MapRecord",
     "MapSettings",
     "Mapper",
     "Row",
-    "keys_of",
     "read_chunk",
+    "read_header",
     "read_manifest",
     "read_map",
     "write_rows",
@@ -45,22 +46,28 @@ MAP_FILE: Final = "map.json"
 MANIFEST: Final = "manifest.json"
 MAP_FORMAT: Final = 1
 CHUNK: Final = ".chunk"
-"""How the names of chunks' files end."""
+"""Suffix of the files of chunks."""
 
-_MOST_CHUNK_BYTES: Final = 2 * MOST_CHUNK_BYTES
-"""Of a chunk's file: what cannot be compressed gets a little longer by that."""
-_MOST_MAP_BYTES: Final = 1 << 20
-_MOST_MANIFEST_BYTES: Final = MOST_BYTES - 1
-"""Of ``map.json``, and of ``manifest.json``: about two million chunks."""
+_MAX_CHUNK_FILE_BYTES: Final = 2 * MAX_CHUNK_BYTES
+"""Length of a chunk's file: what cannot be compressed gets a little longer."""
+_MAX_MAP_BYTES: Final = 1 << 20
+_MAX_MANIFEST_BYTES: Final = MAX_BYTES - 1
+"""Length of ``map.json``, and of ``manifest.json``: about two million chunks."""
 _MAP_ID: Final = re.compile(r"[0-9a-f]{32}")
 _RESOLUTION_M: Final = (1e-4, 1e3)
 _NOT_DECODED: Final = (
-    msgspec.MsgspecError, ValueError, ConfigError, RecursionError, MemoryError, OverflowError, struct.error,
-)  # fmt: skip
+    msgspec.MsgspecError,
+    ValueError,
+    ConfigError,
+    RecursionError,
+    MemoryError,
+    OverflowError,
+    struct.error,
+)
 """What decoders raise for damaged bytes."""
 
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62) - 1)]
-"""Of a file that may have been changed: never negative, and something can be added."""
+"""A number in a file that may be damaged: never negative, and small enough to add to."""
 
 
 class MapSettings(msgspec.Struct, frozen=True):
@@ -81,7 +88,7 @@ class MapSettings(msgspec.Struct, frozen=True):
     frame_id: str = "map"
 
     def identity(self, map_id: bytes, key: ChunkKey, generation: int) -> ChunkIdentity:
-        """What a chunk of a map of this kind is in memory."""
+        """Return the identity of a chunk in memory, of a map with these settings."""
         _, _, low, high = self.occupancy.steps
         return ChunkIdentity(
             map_id, key, self.resolution, low, high, *self.occupancy.thresholds, generation, self.frame_id
@@ -89,14 +96,14 @@ class MapSettings(msgspec.Struct, frozen=True):
 
 
 class Mapper(msgspec.Struct):
-    """Who maps: a user and the name that a program of theirs chose.
+    """A user and the name that one of the user's programs chose.
 
     Attributes
     ----------
     number
         Stands for it in chunks, and is never given to another.
     scans
-        All scans that it sent have smaller numbers; true on disk before one is applied.
+        All scans that it sent have smaller numbers; on the disk before one is applied.
     """
 
     number: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)]
@@ -117,13 +124,13 @@ class Row(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, header: ChunkFileHeader) -> Row:
-        """What a whole file's header says."""
+        """Return the row of a whole file with this header."""
         size = FILE_HEADER_BYTES + header.stored_bytes
         return cls(header.version, size, header.active, header.occupied, header.free, header.bricks)
 
 
 class MapRecord(msgspec.Struct):
-    """``map.json``."""
+    """Content of ``map.json``."""
 
     format: int
     map_id: str
@@ -134,14 +141,14 @@ class MapRecord(msgspec.Struct):
 
 
 class Manifest(msgspec.Struct):
-    """``manifest.json``.
+    """Content of ``manifest.json``.
 
     Attributes
     ----------
     chunks
-        Those that are durable.
+        The durable ones.
     applied
-        Up to which scan of each mapper, by its number, all are durable: at least.
+        The scan up to which all of each mapper's, by its number, are at least durable.
     """
 
     format: int
@@ -149,21 +156,62 @@ class Manifest(msgspec.Struct):
     applied: dict[int, Count] = {}
 
 
-def keys_of(names: Iterable[str]) -> tuple[dict[ChunkKey, str], list[str]]:
-    """Files of chunks by key, in the order of the keys; and those called so that no chunk can have."""
-    found: dict[ChunkKey, str] = {}
-    strange: list[str] = []
-    for name in names:
-        if name.endswith(CHUNK):
-            try:
-                found[ChunkKey.from_text(name.removesuffix(CHUNK))] = name
-            except BadRequest:
-                strange.append(name)
-    return dict(sorted(found.items())), strange
+class FileNames(NamedTuple):
+    """The files in the directory of a live map, by what they are.
+
+    Attributes
+    ----------
+    chunks
+        By key, in the order of the keys.
+    strange
+        Named like files of chunks, but of chunks that cannot be.
+    interim
+        Files that did not get their own names yet.
+    quarantined
+        Damaged or unreadable files that were given other names.
+    """
+
+    everything: list[str]
+    chunks: dict[ChunkKey, str]
+    strange: list[str]
+    interim: list[str]
+    quarantined: list[str]
+
+    @classmethod
+    def of(cls, names: Iterable[str]) -> FileNames:
+        """Sort names by what they mean."""
+        found = cls(sorted(names), {}, [], [], [])
+        chunks: dict[ChunkKey, str] = {}
+        for name in found.everything:
+            if name.startswith(".") and name.endswith(INTERIM):
+                found.interim.append(name)
+            elif DAMAGED in name and name.rpartition(".")[2].isdecimal():
+                found.quarantined.append(name)
+            elif name.endswith(CHUNK):
+                try:
+                    chunks[ChunkKey.from_text(name.removesuffix(CHUNK))] = name
+                except BadRequest:
+                    found.strange.append(name)
+        found.chunks.update(sorted(chunks.items()))
+        return found
+
+    @property
+    def of_map(self) -> list[str]:
+        """The map's own files, in the order in which they may be removed or moved.
+
+        Whatever a kill leaves is a live map still: ``map.json``, without which chunks mean nothing, goes
+        last, and the manifest, for which chunks would be missing, first.
+        """
+        own = (f".{MAP_FILE}.", f".{MANIFEST}.")
+        interim = [name for name in self.interim if name.startswith(own) or f"{CHUNK}." in name]
+        others = [*self.chunks.values(), *self.strange, *self.quarantined, *interim]
+        there = set(self.everything)
+        first, last = [MANIFEST] if MANIFEST in there else [], [MAP_FILE] if MAP_FILE in there else []
+        return [*first, *sorted(others), *last]
 
 
 def _whole(files: FilesToRead, name: str, most: int) -> bytes:
-    """All of a file that is no longer than it can be; raises as `read_map`."""
+    """Return all of a file that is no longer than it can be; raise as `read_map`."""
     data = files.read(name, most + 1)
     if len(data) > most:
         raise MapDataError(f"it has more than {most:,} bytes", path=name, cause="too_long")
@@ -171,8 +219,13 @@ def _whole(files: FilesToRead, name: str, most: int) -> bytes:
 
 
 def read_chunk(files: FilesToRead, name: str) -> bytes:
-    """Return the whole file of a chunk, which may be anything yet; raises as `read_map`."""
-    return _whole(files, name, _MOST_CHUNK_BYTES)
+    """Return the whole file of a chunk, unchecked; raise as `read_map`."""
+    return _whole(files, name, _MAX_CHUNK_FILE_BYTES)
+
+
+def read_header(files: FilesToRead, name: str, path: str = "") -> ChunkFileHeader:
+    """Return the header of a chunk's file, which errors call ``path``; raise as `read_map`."""
+    return read_file_header(files.read(name, FILE_HEADER_BYTES), path or name)
 
 
 # made here, once: msgspec ends the process if threads are the first to decode a type at the same time
@@ -184,12 +237,12 @@ def _decoded(data: bytes, decoder: msgspec.json.Decoder[_T], name: str) -> _T:
     try:
         return decoder.decode(data)
     except _NOT_DECODED as error:
-        said = str(error) or type(error).__name__
-        raise MapDataError(f"it is damaged: {said}", path=name) from error
+        reason = str(error) or type(error).__name__
+        raise MapDataError(f"it is damaged: {reason}", path=name) from error
 
 
 def read_map(files: FilesToRead) -> MapRecord:
-    """Return what ``map.json`` says.
+    """Read ``map.json``.
 
     Raises
     ------
@@ -198,26 +251,26 @@ def read_map(files: FilesToRead) -> MapRecord:
     OSError
         It cannot be read.
     """
-    found = _decoded(_whole(files, MAP_FILE, _MOST_MAP_BYTES), _map_record, MAP_FILE)
+    found = _decoded(_whole(files, MAP_FILE, _MAX_MAP_BYTES), _map_record, MAP_FILE)
     if found.format != MAP_FORMAT:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MAP_FILE)
     numbers = [one.number for one in found.mappers]
     least, most = _RESOLUTION_M
-    for is_so, what in (
+    for is_right, what in (
         (_MAP_ID.fullmatch(found.map_id), "map_id is not 32 hexadecimal digits"),
         (least <= found.settings.resolution <= most, f"resolution {found.settings.resolution!r}"),
-        (0 < len(found.settings.frame_id.encode()) <= MOST_FRAME_BYTES, "frame_id is empty or too long"),
+        (0 < len(found.settings.frame_id.encode()) <= MAX_FRAME_BYTES, "frame_id is empty or too long"),
         (len(numbers) <= MAPPERS, f"{len(numbers)} mappers; {MAPPERS} are the most"),
         (len(set(numbers)) == len(numbers), "two mappers have one number"),
         (max(numbers, default=0) < found.next_mapper, "a mapper has a number that was not given yet"),
     ):
-        if not is_so:
+        if not is_right:
             raise MapDataError(f"it is damaged: {what}", path=MAP_FILE)
     return found
 
 
 def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, int]]:
-    """Return the chunks that the manifest lists, and up to which scan of each mapper all are durable.
+    """Return the chunks that the manifest lists, and the scan up to which all of each mapper's are durable.
 
     Raises
     ------
@@ -226,7 +279,7 @@ def read_manifest(files: FilesToRead) -> tuple[dict[ChunkKey, Row], dict[int, in
     OSError
         It cannot be read; FileNotFoundError: there is none.
     """
-    found = _decoded(_whole(files, MANIFEST, _MOST_MANIFEST_BYTES), _manifest, MANIFEST)
+    found = _decoded(_whole(files, MANIFEST, _MAX_MANIFEST_BYTES), _manifest, MANIFEST)
     if found.format != MAP_FORMAT:
         raise MapDataError(f"format {found.format}; this reads {MAP_FORMAT}", path=MANIFEST)
     try:

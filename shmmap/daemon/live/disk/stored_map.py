@@ -10,11 +10,11 @@ import contextlib
 import os
 from collections.abc import Iterator
 
-from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, decode_chunk, read_file_header
+from shmmap.chunks.chunk_file import ChunkFileHeader, decode_chunk, read_file_header
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, keys_of, read_chunk, read_map
-from shmmap.daemon.live.folder import FilesToRead, Folder, FolderToRead, is_aside
+from shmmap.daemon.live.disk.folder import FilesToRead, Folder, FolderToRead
+from shmmap.daemon.live.disk.map_record import CHUNK, MAP_FILE, FileNames, read_chunk, read_header, read_map
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 
 __all__ = ["StoredMap", "opened_folder", "opened_folder_to_read"]
@@ -25,21 +25,15 @@ class StoredMap:
 
     Parameters
     ----------
-    files
-        Of its directory.
     path
         What errors call the directory.
 
     Attributes
     ----------
     map_id, settings
-        As ``map.json`` has them.
-    chunks : dict
-        The files of chunks by key, in the order of the keys.
-    strange : list
-        Files that are called as those of chunks are, but for a chunk that cannot be.
-    aside : list
-        Files that were put aside, because they could not be read.
+        As in ``map.json``.
+    names, chunks
+        All files of the directory, and among them those of chunks, by key.
 
     Raises
     ------
@@ -63,23 +57,22 @@ class StoredMap:
             ) from error
         self.map_id = bytes.fromhex(record.map_id)
         self.settings = record.settings
-        self.names = sorted(files.names())
-        self.chunks, self.strange = keys_of(self.names)
-        self.aside = [name for name in self.names if is_aside(name)]
+        self.names = FileNames.of(files.names())
+        self.chunks = self.names.chunks
 
     def header(self, key: ChunkKey) -> ChunkFileHeader:
-        """What a file says of its chunk; raises as `chunk`."""
+        """Return the header of a chunk's file; raise as `chunk`."""
         path = self.path_of(key)
         with _reading(path):
-            return read_file_header(self.files.read(self.chunks[key], FILE_HEADER_BYTES), path)
+            return read_header(self.files, self.chunks[key], path)
 
     def chunk(self, key: ChunkKey) -> tuple[ChunkFileHeader, ChunkView]:
-        """Read a chunk whole, and prove that it is as it was saved.
+        """Read a whole chunk, and prove that it is as it was saved.
 
         Raises
         ------
         MapDataError
-            It is not; or it cannot be read at all (cause ``unreadable``), or is not there any more (cause
+            It is not; or it cannot be read at all (cause ``unreadable``), or was removed meanwhile (cause
             ``missing``).
         PackageMissing
             The package for its codec is not installed.
@@ -91,7 +84,7 @@ class StoredMap:
             return read_file_header(data), view
 
     def path_of(self, key: ChunkKey) -> str:
-        """Path of a chunk's file."""
+        """Return the path of a chunk's file."""
         return os.path.join(self.path, self.chunks[key])
 
 
@@ -109,28 +102,27 @@ def _reading(path: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def opened_folder_to_read(path: str) -> Iterator[FolderToRead]:
-    """The directory of a live map, which others may be changing.
+    """Open the directory of a live map, which others may be changing.
 
     Raises
     ------
     MapMissing
         There is no live map, or it cannot be opened.
     MapDataError
-        There are chunks, but nothing that says what they are.
+        There are chunks, but no ``map.json`` that says what they are.
     """
-    folder = _opened(path)
-    with contextlib.closing(folder):
+    with contextlib.closing(_opened(path)) as folder:
         yield folder
 
 
 @contextlib.contextmanager
 def opened_folder(path: str, hint: str) -> Iterator[Folder]:
-    """The directory of a live map, for this process alone; ``hint`` says what to do if it is not.
+    """Open the directory of a live map for this process alone; ``hint`` is the remedy if it is in use.
 
     Raises
     ------
     InstanceBusy
-        Somebody works with it.
+        Another process works with it.
     MapMissing, MapDataError
         As `opened_folder_to_read`.
     """

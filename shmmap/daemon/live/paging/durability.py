@@ -1,19 +1,105 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which scans no power cut takes away: those all of whose chunks have been written and flushed since."""
+"""Chunks of a live map, the scans that they take in, and which scans are safe from power cuts.
+
+A scan is durable when all its chunks have been written and flushed since they took it in.
+"""
 
 from __future__ import annotations
 
+import enum
 import math
+from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.paging.records import Chunk, Scan
 
-__all__ = ["Durability"]
+__all__ = ["Chunk", "Durability", "Scan", "State"]
 
 TOGETHER_S: Final = 1.0
-"""Files that were written in this time are flushed together: each once, however often it was written."""
+"""Files written within this time are flushed together: each once, however often it was written."""
+
+
+class State(enum.Enum):
+    """State of a chunk in memory, or of one that is being brought there."""
+
+    LOADING = "loading"
+    CLEAN = "clean"
+    DIRTY = "dirty"
+    SAVING = "saving"
+
+
+@dataclass(eq=False, slots=True)
+class Scan:
+    """One scan of a mapper until it is durable.
+
+    Attributes
+    ----------
+    mapper, number
+        Which mapper sent it, and under which number.
+    nbytes
+        Memory that it takes until it is applied.
+    to_apply
+        Chunks that have not taken it in yet.
+    to_save
+        Chunks that have, with the version that they reached by it, and are not durable in that version.
+    """
+
+    mapper: int
+    number: int
+    nbytes: int
+    to_apply: set[ChunkKey]
+    to_save: dict[ChunkKey, int] = field(default_factory=dict)
+
+    @property
+    def applied(self) -> bool:
+        """Whether all of it is in memory that outlives any process."""
+        return not self.to_apply
+
+    @property
+    def durable(self) -> bool:
+        """Whether all of it is on the disk."""
+        return not self.to_apply and not self.to_save
+
+
+@dataclass(eq=False, slots=True)
+class Chunk:
+    """A chunk in memory, or one that is to be there.
+
+    Attributes
+    ----------
+    version, saved, durable
+        The version in memory, in its file, and on the disk, safe from power cuts.
+    in_progress
+        It is being loaded.
+    leaving
+        It is being saved in order to be given up.
+    retry_s
+        Its file is not tried again before this time.
+    missing_bytes
+        Memory that it needs for its next scan, and did not get.
+    waiting
+        Scans that it has yet to take in, in this order.
+    unsaved
+        Scans that it has taken in and that are not durable, with its version after each.
+    """
+
+    key: ChunkKey
+    state: State = State.LOADING
+    nbytes: int = 0
+    active: int = 0
+    version: int = 0
+    saved: int = 0
+    durable: int = 0
+    in_progress: bool = False
+    leaving: bool = False
+    retry_s: float = -math.inf
+    dirty_since_s: float = 0.0
+    changed_s: float = -math.inf
+    missing_bytes: int = 0
+    waiting: deque[Scan] = field(default_factory=deque)
+    unsaved: deque[tuple[int, Scan]] = field(default_factory=deque)
 
 
 class Durability:
@@ -24,9 +110,9 @@ class Durability:
     written
         Chunks whose files were written since the last flush began, with the versions.
     flushing
-        What the flush that is under way makes durable.
+        What the running flush makes durable.
     retry_s
-        Not before that: a flush failed.
+        No flush before this time: one failed.
     """
 
     def __init__(self) -> None:
@@ -39,17 +125,17 @@ class Durability:
 
     @property
     def due_s(self) -> float:
-        """When what was written is to be flushed; infinity for not at all."""
+        """When what was written is to be flushed; infinity for never."""
         return max(self._first_s + TOGETHER_S, self.retry_s)
 
     def note_written(self, chunk: Chunk, version: int, now_s: float) -> None:
-        """A chunk's file was written."""
+        """Note that a chunk's file was written."""
         self._first_s = min(self._first_s, now_s)
         self.written.append((chunk, version))
         self._written_keys.add(chunk.key)
 
     def note_loaded(self, chunk: Chunk) -> None:
-        """A chunk has come back as its file is, which may not be durable yet."""
+        """Note that a chunk came back as in its file, which may not be durable yet."""
         if chunk.key in self._written_keys:
             self.written.append((chunk, chunk.version))
         elif chunk.key in self._flushing_keys:
@@ -59,34 +145,34 @@ class Durability:
 
     @staticmethod
     def note_applied(chunk: Chunk, scan: Scan) -> None:
-        """A chunk has taken in a scan, or had before."""
+        """Note that a chunk has taken in a scan, now or before."""
         if chunk.version > chunk.durable:
             scan.to_save[chunk.key] = chunk.version
             chunk.unsaved.append((chunk.version, scan))
 
     def missing(self, chunks: Iterable[Chunk]) -> list[tuple[Chunk, int]]:
-        """Chunks, of these and of those given up since they were written, that are not durable as they are.
+        """Return what is not durable of these chunks, and of those given up since they were written.
 
-        Each is, when its ``durable`` comes to the version that stands beside it.
+        Each is durable once its ``durable`` reaches the version beside it.
         """
-        there = [(chunk, chunk.version) for chunk in chunks if chunk.version > chunk.durable]
-        return [*there, *self.written, *self.flushing]
+        in_memory = [(chunk, chunk.version) for chunk in chunks if chunk.version > chunk.durable]
+        return [*in_memory, *self.written, *self.flushing]
 
     def begin(self) -> None:
-        """A flush begins: it makes durable what was written until now."""
+        """Begin a flush, which makes durable what was written until now."""
         self.flushing, self.written = self.written, []
         self._flushing_keys, self._written_keys = self._written_keys, set()
         self._first_s = math.inf
 
     def failed(self, retry_s: float) -> None:
-        """The flush did not come about; it is tried again then."""
+        """End a flush that failed; it is tried again at this time."""
         self.flushing, self.written = [], self.flushing + self.written
         self._written_keys |= self._flushing_keys
         self._flushing_keys = set()
         self._first_s, self.retry_s = -math.inf, retry_s
 
     def flushed(self) -> list[Scan]:
-        """The flush is over; returns the scans that are durable by that."""
+        """End a flush; return the scans that it made durable."""
         done: list[Scan] = []
         for chunk, version in self.flushing:
             chunk.durable = max(chunk.durable, version)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keys of chunks in their order, found by area and walked through a part at a time."""
+"""Keys of chunks in order: found by area, and iterated over a part at a time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class KeyIndex:
     Parameters
     ----------
     keys
-        What it begins with.
+        Its first content.
     """
 
     def __init__(self, keys: Iterable[ChunkKey] = ()) -> None:
@@ -44,7 +44,7 @@ class KeyIndex:
         return key in self._keys
 
     def add(self, key: ChunkKey) -> None:
-        """Add a key, unless it is there."""
+        """Add a key, unless it is in the set."""
         if key in self._keys:
             return
         self._keys.add(key)
@@ -55,7 +55,7 @@ class KeyIndex:
         insort(column, key)
 
     def discard(self, key: ChunkKey) -> None:
-        """Remove a key, if it is there."""
+        """Remove a key, if it is in the set."""
         if key not in self._keys:
             return
         self._keys.remove(key)
@@ -75,14 +75,14 @@ class KeyIndex:
         after
             Keys up to this one are left out; None: from the first one on.
         most
-            Keys and columns that are looked at, not those that are found.
+            Keys and columns to look at, not to find.
 
         Returns
         -------
         keys
             Sorted.
         last
-            Pass it as ``after`` for what comes next; None at the end.
+            Pass it as ``after`` to go on; None at the end.
         """
         low, high = within
         found: list[ChunkKey] = []
@@ -115,7 +115,7 @@ class KeyIndex:
 def merged_part(
     indexes: Sequence[KeyIndex], after: ChunkKey | None, within: KeyRange, most: int
 ) -> tuple[list[ChunkKey], ChunkKey | None]:
-    """Return the next keys that are in any of these; as `KeyIndex.part`."""
+    """Return the next keys that are in any of these indexes; as `KeyIndex.part`."""
     parts = [index.part(after, within, most) for index in indexes]
     if len(parts) == 1:
         return parts[0]

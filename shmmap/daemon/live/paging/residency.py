@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which chunks of a live map are in memory: what is loaded, written, saved and given up, and in which order.
+"""Which chunks of a live map are in memory: what is loaded, applied, saved and given up, and in which order.
 
-Pure: clock and bytes are injected, and nothing is done here.  The owner of the memory asks what is to be done
-next (`next_load`, `ready`, `next_save`, `next_eviction`) and reports when it was done.
+Pure: clock and sizes are injected, and nothing is done here.  The owner of the memory asks what to do next
+(`next_load`, `ready`, `next_save`, `next_eviction`) and reports when it has done it.
 
 - A chunk is loaded because a scan waits for it, or because it is near a client.  It stays until its room is
-  needed: for a chunk near a client only what is near none is given up, for a scan anything, the furthest
-  first.
-- A scan is never dropped: for a chunk that is not in memory it waits, and scans are applied in the order in
+  needed.  For a chunk near a client, only chunks near no client are given up; for a scan, any chunk, the
+  furthest first.
+- A scan is never dropped: it waits for chunks that are not in memory, and scans are applied in the order in
   which they came.  What waits is bounded; beyond that scans are not accepted (`has_room`).
-- A chunk that was written is saved before it is given up (when memory is half full, before its room is
-  needed), and is durable after `Limits.checkpoint_s`; one that is written while it is saved is dirty again.
+- A changed chunk is saved before it is given up (once memory is half full, before its room is needed), and is
+  durable after `Limits.checkpoint_s`.  A chunk that changes while it is saved is dirty again.
 """
 
 from __future__ import annotations
@@ -18,35 +18,76 @@ from __future__ import annotations
 import enum
 import math
 from collections import deque
+from dataclasses import dataclass
 from itertools import islice, takewhile
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.paging.durability import TOGETHER_S, Durability
+from shmmap.daemon.live.paging.durability import TOGETHER_S, Chunk, Durability, Scan, State
 from shmmap.daemon.live.paging.key_index import KeyIndex
-from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
 from shmmap.daemon.live.paging.windows import Windows
 
-__all__ = ["REVIEW_S", "Residency"]
+__all__ = ["REVIEW_S", "Limits", "Residency"]
 
 RETRY_S: Final = 1.0
-"""How long after a file could not be read or written, or a scan needed the room, it is tried again."""
+"""When a file that could not be read or written, or a chunk whose room a scan needed, is tried again."""
 REVIEW_S: Final = 0.1
-"""How often, at most, all chunks are gone over for what may be given up; 30 000 take 30 ms."""
-IN_VAIN_S: Final = 1.0
-"""The same, where nothing was found the last time and no client has moved."""
-REVIEWED_OF_NEWS: Final = 32
-"""All are also reviewed when one chunk in this many came or changed since."""
-SAVED_AHEAD_OF: Final = 32
-"""How many of the chunks changed longest ago are looked at for one that nothing wants."""
-FOUND_AT_ONCE: Final = 64, 16
+"""Shortest time between two reviews of all chunks for what may be given up; 30 000 take 30 ms."""
+FRUITLESS_S: Final = 1.0
+"""The same, where the last review found nothing and no client has moved."""
+CHUNKS_PER_CHANGE: Final = 32
+"""All chunks are also reviewed when one in this many came or changed since."""
+SAVE_CANDIDATES: Final = 32
+"""How many of the chunks changed longest ago are searched for one that is not wanted."""
+FOUND_PER_REVIEW: Final = 64, 16
 """How many chunks one review finds: at least the first, or one in the second; their order gets old."""
 
 
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a map may take.
+
+    Attributes
+    ----------
+    budget_bytes
+        Memory of all chunks and of what is beside them: lists of voxels, marks of scans.
+    reserve_bytes
+        Memory that chunks may take whatever is beside them: so the map can always be written.
+    max_chunks
+        Chunks in memory; 0 for no limit.  Each takes a descriptor and a mapping.
+    most_active
+        Known voxels of all chunks in memory; 0 for no limit.
+    waiting_bytes
+        Marks of scans that wait for chunks.
+    radius
+        Chunks around a client's that are kept, along each axis; 1 for its 26 neighbours.
+    hysteresis
+        How far a client has to be in another chunk until its window follows, as a part of a chunk.
+    linger_s
+        How long a chunk outside all windows counts as near after a scan changed it.
+    checkpoint_s
+        How long a change may be in memory alone.
+    loads, saves
+        Files that are being read and written, or wait for a thread.
+    """
+
+    budget_bytes: int
+    reserve_bytes: int = 0
+    max_chunks: int = 0
+    most_active: int = 0
+    waiting_bytes: int = 64 << 20
+    radius: int = 1
+    hysteresis: float = 0.2
+    linger_s: float = 2.0
+    checkpoint_s: float = 10.0
+    loads: int = 16
+    saves: int = 16
+
+
 class _Short(enum.IntEnum):
-    """What memory is short for, and so what may be given up: nothing, what is near no client, anything."""
+    """What memory is short for, and so what may be given up: nothing, chunks near no client, any chunk."""
 
     NO = 0
     NEAR = 1
@@ -54,7 +95,7 @@ class _Short(enum.IntEnum):
 
 
 class _Rank(NamedTuple):
-    """How soon a chunk is given up: the greatest is the first."""
+    """Place of a chunk in the order of giving up: the greatest goes first."""
 
     is_idle: bool
     is_unwanted: bool
@@ -65,7 +106,7 @@ _SAVED_TO_GO: Final = _Rank(True, True, 1 << 62)
 
 
 class _Missing:
-    """Chunks near a client that are not in memory, by the distance at which they came near."""
+    """Chunks near a client that are not in memory, by their distance when they came near."""
 
     def __init__(self, radius: int) -> None:
         self._levels: list[dict[ChunkKey, None]] = [{} for _ in range(radius + 1)]
@@ -78,7 +119,7 @@ class _Missing:
         return key in self._level
 
     def add(self, key: ChunkKey, distance: int) -> None:
-        """Add a chunk, or have it in another place."""
+        """Add a chunk, or change its distance."""
         self.discard(key)
         self._level[key] = min(distance, len(self._levels) - 1)
         self._levels[self._level[key]][key] = None
@@ -90,12 +131,12 @@ class _Missing:
             del self._levels[level][key]
 
     def nearest(self) -> ChunkKey:
-        """One of the nearest; there must be one."""
+        """Return one of the nearest; there must be one."""
         return next(reversed(next(level for level in self._levels if level)))
 
 
 class Residency:
-    """Decides for one map.
+    """Decides what one map has in memory.
 
     Parameters
     ----------
@@ -107,15 +148,13 @@ class Residency:
     Attributes
     ----------
     chunks, index
-        All that are in memory, or wanted there, and their keys in order.
+        All chunks that are in memory, or wanted there, and their keys in order.
     chunk_bytes, waiting_bytes
-        Memory of chunks, and what waiting scans take.
+        Memory of chunks, and of scans that wait.
     beside_bytes, asked_bytes
         Memory that is taken beside the chunks, and that something waits for.
     active
         Known voxels in memory.
-    windows, durability
-        What is near a client; which scans are safe from power cuts.
     """
 
     def __init__(self, limits: Limits, *, new_bytes: int = 4096) -> None:
@@ -127,30 +166,28 @@ class Residency:
         self.loading = self.saving = 0
         self._held = 0  # chunks that take memory
         self._new_bytes = new_bytes
-        self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # then it is flushed
+        self._save_after_s = max(0.0, limits.checkpoint_s - TOGETHER_S)  # the flush takes the rest
         self._sizes: dict[ChunkKey, int] = {}
         self.windows = Windows(limits.radius, limits.hysteresis)
         self._missing = _Missing(limits.radius)
         self._needing: dict[ChunkKey, Chunk] = {}
-        self._dirty: dict[ChunkKey, Chunk] = {}  # since the longest first
-        self._found: dict[State, list[tuple[_Rank, Chunk]]] = {
-            State.CLEAN: [],
-            State.DIRTY: [],
-        }  # to give up, the first last
-        self._review_s = dict.fromkeys(self._found, -math.inf)  # not before, unless much happens
-        self._in_vain_s = dict.fromkeys(self._found, -math.inf)  # nor before that, unless a client moves
+        self._dirty: dict[ChunkKey, Chunk] = {}  # changed longest ago first
+        # what to give up, the first last
+        self._found: dict[State, list[tuple[_Rank, Chunk]]] = {State.CLEAN: [], State.DIRTY: []}
+        self._review_s = dict.fromkeys(self._found, -math.inf)  # no review before, unless much changes
+        self._fruitless_s = dict.fromkeys(self._found, -math.inf)  # nor before this, unless a client moves
         self._reviewed = dict.fromkeys(self._found, _Short.NO)
-        self._news = dict.fromkeys(self._found, 0)
-        self._save_s = self._near_s = -math.inf  # not before: a file could not be written, or loaded
+        self._changes = dict.fromkeys(self._found, 0)
+        self._save_s = self._near_s = -math.inf  # none before: a file could not be written, or loaded
         self.durability = Durability()
 
     def fits(self, more_bytes: int) -> bool:
-        """Whether so much more memory may be taken now beside the chunks."""
+        """Whether this much more memory may be taken now beside the chunks."""
         return self.chunk_bytes + self.beside_bytes + more_bytes <= self.limits.budget_bytes
 
     def _fits(self, more_bytes: int, more_chunks: int = 0) -> bool:
         limits = self.limits
-        if limits.most_chunks and self._held + more_chunks > limits.most_chunks:
+        if limits.max_chunks and self._held + more_chunks > limits.max_chunks:
             return False
         return self.fits(more_bytes) or self.chunk_bytes + more_bytes <= limits.reserve_bytes
 
@@ -161,7 +198,7 @@ class Residency:
         chunk.nbytes, chunk.active = nbytes, active
 
     def _want(self, key: ChunkKey) -> Chunk:
-        """The chunk of this key, which is to be in memory."""
+        """Return the chunk of this key, which is to be in memory."""
         chunk = self.chunks.get(key)
         if chunk is None:
             chunk = self.chunks[key] = Chunk(key)
@@ -173,7 +210,7 @@ class Residency:
         self.index.discard(key)
 
     def move(self, client: object, position: tuple[float, float, float]) -> None:
-        """A client is somewhere, in chunks; see `Windows.move`."""
+        """Move a client to a position in chunks; see `Windows.move`."""
         entered, left = self.windows.move(client, position)
         center = self.windows.center(client)
         if not entered or center is None:
@@ -185,27 +222,27 @@ class Residency:
                 self._missing.add(key, key.distance(center))
         if center in self._missing:
             self._missing.add(center, 0)
-        self._in_vain_s = dict.fromkeys(self._found, -math.inf)
+        self._fruitless_s = dict.fromkeys(self._found, -math.inf)
 
     def leave(self, client: object) -> None:
-        """A client has gone."""
+        """Forget a client's position."""
         for key in self.windows.leave(client):
             self._missing.discard(key)
-        self._in_vain_s = dict.fromkeys(self._found, -math.inf)
+        self._fruitless_s = dict.fromkeys(self._found, -math.inf)
 
     def is_wanted(self, chunk: Chunk, now_s: float) -> bool:
-        """Whether a chunk is to stay: a scan waits for it, it is near a client, or was just changed."""
+        """Whether a chunk should stay: a scan waits for it, it is near a client, or it was just changed."""
         near = chunk.key in self.windows.near
         return near or bool(chunk.waiting) or now_s < chunk.changed_s + self.limits.linger_s
 
     # --- scans ----------------------------------------------------------------------------------
 
     def has_room(self, nbytes: int) -> bool:
-        """Whether a scan may come: what waits is bounded, and a single one may always wait."""
+        """Whether another scan is accepted: what waits is bounded, and a single one may always wait."""
         return not self.waiting_bytes or self.waiting_bytes + nbytes <= self.limits.waiting_bytes
 
     def add(self, scan: Scan) -> None:
-        """A scan has come: every chunk that it touches is wanted until it has taken it in."""
+        """Add a scan: every chunk that it touches is wanted until it has taken the scan in."""
         if scan.to_apply:
             self.waiting_bytes += scan.nbytes
         for key in scan.to_apply:
@@ -215,16 +252,16 @@ class Residency:
             self._needing[key] = chunk
 
     def ready(self) -> list[tuple[Chunk, Scan]]:
-        """What can be applied now: of each chunk in memory the scan that comes next.
+        """Return what can be applied now: each chunk in memory with its next scan.
 
-        Those that had not the memory for it, and have not now, come last.
+        Chunks that lacked the memory for it, and still do, come last.
         """
-        there = [chunk for chunk in self._needing.values() if chunk.state is not State.LOADING]
-        return [(chunk, chunk.waiting[0]) for chunk in sorted(there, key=self._lacks_memory)]
+        loaded = [chunk for chunk in self._needing.values() if chunk.state is not State.LOADING]
+        return [(chunk, chunk.waiting[0]) for chunk in sorted(loaded, key=self._lacks_memory)]
 
     @property
     def is_ready(self) -> bool:
-        """Whether something can be applied now for which there may be memory."""
+        """Whether a scan can be applied now for which there may be memory."""
         needing = self._needing.values()
         return any(one.state is not State.LOADING and not self._lacks_memory(one) for one in needing)
 
@@ -232,7 +269,7 @@ class Residency:
         return bool(chunk.missing_bytes) and not self._fits(chunk.missing_bytes)
 
     def may_grow(self, chunk: Chunk, more_bytes: int) -> bool:
-        """Whether a chunk may take so much more memory now; if not, others are given up for it."""
+        """Whether a chunk may take this much more memory now; if not, others are given up for it."""
         fits = self._fits(more_bytes)
         chunk.missing_bytes = 0 if fits else more_bytes
         return fits
@@ -240,14 +277,14 @@ class Residency:
     def applied(
         self, chunk: Chunk, scan: Scan, *, version: int, nbytes: int, active: int, now_s: float
     ) -> None:
-        """A chunk has taken in the scan that it waited for first; ValueError if another one comes first."""
+        """Note that a chunk has taken in its next scan; raise ValueError if another one comes first."""
         if chunk.waiting[0] is not scan:
             raise ValueError("scans of a chunk are applied in the order in which they came")
         chunk.waiting.popleft()
         if not chunk.waiting:
             del self._needing[chunk.key]
         self._resize(chunk, nbytes, active)
-        self._note_news()
+        self._note_change()
         chunk.missing_bytes, chunk.changed_s = 0, now_s
         if version > chunk.version:
             chunk.version = version
@@ -265,7 +302,7 @@ class Residency:
     def adopt(
         self, key: ChunkKey, *, version: int, saved: int, nbytes: int, active: int, now_s: float
     ) -> Chunk:
-        """A chunk is in memory since an earlier life of the writer; its file has the version ``saved``."""
+        """Note a chunk that a previous writer left in memory; its file has the version ``saved``."""
         chunk = self._want(key)
         chunk.state, chunk.version, chunk.saved, chunk.durable = State.CLEAN, version, saved, saved
         self._missing.discard(key)
@@ -275,17 +312,17 @@ class Residency:
         return chunk
 
     def note_size(self, key: ChunkKey, nbytes: int) -> None:
-        """A chunk on disk takes so much memory."""
+        """Note how much memory a chunk on disk will take."""
         self._sizes[key] = nbytes
 
     def _size(self, key: ChunkKey) -> int:
         return self._sizes.get(key, self._new_bytes)
 
     def next_load(self, now_s: float) -> Chunk | None:
-        """The chunk to load now: those that scans wait for first, then what is nearest to a client."""
+        """Return the chunk to load now: first those that scans wait for, then the nearest to a client."""
         if self.loading >= self.limits.loads:
             return None
-        kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # room was made for these
+        kept_bytes = sum(chunk.missing_bytes for chunk in self._needing.values())  # their room was made
         for chunk in self._needing.values():
             if self._can_load(chunk, now_s) and self._fits(self._size(chunk.key) + kept_bytes, 1):
                 return self._begin_load(chunk)
@@ -297,28 +334,28 @@ class Residency:
         return None
 
     def _can_load(self, chunk: Chunk, now_s: float) -> bool:
-        return chunk.state is State.LOADING and not chunk.under_way and chunk.retry_s <= now_s
+        return chunk.state is State.LOADING and not chunk.in_progress and chunk.retry_s <= now_s
 
     def _begin_load(self, chunk: Chunk) -> Chunk:
-        chunk.under_way = True
+        chunk.in_progress = True
         self._resize(chunk, self._size(chunk.key), 0)
         self.loading += 1
         return chunk
 
     def loaded(self, chunk: Chunk, *, version: int, nbytes: int, active: int) -> None:
-        """A chunk is in memory as it is on disk, or new: version 0."""
+        """Note that a chunk is in memory as on disk, or new: version 0."""
         self.loading -= 1
-        chunk.under_way = False
+        chunk.in_progress = False
         chunk.state = State.CLEAN
-        self._note_news()
+        self._note_change()
         self._resize(chunk, nbytes, active)
         chunk.version = chunk.saved = version
         self.durability.note_loaded(chunk)
 
     def load_failed(self, chunk: Chunk, now_s: float) -> None:
-        """A file could not be read just now: what waits for it goes on waiting."""
+        """Note that a file could not be read: scans that wait for it go on waiting."""
         self.loading -= 1
-        chunk.under_way = False
+        chunk.in_progress = False
         self._resize(chunk, 0, 0)
         chunk.retry_s = now_s + RETRY_S
         if not chunk.waiting:
@@ -327,14 +364,14 @@ class Residency:
             self._note_missing(chunk.key)
 
     def _note_missing(self, key: ChunkKey) -> None:
-        """A chunk is not in memory; if it is near a client it is loaded again after the others."""
+        """Have a chunk that left memory loaded again, after the others, if it is near a client."""
         if key in self.windows.near:
             self._missing.add(key, self.limits.radius)
 
     # --- saving ---------------------------------------------------------------------------------
 
     def _short(self, now_s: float) -> _Short:
-        """What memory is short for now."""
+        """Return what memory is short for now."""
         limits = self.limits
         if (
             (limits.most_active and self.active > limits.most_active)
@@ -352,13 +389,13 @@ class Residency:
         return _Short.NO
 
     def _may_go(self, chunk: Chunk, now_s: float, short: _Short) -> bool:
-        """Whether a chunk may be given up; one that can take in a scan now does that first."""
+        """Whether a chunk may be given up; one that can take in a scan now takes it in first."""
         if chunk.state is State.LOADING or (chunk.waiting and not self._lacks_memory(chunk)):
             return False
         return short is _Short.SCANS or (short is _Short.NEAR and not self.is_wanted(chunk, now_s))
 
     def _next_victim(self, now_s: float, state: State) -> Chunk | None:
-        """What to give up next, of the chunks that are clean, or dirty."""
+        """Return the clean, or dirty, chunk to give up next."""
         short = self._short(now_s)
         if short is _Short.NO:
             return None
@@ -371,13 +408,13 @@ class Residency:
                 may_go = self._may_go(chunk, now_s, short)
                 if may_go and not (state is State.DIRTY and self._has_clean(rank, now_s, short)):
                     return chunk
-                if may_go or short < self._reviewed[state]:  # its turn comes when memory is shorter again
+                if may_go or short < self._reviewed[state]:  # it goes when memory is shorter again
                     found.append((rank, chunk))
                     return None
         return None
 
     def _has_clean(self, rank: _Rank, now_s: float, short: _Short) -> bool:
-        """Whether a clean chunk is given up before one of this rank: then that is not saved for it."""
+        """Whether a clean chunk is given up before one of this rank, which then need not be saved."""
         found = self._found[State.CLEAN]
         return (
             bool(found)
@@ -386,31 +423,31 @@ class Residency:
             and self._may_go(found[-1][1], now_s, short)
         )
 
-    def _note_news(self) -> None:
-        """A chunk came, was changed or saved."""
-        for state in self._news:
-            self._news[state] += 1
+    def _note_change(self) -> None:
+        """Count a chunk that came, was changed or saved."""
+        for state in self._changes:
+            self._changes[state] += 1
 
     def _is_review_due(self, now_s: float, state: State, short: _Short) -> bool:
-        """Whether all chunks are gone over again: seldom, or for a scan when much has happened."""
-        if now_s >= max(self._review_s[state], self._in_vain_s[state]) or short > self._reviewed[state]:
+        """Whether to review all chunks again: seldom, or for a scan when much has changed."""
+        if now_s >= max(self._review_s[state], self._fruitless_s[state]) or short > self._reviewed[state]:
             return True
-        idle = not self.loading and not self.saving
-        much = self._news[state] > 0 if idle else self._news[state] * REVIEWED_OF_NEWS >= len(self.chunks)
+        idle, changes = not self.loading and not self.saving, self._changes[state]
+        much = changes > 0 if idle else changes * CHUNKS_PER_CHANGE >= len(self.chunks)
         return much and short is _Short.SCANS and not self._found[state]
 
     def _review(self, now_s: float, state: State, short: _Short) -> None:
-        """Find what may be given up: what is not wanted first, then the furthest."""
-        self._news[state], self._reviewed[state] = 0, short
+        """Find the chunks that may be given up: unwanted ones first, then the furthest."""
+        self._changes[state], self._reviewed[state] = 0, short
         every = self._dirty if state is State.DIRTY else self.chunks
         found = [one for one in every.values() if one.state is state and self._may_go(one, now_s, short)]
         self._review_s[state] = now_s + REVIEW_S
-        self._in_vain_s[state] = -math.inf if found else now_s + IN_VAIN_S
+        self._fruitless_s[state] = -math.inf if found else now_s + FRUITLESS_S
         is_idle = np.array([not one.waiting for one in found], bool)
         is_unwanted = np.array([not self.is_wanted(one, now_s) for one in found], bool)
         distance = self.windows.distances([one.key for one in found])
         order = np.lexsort((np.array([-one.active for one in found]), distance, is_unwanted, is_idle))
-        least, part = FOUND_AT_ONCE
+        least, part = FOUND_PER_REVIEW
         first = order[-max(least, len(found) // part) :]
         ranks = zip(
             is_idle[first].tolist(), is_unwanted[first].tolist(), distance[first].tolist(), strict=True
@@ -420,7 +457,7 @@ class Residency:
         ]
 
     def next_save(self, now_s: float, *, everything: bool = False) -> Chunk | None:
-        """The chunk to save now: one that is to be given up, else one whose time has come, or all."""
+        """Return the chunk to save now: one to be given up, else one that is due, or any."""
         if self.saving >= self.limits.saves or now_s < self._save_s:
             return None
         due_s = math.inf if everything else now_s - self._save_after_s
@@ -435,10 +472,10 @@ class Residency:
         return best
 
     def _next_to_leave(self, now_s: float) -> Chunk | None:
-        """One that nothing wants, once memory is half full: its room is there at once when it is needed."""
+        """Return an unwanted one once memory is half full: its room is free at once when it is needed."""
         if not self._fills_up or self._short(now_s) is not _Short.NO:
             return None
-        oldest = islice(self._dirty.values(), SAVED_AHEAD_OF)
+        oldest = islice(self._dirty.values(), SAVE_CANDIDATES)
         return next((one for one in oldest if one.retry_s <= now_s and not self.is_wanted(one, now_s)), None)
 
     @property
@@ -446,20 +483,20 @@ class Residency:
         return 2 * (self.chunk_bytes + self.beside_bytes) > self.limits.budget_bytes
 
     def saved(self, chunk: Chunk, version: int, now_s: float) -> None:
-        """A chunk's file has this version; it may have been written since."""
+        """Note that a chunk's file has this version; the chunk may have changed since."""
         self.saving -= 1
         chunk.saved = version
         self._sizes[chunk.key] = chunk.nbytes
         self.durability.note_written(chunk, version, now_s)
         chunk.state = State.CLEAN
-        self._note_news()
+        self._note_change()
         if chunk.version > version:
             self._soil(chunk, now_s)
         elif chunk.leaving:
             self._found[State.CLEAN].append((_SAVED_TO_GO, chunk))
 
     def save_failed(self, chunk: Chunk, now_s: float) -> None:
-        """A file could not be written: the chunk stays in memory, and is tried again."""
+        """Note that a file could not be written: the chunk stays in memory, and is tried again."""
         self.saving -= 1
         chunk.retry_s = self._save_s = now_s + RETRY_S  # others would fail as well
         self._soil(chunk, now_s)
@@ -475,7 +512,7 @@ class Residency:
         return not self._dirty and not self.saving and not self.durability.written + self.durability.flushing
 
     def flush_is_due(self, now_s: float, *, everything: bool = False) -> bool:
-        """Whether files that were written are to be made durable now: those of some time together, or all."""
+        """Whether to flush the files that were written: those of some time together, or all."""
         if self.durability.flushing:
             return False
         if everything and not self.saving:
@@ -485,30 +522,30 @@ class Residency:
     # --- giving up ------------------------------------------------------------------------------
 
     def next_eviction(self, now_s: float) -> Chunk | None:
-        """Give up a chunk that is as its file; its memory is free when this has been done."""
+        """Return the saved chunk to give up now; its memory counts as free."""
         chunk = self._next_victim(now_s, State.CLEAN)
         if chunk is None:
             return None
         self._resize(chunk, 0, 0)
         self._forget(chunk.key)
-        if chunk.waiting:  # for another that comes first it gave way: later it is loaded again
+        if chunk.waiting:  # another needs its room first: it is loaded again later
             again = self._needing[chunk.key] = self._want(chunk.key)
             again.changed_s, again.waiting = chunk.changed_s, chunk.waiting
             chunk.waiting = deque()
         else:
             self._note_missing(chunk.key)
-            if chunk.key in self.windows.near:  # a scan needed its room: it would soon be given up again
+            if chunk.key in self.windows.near:  # a scan needed its room, and soon would again
                 self._near_s = now_s + RETRY_S
         return chunk
 
     def next_event_s(self, now_s: float) -> float:
-        """When there is something to do although nothing happens; infinity for never."""
+        """Return when something is due even if nothing happens before; infinity for never."""
         times = [chunk.retry_s for chunk in self._needing.values() if chunk.retry_s > now_s]
         if not self.durability.flushing:
             times.append(self.durability.due_s)
         if self._missing and now_s < self._near_s:
             times.append(self._near_s)
-        if self._dirty and self.saving < self.limits.saves:  # else there is when one has been saved
+        if self._dirty and self.saving < self.limits.saves:  # else the end of a save wakes the worker
             first = next(iter(self._dirty.values()))
             times.append(max(first.dirty_since_s + self._save_after_s, first.retry_s, self._save_s))
             if self._fills_up:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which chunks are near a client: around each there is a window of them, and all windows count."""
+"""Which chunks are near a client: each client has a window of chunks around it, and all windows count."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ __all__ = ["Windows", "place_ahead"]
 Place: TypeAlias = tuple[float, float, float]
 
 
-def place_ahead(before: Place, here: Place, passed_s: float, ahead_s: float, most: float) -> Place:
-    """Where a client will be if it goes on as it does.
+def place_ahead(before: Place, here: Place, passed_s: float, ahead_s: float, longest: float) -> Place:
+    """Return where a client will be if it keeps its velocity.
 
     Parameters
     ----------
     before, here
-        Where it was, and where it is now.
+        Its previous place, and its place now.
     passed_s, ahead_s
-        Seconds between the two, and from now on.
-    most
-        It is not looked further ahead along any axis; the direction stays the same.
+        Seconds between the two, and to look ahead.
+    longest
+        Look-ahead along any axis at most; the direction stays the same.
     """
-    way = [now - then for now, then in zip(here, before, strict=True)]
-    longest = max(map(abs, way))
-    factor = min(ahead_s / passed_s, most / longest) if longest else 0.0
-    x, y, z = (at + part * factor for at, part in zip(here, way, strict=True))
+    moved = [now - then for now, then in zip(here, before, strict=True)]
+    most = max(map(abs, moved))
+    factor = min(ahead_s / passed_s, longest / most) if most else 0.0
+    x, y, z = (at + part * factor for at, part in zip(here, moved, strict=True))
     return x, y, z
 
 
@@ -50,7 +50,7 @@ class Windows:
     Attributes
     ----------
     near
-        Chunks that are near a client, with the number of windows that they are in.
+        Chunks near a client, with the number of windows that they are in.
     """
 
     def __init__(self, radius: int, hysteresis: float) -> None:
@@ -60,23 +60,23 @@ class Windows:
         self.near: dict[ChunkKey, int] = {}
 
     def move(self, client: object, position: Place) -> tuple[list[ChunkKey], list[ChunkKey]]:
-        """A client is somewhere, in chunks; returns the chunks that came near, and that are near no more.
+        """Move a client to a position in chunks; return the chunks that came near, and that went away.
 
         Its window follows when the client is more than ``hysteresis`` beyond the border of the window's
-        middle on each axis that changes, or at once when it is more than a chunk away.
+        centre on each axis that changes, or at once when it is more than a chunk away.
         """
         key = ChunkKey(*(math.floor(value) for value in position))
         center = self._centers.get(client)
         if center is not None and (
-            center == key or (key.distance(center) == 1 and not self._left(center, position))
+            center == key or (key.distance(center) == 1 and not self._is_beyond(center, position))
         ):
             return [], []
         self._centers[client] = key
         entered = [one for one in self._only_around(key, center) if self._enter(one)]
         return entered, [] if center is None else self._leave(center, key)
 
-    def _left(self, center: ChunkKey, position: Place) -> bool:
-        """Whether a position is far enough out of a chunk next to it."""
+    def _is_beyond(self, center: ChunkKey, position: Place) -> bool:
+        """Whether a position is far enough out of a neighbouring chunk."""
         into = [
             max(low - value, value - low - 1.0)
             for low, value in zip(center, position, strict=True)
@@ -85,21 +85,21 @@ class Windows:
         return min(into) >= self._hysteresis
 
     def leave(self, client: object) -> list[ChunkKey]:
-        """A client has gone; returns the chunks that are near no more."""
+        """Forget a client; return the chunks that are near none any more."""
         center = self._centers.pop(client, None)
         return [] if center is None else self._leave(center, None)
 
     def center(self, client: object) -> ChunkKey | None:
-        """The middle of a client's window."""
+        """Return the chunk in the middle of a client's window."""
         return self._centers.get(client)
 
     def _enter(self, key: ChunkKey) -> bool:
-        """Count one more window around a chunk; whether it is the first."""
+        """Count one more window around a chunk; return whether it is the first."""
         count = self.near[key] = self.near.get(key, 0) + 1
         return count == 1
 
     def _leave(self, center: ChunkKey, now: ChunkKey | None) -> list[ChunkKey]:
-        """Count one window less around all that is not around another chunk; returns what is near no more."""
+        """Count one window less around a chunk, but not around another; return what is near none any more."""
         left = []
         for key in self._only_around(center, now):
             self.near[key] -= 1
@@ -109,7 +109,7 @@ class Windows:
         return left
 
     def _only_around(self, center: ChunkKey, other: ChunkKey | None) -> Iterator[ChunkKey]:
-        """Chunks in the window around one chunk that are not in the window around another."""
+        """Yield the chunks in the window around one chunk that are not in the window around another."""
         reach = self._radius
         ranges = [range(at - reach, at + reach + 1) for at in center]
         if other is not None:
@@ -126,11 +126,11 @@ class Windows:
         yield from (ChunkKey(*key) for key in product(*ranges))
 
     def distances(self, keys: Sequence[ChunkKey]) -> NDArray[np.int64]:
-        """Chunks from each of these to the nearest client, (N,); 0 where there is none."""
+        """Return the distance of each chunk to the nearest client, (N,) chunks; 0 where there is none."""
         if not self._centers or not keys:
             return np.zeros(len(keys), np.int64)
-        there = np.array(keys, np.int64)
+        places = np.array(keys, np.int64)
         nearest = np.full(len(keys), np.iinfo(np.int64).max)
         for center in set(self._centers.values()):
-            np.minimum(nearest, np.abs(there - np.array(center)).max(axis=1), out=nearest)
+            np.minimum(nearest, np.abs(places - np.array(center)).max(axis=1), out=nearest)
         return nearest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Areas that readers ask for: whether they make sense, and which chunks and voxels lie in them."""
+"""Areas that readers ask for: whether they are valid, and which chunks and voxels lie in them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["check_area", "inside", "key_range", "touches"]
 
 
 def check_area(area: LiveArea) -> None:
-    """Refuse an area that makes no sense; `BadRequest`."""
+    """Raise `BadRequest` for an area that is not valid."""
     if isinstance(area, SphereMessage):
         numbers = (area.x, area.y, area.z, area.radius)
         good = all(abs(number) < FURTHEST_M for number in numbers) and area.radius >= 0.0
@@ -38,12 +38,8 @@ def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
         return True
     low_x, low_y, low_z, high_x, high_y, high_z = key.box(resolution)
     if isinstance(area, SphereMessage):
-        gaps = (
-            max(low - value, 0.0, value - high)
-            for value, low, high in (
-                (area.x, low_x, high_x), (area.y, low_y, high_y), (area.z, low_z, high_z),
-            )
-        )  # fmt: skip
+        axes = (area.x, low_x, high_x), (area.y, low_y, high_y), (area.z, low_z, high_z)
+        gaps = (max(low - value, 0.0, value - high) for value, low, high in axes)
         return sum(gap * gap for gap in gaps) <= area.radius * area.radius
     flat = low_x <= area.max_x and high_x >= area.min_x and low_y <= area.max_y and high_y >= area.min_y
     if area.z_min is None or area.z_max is None:
@@ -52,7 +48,7 @@ def touches(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
 
 
 def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of these places, (N, 3) metres, lie in an area."""
+    """Return which places, (N, 3) metres, lie in an area, (N,)."""
     if area is None:
         return np.ones(len(centers), np.bool_)
     found: NDArray[np.bool_]
@@ -68,7 +64,7 @@ def inside(area: LiveArea | None, centers: NDArray[np.float64]) -> NDArray[np.bo
 
 
 def key_range(area: LiveArea | None, resolution: float) -> KeyRange:
-    """Chunks among which are all that touch an area, whatever is lost in rounding."""
+    """Return a range of keys that includes every chunk that touches an area, whatever rounding does."""
     if area is None:
         return EVERYWHERE
     if isinstance(area, SphereMessage):

@@ -1,44 +1,84 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who maps, and which of their scans are where: applied once each, whatever is sent again.
+"""Mappers of a live map, and how far their scans have come: each is applied once, however often it is sent.
 
-A mapper is a user and a name that a program of theirs chose; its scans have numbers that rise, also when the
-program starts anew.  A scan that was sent twice is applied once: while it is on its way, both are answered
-by it; afterwards every chunk knows that it has it.
+A mapper is a user and a name that one of the user's programs chose; its scans have numbers that rise, also
+when the program is restarted.  A scan that was sent twice is applied once: until it is applied, both requests
+wait for it; afterwards every chunk knows that it has it.
 """
 
 from __future__ import annotations
 
+import mmap
 import threading
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
+
 from shmmap.chunks.layout import MAPPERS
-from shmmap.daemon.live.map_files import MapFiles, Mapper
-from shmmap.daemon.live.worker.applied_scans import AppliedScans
+from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.daemon.live.disk.map_record import Mapper
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 
-__all__ = ["ActiveMapper", "Mappers"]
+__all__ = ["APPLIED_BYTES", "ActiveMapper", "AppliedScans", "Mappers"]
 
-MOST_SCANS: Final = 1 << 61
+MAX_SCANS: Final = 1 << 61
 """Numbers of scans are less: what ``map.json`` expects beyond them has to be a number, too."""
+_ROW: Final = np.dtype([("mapper", "<u8"), ("scan", "<u8")])
+APPLIED_BYTES: Final = _ROW.itemsize * MAPPERS
+
+
+class AppliedScans:
+    """The scan up to which all of each mapper's are in memory that outlives the worker.
+
+    A program that plays scans from files goes on after this one.  The number is never greater than what is in
+    the map; a scan that is sent again does not count twice.
+
+    Parameters
+    ----------
+    memory
+        `APPLIED_BYTES`, at first zeros.
+    """
+
+    def __init__(self, memory: bytearray | mmap.mmap) -> None:
+        self._rows = np.frombuffer(memory, _ROW, MAPPERS)
+
+    def of(self, mapper: int) -> int:
+        """Return the scan up to which all are in the map; 0 where nothing is known."""
+        found = np.flatnonzero(self._rows["mapper"] == mapper)
+        return int(self._rows["scan"][found[0]]) if len(found) else 0
+
+    def note(self, mapper: int, scan: int, known: Collection[int]) -> None:
+        """Note that all scans of a mapper up to this one are in the map; replace mappers not ``known``."""
+        found = np.flatnonzero(self._rows["mapper"] == mapper)
+        if not len(found):
+            numbers = self._rows["mapper"].tolist()
+            at = next((at for at, number in enumerate(numbers) if number not in known), None)
+            if at is None:
+                return  # nothing is lost: only the scan to go on from is unknown
+            self._rows["scan"][at] = 0  # a kill between these must not leave another mapper's number
+            self._rows["mapper"][at] = mapper
+            found = np.array([at])
+        self._rows["scan"][found[0]] = scan
 
 
 @dataclass(eq=False, slots=True)
 class ActiveMapper:
-    """A mapper in this life of the worker.
+    """A mapper in this run of the worker.
 
     Attributes
     ----------
     first
-        The least number that no scan had before this life.
+        The least number that no scan had in previous runs.
     session
-        Who maps under it now; 0: nobody.
+        The session that maps under it now; 0 for none.
     last
-        Highest number of a scan that was taken in; in an earlier life, that is known to be in the map.
+        Highest number of a scan that was accepted; at first, that is known to be in the map.
     used
         Order of use: the greatest was used last.
     unapplied, unsaved
-        Scans that were taken in and are not applied, and not durable.
+        Accepted scans that are not applied, and not durable.
     """
 
     mapper: Mapper
@@ -61,7 +101,7 @@ class ActiveMapper:
 
 
 class Mappers:
-    """The mappers of one map."""
+    """All mappers of one map."""
 
     def __init__(self, files: MapFiles, record: AppliedScans) -> None:
         self._files = files
@@ -74,14 +114,14 @@ class Mappers:
             self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
-        """Let a session map under a name; one that did before does not any more.  From any thread.
+        """Let a session map under a name, in the place of any other.  Called from any thread.
 
         Raises
         ------
         Busy
             There are as many mappers as a chunk remembers, and none of them can be forgotten.
         OSError
-            The disk does not take a new one.
+            A new one cannot be written to the disk.
         """
         with self._opening:
             for active in self.by_number.values():
@@ -92,8 +132,8 @@ class Mappers:
                     self._forget_one()
                 mapper = self._files.add_mapper(uid, name)
                 active = ActiveMapper(mapper)
-                self.by_number = {**self.by_number, mapper.number: active}  # others go through it meanwhile
-            # now, and not with the first scan: once it may map, it does, also on a disk that is full
+                self.by_number = {**self.by_number, mapper.number: active}  # another thread may iterate
+            # now, and not with the first scan: once opened, a mapper also maps on a disk that is full
             self._files.expect_scan(active.mapper, self.next_scan(active))
             active.session = session
             self._uses += 1
@@ -111,37 +151,37 @@ class Mappers:
         self._files.forget_mapper(oldest.mapper)
         self.by_number = {number: one for number, one in self.by_number.items() if one is not oldest}
 
-    def taken(self, active: ActiveMapper, scan: int) -> None:
-        """A scan is on its way into the map; it may have come before."""
+    def accepted(self, active: ActiveMapper, scan: int) -> None:
+        """Note that a scan was accepted; it may have come before."""
         active.unapplied.add(scan)
         active.unsaved.add(scan)
         active.last = max(active.last, scan)
 
     def applied(self, active: ActiveMapper, scan: int) -> None:
-        """A scan is in the map."""
+        """Note that a scan is in the map."""
         active.unapplied.discard(scan)
         self._record.note(active.mapper.number, active.applied, self.by_number)
 
     def next_scan(self, active: ActiveMapper) -> int:
-        """The least number that a new scan may have: no earlier one, of any life, had it."""
+        """Return the least number for a new scan: no scan of any run had it."""
         return max(active.last + 1, active.first)
 
     def is_far(self, number: int, scan: int) -> bool:
-        """Whether the disk has to learn of a scan's number first."""
+        """Whether a scan's number has to be noted on the disk first."""
         active = self.by_number.get(number)
-        return active is not None and active.mapper.scans <= scan < MOST_SCANS
+        return active is not None and active.mapper.scans <= scan < MAX_SCANS
 
     def expect(self, number: int, scan: int, session: int) -> ActiveMapper:
-        """Return whose scan this is, which is about to be taken in; waits for the disk if `is_far` says so.
+        """Return the mapper of a scan that is about to be accepted; wait for the disk if `is_far`.
 
         Raises
         ------
         BadRequest
             The session does not map under this number.
         LiveInterrupted
-            No session does, since the worker began anew.
+            No session does, since the worker was restarted.
         OSError
-            The disk does not take what has to be there first.
+            The number cannot be written to the disk first.
         """
         active = self.by_number.get(number)
         if active is None:
@@ -157,15 +197,15 @@ class Mappers:
             raise BadRequest(
                 f"another program maps as {active.mapper.name!r} now", hint="give each program its own name"
             )
-        if not 0 < scan < MOST_SCANS:
+        if not 0 < scan < MAX_SCANS:
             raise BadRequest(f"scan {scan}: numbers begin at 1 and rise")
         if scan >= active.mapper.scans:
             with self._opening:
                 self._files.expect_scan(active.mapper, scan)
         return active
 
-    def left(self, session: int) -> None:
-        """A session has ended."""
+    def on_disconnect(self, session: int) -> None:
+        """Note that a session has ended."""
         for active in self.by_number.values():
             if active.session == session:
                 active.session = 0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where mappers put the marks of their scans, as files: what is in them is nobody's word but theirs.
+"""The directory where mappers put the marks of their scans, as files; their content is not trusted.
 
-The directory belongs to the daemon; members of the mappers' group may make files in it and remove their own
-(mode 1770).  A file is named after the session that made it, and goes when that has ended.
+The directory belongs to the daemon; members of the mappers' group may create files in it and remove their own
+(mode 1770).  A file is named after the session that made it, and removed when that has ended.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Final
 
 from shmmap.errors import BadRequest
 
-__all__ = ["MOST_MARKS_BYTES", "MarksDirectory"]
+__all__ = ["MAX_MARKS_BYTES", "MarksDirectory"]
 
-MOST_MARKS_BYTES: Final = 32 << 20
-"""Of one scan; 120 000 points make 0.2 MB."""
+MAX_MARKS_BYTES: Final = 32 << 20
+"""Length of one scan's marks; 120 000 points make 0.2 MB."""
 
 _NAME: Final = re.compile(r"([0-9a-f]{1,16})\.[0-9]{1,20}")
 
@@ -29,14 +29,14 @@ class MarksDirectory:
     Parameters
     ----------
     path
-        On a tmpfs; made here, and what an earlier life left in it is removed.
+        On a tmpfs; created here, and what a previous run left in it is removed.
     gid
         Group whose members may map; -1: none, only the owner.
 
     Raises
     ------
     OSError
-        It cannot be made, or is somebody else's.
+        It cannot be created, or belongs to another user.
     """
 
     def __init__(self, path: str, gid: int = -1) -> None:
@@ -56,25 +56,25 @@ class MarksDirectory:
             raise
 
     def take(self, name: str, nbytes: int, session: int, uid: int) -> bytes:
-        """Take the content of a file of marks, and remove it: its memory is free for chunks.
+        """Return the content of a file of marks, and remove the file: its memory is free for chunks.
 
         Parameters
         ----------
         name, nbytes
-            What the mapper says of it.
+            As in the mapper's request.
         session, uid
-            Whose it must be.
+            Its owner.
 
         Raises
         ------
         BadRequest
-            It is not what a file of marks of this session can be: the message says why.
+            It cannot be a file of marks of this session: the message says why.
         """
         found = _NAME.fullmatch(name)
         if found is None or found[1] != f"{session:x}":
             raise BadRequest(f"marks: {name!r} is not a name that this session may use")
-        if not 0 < nbytes <= MOST_MARKS_BYTES:
-            raise BadRequest(f"marks: {nbytes} bytes; {MOST_MARKS_BYTES} are the most")
+        if not 0 < nbytes <= MAX_MARKS_BYTES:
+            raise BadRequest(f"marks: {nbytes} bytes; {MAX_MARKS_BYTES} are the most")
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY
         try:
             fd = os.open(name, flags, dir_fd=self._fd)
@@ -94,15 +94,15 @@ class MarksDirectory:
             raise BadRequest(f"marks: {name} was cut to {len(data)} bytes")
         return data
 
-    def forget(self, session: int) -> None:
-        """Remove what a session left."""
+    def on_disconnect(self, session: int) -> None:
+        """Remove the files of a session that has ended."""
         start = f"{session:x}."
         for name in os.listdir(self._fd):
             if name.startswith(start):
                 self._remove(name)
 
     def close(self) -> None:
-        """Remove it, and all that is in it."""
+        """Remove the directory, and all that is in it."""
         self._remove_all()
         os.close(self._fd)
         with contextlib.suppress(OSError):
@@ -116,7 +116,7 @@ class MarksDirectory:
         try:
             os.unlink(name, dir_fd=self._fd)
         except IsADirectoryError:
-            with contextlib.suppress(OSError):  # a directory that has something in it stays
+            with contextlib.suppress(OSError):  # a directory that is not empty stays
                 os.rmdir(name, dir_fd=self._fd)
         except FileNotFoundError:
             pass

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map whose files are being read: in a thread, for a directory may hang, and again until it succeeds.
+"""A live map whose files are being read: in a thread, since a directory may hang, until it succeeds.
 
-Whatever is wrong with one map's files is that map's problem: it has a name, and others are served meanwhile.
+A problem with one map's files is that map's alone: it is reported, and other maps are served meanwhile.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from collections.abc import Callable
 from typing import Final
 
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.map_files import MapFiles, MapSettings
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.daemon.live.messages import not_served
 from shmmap.errors import ShmmapError
 from shmmap.logfmt import log
@@ -21,22 +22,18 @@ from shmmap.protocol.live import LiveMapRow
 __all__ = ["OpeningMap"]
 
 LONG_S: Final = 1.0
-"""Files that have been read for longer than this are a problem by now; a slow disk's passes by itself."""
+"""Reading that takes longer than this is a problem; with a slow disk it passes by itself."""
 RETRY_S: Final = 1.0
-"""At least, after the files could not be read."""
-PART: Final = 4.0
-"""How much longer than it took in vain the pause is: large maps are not read all the time."""
+"""Least pause after the files could not be read."""
+PAUSE_FACTOR: Final = 4.0
+"""How much longer than the failed try the pause is: large maps are not read all the time."""
 
 
 class OpeningMap:
-    """One map on its way into memory.
+    """One map that is being brought into memory.
 
     Parameters
     ----------
-    settings
-        Which, and where.
-    budget_bytes
-        What it may take.
     wake
         Called in the thread when the files have been read, or cannot be.
 
@@ -45,7 +42,7 @@ class OpeningMap:
     problem
         Why it is not open; empty while that is not known.
     error
-        What the last try ended with.
+        Of the last try.
     """
 
     def __init__(self, settings: LiveSettings, budget_bytes: int, wake: Callable[[], None]) -> None:
@@ -58,8 +55,8 @@ class OpeningMap:
         self._thread: threading.Thread | None = None
         self._outcome: list[tuple[Folder, MapFiles] | Exception] = []
 
-    def turn(self, now_s: float) -> tuple[Folder, MapFiles] | None:
-        """Go on; returns the directory and its files, open and of a new life, once they have been read."""
+    def run_turn(self, now_s: float) -> tuple[Folder, MapFiles] | None:
+        """Continue; return the open directory and its files, in a new run, once they have been read."""
         if self._thread is None:
             if now_s >= self._retry_s:
                 self._begun_s = now_s
@@ -79,9 +76,9 @@ class OpeningMap:
         return None
 
     def failed(self, error: Exception, now_s: float) -> None:
-        """It cannot be opened just now: that is its problem until the next try succeeds."""
+        """Note that it cannot be opened: that is its problem until the next try succeeds."""
         self.error = error
-        self._retry_s = now_s + max(RETRY_S, PART * (now_s - self._begun_s))
+        self._retry_s = now_s + max(RETRY_S, PAUSE_FACTOR * (now_s - self._begun_s))
         self._note(f"it cannot be opened: {_reason(error)}")
 
     def _note(self, problem: str) -> None:
@@ -90,17 +87,17 @@ class OpeningMap:
             log.error("live map not open", map=self.settings.name, path=self.settings.path, reason=problem)
 
     def next_turn_s(self, now_s: float) -> float:
-        """When the next turn is due."""
+        """Return when the next turn is due."""
         if self._thread is None:
             return max(now_s, self._retry_s)
         return max(now_s, self._begun_s + LONG_S) if not self.problem else now_s + LONG_S
 
     def status(self) -> LiveMapRow:
-        """How the map is: nothing of it is in memory."""
+        """Return the map's state: nothing of it is in memory."""
         return not_served(self.settings, self._budget_bytes, self.problem)
 
     def _read(self) -> None:
-        """Read the files, in a thread that may never come back."""
+        """Read the files, in a thread that may never return."""
         outcome: tuple[Folder, MapFiles] | Exception
         try:
             outcome = open_files(self.settings)
@@ -111,7 +108,7 @@ class OpeningMap:
 
 
 def open_files(settings: LiveSettings) -> tuple[Folder, MapFiles]:
-    """Open a map's directory and read what is in it; a new life of the map begins.
+    """Open a map's directory and read it; a new run of the map begins.
 
     Raises
     ------
@@ -121,7 +118,7 @@ def open_files(settings: LiveSettings) -> tuple[Folder, MapFiles]:
     folder = Folder(settings.path)
     try:
         files = MapFiles(folder, MapSettings(settings.resolution, settings.occupancy, settings.frame_id))
-        files.begin_life()
+        files.begin_run()
     except BaseException:
         folder.close()
         raise

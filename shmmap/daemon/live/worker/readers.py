@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What readers of a live map ask: which chunks there are, and which voxels lie in an area.
+"""Requests of readers of a live map: which chunks there are, what changed, which voxels lie in an area.
 
-A request is worked at in steps, each much shorter than a scan takes.  Sessions have a step each by turns, in
-a small part of the time between two scans; files are read in threads of their own.  So readers wait for each
-other and for the disk, and mapping for none of them.
+A request is processed in steps, each much shorter than a scan takes.  Sessions take turns of one step, in a
+small part of the time between two scans; files are read in threads of their own.  So readers wait for each
+other and for the disk, and mapping waits for none of them.
 """
 
 from __future__ import annotations
@@ -14,18 +14,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import islice, takewhile
 from typing import Any, Final
 
 from shmmap.chunks.reading import KINDS
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.file_threads import FileThreads, Job
-from shmmap.daemon.live.live_map import LiveMap
-from shmmap.daemon.live.map_files import Row
+from shmmap.daemon.live.disk.map_record import Row
 from shmmap.daemon.live.messages import Ask
+from shmmap.daemon.live.paged_map import FileThreads, Job, PagedMap
 from shmmap.daemon.live.paging.key_index import KeyIndex, merged_part
 from shmmap.daemon.live.worker.areas import check_area, key_range, touches
-from shmmap.daemon.live.worker.changes import Changes
 from shmmap.daemon.live.worker.voxel_lists import Later, Steps, VoxelLists
 from shmmap.errors import BadRequest, CannotWrite, InternalError, ShmmapError
 from shmmap.logfmt import log
@@ -35,22 +33,83 @@ from shmmap.protocol.messages import ErrorReply
 __all__ = ["Readers"]
 
 NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
-"""Of a chunk that has no file."""
+"""Row of a chunk that has no file."""
 TURN_S: Final = 0.001
-"""What readers get of the worker's time between two of its turns, if there is something else to do."""
-KEYS_A_STEP: Final = 64
+"""The readers' part of the worker's time between two of its turns, if there is something else to do."""
+KEYS_PER_STEP: Final = 64
 FEW_CHANGES: Final = 1000
-"""More chunks than that are not sorted in one step."""
+"""More chunks than this are not sorted in one step."""
 THREADS: Final = 2
 """They read the files that readers ask for; mapping has its own."""
 MEASURED_S: Final = 2.0
-NAMED: Final = 3
-"""Sessions that are named for the time that they take."""
+BUSIEST: Final = 3
+"""Sessions that are reported for the time that they take."""
+MAX_GONE: Final = 4000
+"""Chunks that left memory and are remembered: all of them go into one reply."""
+
+
+class Changes:
+    """Numbered changes of one map, since the worker began.
+
+    Parameters
+    ----------
+    first
+        Number to begin with: greater than any of a previous run.
+
+    Attributes
+    ----------
+    number
+        Of the last change.
+    """
+
+    def __init__(self, first: int) -> None:
+        self.number = self._forgotten = first
+        self._changed: dict[ChunkKey, int] = {}  # the last one last
+        self._gone: deque[tuple[int, ChunkKey]] = deque()
+
+    def note_changed(self, key: ChunkKey) -> None:
+        """Note that a chunk came into memory, or was changed there."""
+        self.number += 1
+        self._changed.pop(key, None)
+        self._changed[key] = self.number
+
+    def note_gone(self, key: ChunkKey) -> None:
+        """Note that a chunk left memory."""
+        self.number += 1
+        self._changed.pop(key, None)
+        self._gone.append((self.number, key))
+        if len(self._gone) > MAX_GONE:
+            self._forgotten, _ = self._gone.popleft()
+
+    def known(self, since: int) -> bool:
+        """Whether all changes after ``since`` are remembered."""
+        return self._forgotten <= since <= self.number
+
+    def is_newer(self, key: ChunkKey, since: int) -> bool:
+        """Whether a chunk in memory changed after ``since``."""
+        return self._changed.get(key, 0) > since
+
+    def newer(self, since: int, most: int) -> list[ChunkKey] | None:
+        """Return the chunks in memory that changed after ``since``; None if they are more than ``most``."""
+        found: list[ChunkKey] = []
+        for key, number in reversed(self._changed.items()):
+            if number <= since:
+                break
+            if len(found) == most:
+                return None
+            found.append(key)
+        return found
+
+    def gone(self, since: int) -> list[ChunkKey]:
+        """Return the chunks that left memory after ``since`` and did not come back."""
+        newest_first = list(takewhile(lambda one: one[0] > since, reversed(self._gone)))
+        keys = dict.fromkeys(key for _, key in reversed(newest_first))
+        return [key for key in keys if key not in self._changed]
 
 
 @dataclass(eq=False, slots=True)
 class _Work:
-    """A request at work; ``error`` or ``outcome`` is what came of the last thing that a thread did for it."""
+    """A request in progress; ``error`` or ``outcome`` is of the last thing that a thread did for it."""
 
     ask: Ask
     request: int
@@ -65,57 +124,66 @@ class Readers:
 
     Parameters
     ----------
-    live, changes, lists
-        The map, what changed in it, and lists of its voxels.
+    live, changes
+        The map, and what changed in it.
     answer
         Takes a ticket and the reply to it.
+    wake
+        Called, in another thread, when there is something to do in the next turn.
 
     Attributes
     ----------
+    lists
+        Lists of the map's voxels.
     busiest
         Sessions whose requests took most of the time, and how much of one processor, in thousandths.
     """
 
     def __init__(
-        self, live: LiveMap, changes: Changes, lists: VoxelLists, answer: Callable[[int, Any], None]
+        self,
+        live: PagedMap,
+        changes: Changes,
+        answer: Callable[[int, Any], None],
+        wake: Callable[[], None],
     ) -> None:
-        self.live, self.changes, self.lists, self._answer = live, changes, lists, answer
-        self._ready: dict[int, deque[_Work]] = {}  # by session, the one whose turn it is first
+        self.live, self.changes, self._answer = live, changes, answer
+        self.lists = VoxelLists(live)
+        self._ready: dict[int, deque[_Work]] = {}  # by session, the next one first
         self._later: list[tuple[float, _Work]] = []
         self._in_thread: dict[int, deque[tuple[_Work, Callable[[], Any]]]] = {}  # by session, one at a time
-        self._threads = FileThreads(lambda: live.on_work_done(), THREADS)
+        self._threads = FileThreads(wake, THREADS)
         self._spent_s: dict[int, float] = {}  # by session, since the measurement began
         self._measured_s = time.monotonic()
         self.busiest: tuple[tuple[int, int], ...] = ()
 
     def next_turn_s(self, now_s: float) -> float:
-        """When there is something to do; infinity for when something comes."""
+        """Return when something is due; infinity for never."""
         if self._ready:
             return now_s
         return min([self.lists.next_expiry_s, *(due_s for due_s, _ in self._later)])
 
     @property
     def are_waiting(self) -> bool:
-        """Whether a request is at work."""
+        """Whether a request is in progress."""
         return bool(self._ready or self._later or self._in_thread)
 
-    def left(self, session: int) -> None:
-        """A session has ended."""
+    def on_disconnect(self, session: int) -> None:
+        """Drop the requests and lists of a session that has ended."""
         works = [*self._ready.pop(session, ()), *(work for work, _ in self._in_thread.get(session, ()))]
         works += [work for _, work in self._later if work.ask.session == session]
         self._later = [row for row in self._later if row[1].ask.session != session]
         for work in works:
             work.is_over = True
             work.steps.close()
-        self.lists.left(session)
+        self.lists.on_disconnect(session)
 
     def close(self) -> None:
-        """Answer nothing more: the end does not wait for a disk that readers asked for."""
+        """Answer nothing more: the end does not wait for files that readers asked for."""
         self.lists.is_closed = True
         self._threads.close(0.0)
 
     def begin(self, ask: Ask, message: messages.LiveChunks | messages.LiveVoxels) -> None:
-        """Begin with a request, which is answered in later turns; raises `BadRequest`."""
+        """Begin a request, which is answered in later turns; raise `BadRequest`."""
         if message.area is not None:
             check_area(message.area)
         if isinstance(message, messages.LiveChunks):
@@ -130,9 +198,9 @@ class Readers:
 
     # --- turns ----------------------------------------------------------------------------------
 
-    def turn(self, now_s: float) -> None:
-        """Go on with requests for a short time."""
-        self._threads.tell(now_s)
+    def run_turn(self, now_s: float) -> None:
+        """Process requests for a short time."""
+        self._threads.deliver(now_s)
         due = [work for due_s, work in self._later if due_s <= now_s]
         self._later = [row for row in self._later if row[0] > now_s]
         for work in due:
@@ -153,10 +221,10 @@ class Readers:
             before_s = after_s
 
     def measure(self, now_s: float) -> None:
-        """Note which sessions are the busiest, from time to time."""
+        """Find the busiest sessions, from time to time."""
         passed_s = now_s - self._measured_s
         if passed_s >= MEASURED_S:
-            busiest = sorted(self._spent_s.items(), key=lambda item: -item[1])[:NAMED]
+            busiest = sorted(self._spent_s.items(), key=lambda item: -item[1])[:BUSIEST]
             self.busiest = tuple((session, round(1000 * took_s / passed_s)) for session, took_s in busiest)
             self._measured_s = now_s
             self._spent_s.clear()
@@ -165,7 +233,7 @@ class Readers:
         self._ready.setdefault(work.ask.session, deque()).append(work)
 
     def _step(self, work: _Work, now_s: float) -> bool:
-        """Do a step of a request; whether the next one may follow."""
+        """Do a step of a request; return whether the next one may follow."""
         outcome, error = work.outcome, work.error
         work.outcome = work.error = None
         try:
@@ -193,7 +261,7 @@ class Readers:
         self._answer(work.ask.ticket, reply)
 
     def _read(self, work: _Work, what: Callable[[], Any]) -> None:
-        """Have a thread do something for a request, after what it does for others of the same session."""
+        """Do something for a request in a thread, after what others of the same session wait for."""
         waiting = self._in_thread.setdefault(work.ask.session, deque())
         waiting.append((work, what))
         if len(waiting) == 1:
@@ -214,13 +282,13 @@ class Readers:
         else:
             del self._in_thread[session]
 
-    # --- what is asked --------------------------------------------------------------------------
+    # --- requests -------------------------------------------------------------------------------
 
     def _keys(
         self, area: messages.LiveArea | None, indexes: list[KeyIndex], since: int, after: ChunkKey | None
     ) -> Iterator[list[ChunkKey]]:
-        """Chunks that touch an area, in order, a step's at a time; those in memory that changed since."""
-        resolution = self.live.files.settings.resolution
+        """Yield chunks that touch an area, in order, a step's at a time; of those in memory what changed."""
+        resolution = self.live.resolution
         few = (
             self.changes.newer(since, FEW_CHANGES)
             if since and indexes == [self.live.residency.index]
@@ -228,12 +296,12 @@ class Readers:
         )
         if few is not None:
             sorted_few = iter(sorted(key for key in few if after is None or key > after))
-            while some := list(islice(sorted_few, KEYS_A_STEP)):
+            while some := list(islice(sorted_few, KEYS_PER_STEP)):
                 yield [key for key in some if touches(area, key, resolution)]
             return
         within, last = key_range(area, resolution), after
         while True:
-            keys, last = merged_part(indexes, last, within, KEYS_A_STEP)
+            keys, last = merged_part(indexes, last, within, KEYS_PER_STEP)
             yield [
                 key
                 for key in keys
@@ -244,17 +312,16 @@ class Readers:
                 return
 
     def _page(self, message: messages.LiveChunks) -> Steps:
-        """Which chunks there are."""
+        """List chunks."""
         live, area, change = self.live, message.area, self.changes.number
         known = not message.since or self.changes.known(message.since)
         since = message.since if known else 0
         gone = []
         if since and message.after is None:
-            resolution = live.files.settings.resolution
-            for number, key in enumerate(self.changes.left(since), 1):
-                if touches(area, key, resolution):
+            for number, key in enumerate(self.changes.gone(since), 1):
+                if touches(area, key, live.resolution):
                     gone.append(key)
-                if number % KEYS_A_STEP == 0:
+                if number % KEYS_PER_STEP == 0:
                     yield None
         indexes = [live.residency.index, *([live.stored] if message.saved else [])]
         after = ChunkKey(*message.after) if message.after is not None else None
@@ -284,13 +351,15 @@ class Readers:
                 key, 0, row.version, state_now, row.active, row.occupied, row.free, nbytes
             )
         state = there.view.state
+        version, active, occupied, free = (
+            int(state[name]) for name in ("version", "active", "occupied", "free")
+        )
         return messages.LiveChunkRow(
-            key, there.generation, int(state["version"]), known.state.value, int(state["active"]),
-            int(state["occupied"]), int(state["free"]), known.nbytes,
-        )  # fmt: skip
+            key, there.generation, version, known.state.value, active, occupied, free, known.nbytes
+        )
 
     def _voxels(self, ask: Ask, message: messages.LiveVoxels) -> Steps:
-        """Which voxels there are."""
+        """List voxels."""
         change = self.changes.number
         since = message.since if self.changes.known(message.since) else 0
         indexes = []

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxels of an area, put together into a file in shared memory: the answer to a request for many.
+"""Lists of the voxels of an area, as files in shared memory: replies to requests for many voxels.
 
 A list is N x 3 int32, the voxels' indices, and behind them N int16, their log-odds in thousandths.  It takes
-memory within the map's budget, and is there for as long as reading it takes: until its reader releases it,
-asks for more lists than a session may have, or leaves, and for `KEPT_S` at most.  Then it is cut to nothing,
-whatever its reader has open or mapped.
+memory within the map's budget, and is kept for as long as reading it takes: until its reader releases it,
+asks for more lists than a session may have, or disconnects, and for `KEPT_S` at most.  Then it is truncated
+to nothing, whatever its reader has open or mapped.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from shmmap.chunks.chunk_file import decode_chunk
 from shmmap.chunks.layout import ChunkView
 from shmmap.chunks.reading import select_voxels
 from shmmap.chunks.voxels import ChunkKey, voxel_centers
-from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.paged_map import PagedMap
 from shmmap.daemon.live.worker.areas import inside
 from shmmap.errors import MapDataError, OverBudget
 from shmmap.protocol.live import LiveVoxels, LiveVoxelsReply
 
 __all__ = ["Later", "Steps", "VoxelLists"]
 
-LISTS_OF_A_SESSION: Final = 4
+LISTS_PER_SESSION: Final = 4
 VOXEL_BYTES: Final = 14
 PART_OF_BUDGET: Final = 4
 """All lists together may take this part of the map's budget."""
 KEPT_S: Final = 10.0
-"""How long a list is there for its reader."""
+"""How long a list is kept for its reader."""
 ROOM_S: Final = 10.0
 """How long a list waits until chunks have made room for it."""
 ASK_AGAIN_S: Final = 0.005
-FILES_TOGETHER: Final = 8
+FILES_PER_STEP: Final = 8
 """Chunks that a thread reads for a list before others have their turn."""
-BYTES_A_STEP: Final = 256 << 10
+BYTES_PER_STEP: Final = 256 << 10
 NAME: Final = "voxels."
 
 _Part = tuple[NDArray[np.int32], NDArray[np.int16]]
@@ -55,13 +55,13 @@ _Part = tuple[NDArray[np.int32], NDArray[np.int16]]
 
 @dataclass(frozen=True, slots=True)
 class Later:
-    """Seconds after which a request goes on."""
+    """Seconds after which a request continues."""
 
     seconds: float
 
 
 Steps = Generator[Callable[[], Any] | Later | None, Any, Any]
-"""A request at work: it yields None after a step, `Later`, or what a thread is to do, and gets the outcome.
+"""A request in progress: yields None after a step, `Later`, or a function for a thread, and gets its outcome.
 
 What it returns is the reply.
 """
@@ -76,14 +76,7 @@ class _List:
 
 @dataclass(eq=False)
 class VoxelLists:
-    """Makes lists of one map's voxels, a step at a time.
-
-    Parameters
-    ----------
-    live
-        The map.
-    path, mode, gid
-        Directory of the lists, and who may read them.
+    """Makes lists of one map's voxels, a step at a time, beside its chunks.
 
     Attributes
     ----------
@@ -91,10 +84,7 @@ class VoxelLists:
         Threads read no further file.
     """
 
-    live: LiveMap
-    path: str
-    mode: int
-    gid: int
+    live: PagedMap
     _lists: dict[int, deque[_List]] = field(default_factory=dict)
     _making: int = 0
     _asked: dict[int, int] = field(default_factory=dict)
@@ -102,28 +92,28 @@ class VoxelLists:
 
     @property
     def nbytes(self) -> int:
-        """Memory of all lists that are there."""
+        """Memory of all lists."""
         return sum(one.nbytes for lists in self._lists.values() for one in lists)
 
     @property
     def asked_bytes(self) -> int:
-        """The least that a list waits for; 0 where none does."""
+        """The least memory that a list waits for; 0 if none waits."""
         return min(self._asked.values(), default=0)
 
     @property
     def next_expiry_s(self) -> float:
-        """When the next list has been there for long enough; infinity for never."""
+        """When the next list expires; infinity for never."""
         return min((one.until_s for lists in self._lists.values() for one in lists), default=math.inf)
 
     def collect(
         self, message: LiveVoxels, keys: Iterator[list[ChunkKey]], session: int, change: int
     ) -> Steps:
-        """Make a list of the voxels of these chunks; returns the reply.
+        """Make a list of the voxels of these chunks; return the reply.
 
         Raises
         ------
         OverBudget
-            There are more voxels than lists may take memory, or there is no room for them just now.
+            The voxels need more memory than lists may take, or than is free just now.
         MapDataError
             A file cannot be read.
         OSError
@@ -151,8 +141,8 @@ class VoxelLists:
                         yield None
                     elif message.scope != "memory" and key in self.live.files.rows:
                         cold.append(key)
-                for first in range(0, len(cold), FILES_TOGETHER):
-                    for part in (yield partial(self._read, cold[first : first + FILES_TOGETHER], pick)):
+                for first in range(0, len(cold), FILES_PER_STEP):
+                    for part in (yield partial(self._read, cold[first : first + FILES_PER_STEP], pick)):
                         keep(part)
                 yield None
             yield from self._room(_pages(made))
@@ -174,11 +164,11 @@ class VoxelLists:
         indices, log_odds = select_voxels(view, message.kind)
         if message.area is None:
             return indices, log_odds
-        wanted = inside(message.area, voxel_centers(indices, self.live.files.settings.resolution))
+        wanted = inside(message.area, voxel_centers(indices, self.live.resolution))
         return indices[wanted], log_odds[wanted]
 
     def _read(self, keys: list[ChunkKey], pick: Callable[[ChunkView], _Part]) -> list[_Part]:
-        """Voxels of chunks as they were last saved; done by a thread."""
+        """Return voxels of chunks as last saved; runs in a thread."""
         found = []
         for key in keys:
             if self.is_closed:
@@ -196,7 +186,7 @@ class VoxelLists:
         return found
 
     def _room(self, nbytes: int) -> Steps:
-        """Wait until chunks have made room, if there is none."""
+        """Wait until chunks have made room."""
         number = secrets.randbits(62)
         until_s = time.monotonic() + ROOM_S
         try:
@@ -214,9 +204,10 @@ class VoxelLists:
     def _write(
         self, parts: list[_Part], nbytes: int, session: int
     ) -> Generator[Callable[[], Any] | Later | None, Any, str]:
-        one = _List(f"{self.live.memory.prefix}{NAME}{secrets.token_hex(8)}", _pages(nbytes), math.inf)
+        memory = self.live.memory
+        one = _List(f"{memory.prefix}{NAME}{secrets.token_hex(8)}", _pages(nbytes), math.inf)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
-        fd = os.open(self.path + one.name, flags, 0o600)
+        fd = os.open(memory.path + one.name, flags, 0o600)
         lists = self._lists.setdefault(session, deque())
         lists.append(one)
         self.live.residency.beside_bytes += one.nbytes
@@ -225,13 +216,11 @@ class VoxelLists:
                 for part in parts:
                     left = np.ascontiguousarray(part[column]).data.cast("B")
                     while left:
-                        done = os.write(fd, left[:BYTES_A_STEP])
+                        done = os.write(fd, left[:BYTES_PER_STEP])
                         left = left[done:]
-                        if done == BYTES_A_STEP:
+                        if done == BYTES_PER_STEP:
                             yield None
-            if self.gid >= 0:
-                os.fchown(fd, -1, self.gid)
-            os.fchmod(fd, self.mode)
+            memory.give_access(fd)
         except BaseException:
             if one in lists:
                 lists.remove(one)
@@ -240,49 +229,52 @@ class VoxelLists:
         finally:
             os.close(fd)
         one.until_s = time.monotonic() + KEPT_S
-        if len(lists) > LISTS_OF_A_SESSION:
+        if len(lists) > LISTS_PER_SESSION:
             oldest = min(lists, key=lambda other: other.until_s)
             lists.remove(oldest)
             self._remove(oldest)
         return one.name
 
     def release(self, session: int, name: str) -> None:
-        """Remove a list, of those that this session was given."""
+        """Remove a list of this session."""
         lists = self._lists.get(session, deque())
         for one in [one for one in lists if one.name == name]:
             lists.remove(one)
             self._remove(one)
 
     def expire(self, now_s: float) -> None:
-        """Remove what has been there for long enough."""
+        """Remove lists that have been kept for long enough."""
         for lists in self._lists.values():
             for one in [one for one in lists if one.until_s <= now_s]:
                 lists.remove(one)
                 self._remove(one)
 
-    def left(self, session: int) -> None:
-        """A session has ended."""
+    def on_disconnect(self, session: int) -> None:
+        """Remove the lists of a session that has ended."""
         for one in self._lists.pop(session, ()):
             self._remove(one)
 
     def remove_all(self) -> None:
-        """Remove all lists, those of an earlier life too."""
+        """Remove all lists, those of previous runs too."""
         for session in list(self._lists):
-            self.left(session)
+            self.on_disconnect(session)
         start = self.live.memory.prefix.lstrip("/") + NAME
-        for name in os.listdir(self.path):
+        for name in os.listdir(self.live.memory.path):
             if name.startswith(start):
-                self._cut("/" + name)
+                self._free("/" + name)
 
     def _remove(self, one: _List) -> None:
         self.live.residency.beside_bytes -= one.nbytes
-        self._cut(one.name)
+        self._free(one.name)
 
-    def _cut(self, name: str) -> None:
-        """Free a file's memory, whatever readers do with it, and take its name away."""
-        with contextlib.suppress(FileNotFoundError, PermissionError):  # another account's is not one of ours
+    def _free(self, name: str) -> None:
+        """Free a file's memory, whatever readers do with it, and remove its name."""
+        path = self.live.memory.path + name
+        with contextlib.suppress(
+            FileNotFoundError, PermissionError
+        ):  # a file of another user is none of ours
             try:
-                fd = os.open(self.path + name, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+                fd = os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             except OSError as error:
                 if error.errno not in (errno.ELOOP, errno.ENXIO, errno.EISDIR):
                     raise
@@ -291,9 +283,9 @@ class VoxelLists:
                     os.ftruncate(fd, 0)
                 finally:
                     os.close(fd)
-            os.unlink(self.path + name)
+            os.unlink(path)
 
 
 def _pages(nbytes: int) -> int:
-    """Memory that this many bytes of a file take."""
+    """Return the memory that this many bytes of a file take."""
     return -(-nbytes // mmap.PAGESIZE) * mmap.PAGESIZE

@@ -18,7 +18,7 @@ import pytest
 from msgspec.structs import replace
 
 from shmmap.chunks import reading
-from shmmap.chunks.layout import HEADER_BYTES, MOST_BYTES, ChunkIdentity, ChunkView, chunk_bytes, new_header
+from shmmap.chunks.layout import HEADER_BYTES, MAX_BYTES, ChunkIdentity, ChunkView, chunk_bytes, new_header
 from shmmap.chunks.voxels import BRICKS, ChunkKey
 from shmmap.client.live import chunk_reader
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
@@ -308,7 +308,7 @@ def content(data: bytes) -> Callable[[Path], None]:
         (folder, SegmentError, "."),
         (content(b""), SegmentError, "given up all the time"),
         (content(bytes(HEADER_BYTES - 1)), SegmentCorrupt, "cannot be a chunk"),
-        (content(bytes(MOST_BYTES + 1)), SegmentCorrupt, "cannot be a chunk"),
+        (content(bytes(MAX_BYTES + 1)), SegmentCorrupt, "cannot be a chunk"),
         (content(bytes(HEADER_BYTES)), SegmentCorrupt, "no chunk"),
         (content(bytes(new_header(replace(IDENTITY, generation=8)))), SegmentCorrupt, "another chunk"),
         (content(bytes(new_header(replace(IDENTITY, map_id=bytes(16))))), SegmentCorrupt, "another chunk"),

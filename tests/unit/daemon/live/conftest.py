@@ -3,36 +3,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from shmmap.daemon.live.chunk_memory import ChunkMemory
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.live_map import LiveMap
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.paged_map import PagedMap
+from tests.support.served_map import Served
 
 
 @pytest.fixture(autouse=True)
 def closed_maps(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Every live map that a test makes is closed at its end: files stay open otherwise."""
-    made: list[LiveMap] = []
-    begin = LiveMap.__post_init__
-
-    def note(one: LiveMap) -> None:
-        made.append(one)
-        begin(one)
-
-    monkeypatch.setattr(LiveMap, "__post_init__", note)
-    opened: dict[int, ChunkMemory | Folder] = {}
-    for kind in (ChunkMemory, Folder):
+    """Close what a test left open: maps, their memory and their directories."""
+    opened: dict[int, Any] = {}
+    for kind in (PagedMap, ChunkMemory, Folder):
         _follow(kind, opened, monkeypatch)
     yield
-    for one in made:
-        if hasattr(one, "_threads"):
-            one.close()
-    for place in list(opened.values()):
-        place.close()
+    for one in sorted(opened.values(), key=lambda one: not isinstance(one, PagedMap)):
+        one.close()
 
 
 def _follow(kind: Any, opened: dict[int, Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,3 +41,25 @@ def _follow(kind: Any, opened: dict[int, Any], monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(kind, "__init__", init)
     monkeypatch.setattr(kind, "close", close)
+
+
+@pytest.fixture
+def shm() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
+        yield Path(path)
+
+
+@pytest.fixture
+def serve(shm: Path, tmp_path: Path) -> Iterator[Callable[..., Served]]:
+    """Begin runs of one map, ``serve(budget_bytes, linger_s=..., ...)``; `Served.end` ends them."""
+    begun: list[Served] = []
+
+    def factory(budget_bytes: int = 10**9, **limits: Any) -> Served:
+        for previous in begun:
+            previous.live.close()
+        begun.append(Served(shm, tmp_path / "map", budget_bytes, **limits))
+        return begun[-1]
+
+    yield factory
+    for one in begun:
+        one.live.close()

@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from shmmap.chunks.layout import (
     HEADER_BYTES,
-    MOST_BYTES,
+    MAX_BYTES,
     ChunkIdentity,
     chunk_bytes,
     new_header,
@@ -28,7 +28,7 @@ from shmmap.chunks.layout import (
 from shmmap.chunks.voxels import BRICKS, ChunkKey
 from shmmap.daemon.live import chunk_memory
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
-from shmmap.errors import SegmentCorrupt
+from shmmap.errors import CannotStart, SegmentCorrupt
 from tests.support.accounts import MEMBER
 
 PREFIX = live_prefix("test", "lidar")
@@ -72,13 +72,13 @@ def test_a_chunk_is_made_grows_and_is_found_again(memory: ChunkMemory, directory
     fill(chunk, 5)
     assert (chunk.nbytes, len(chunk.view.bricks)) == (2 * 4096, 8)
     fill(chunk, BRICKS)
-    assert chunk.nbytes == MOST_BYTES
+    assert chunk.nbytes == MAX_BYTES
     chunk.close()
     again = memory.open(NAME)
     assert again.view.identity == IDENTITY
     assert (again.view.bricks == np.arange(1, BRICKS + 1)[:, None]).all()
     again.close()
-    assert (directory / NAME[1:]).stat().st_size == MOST_BYTES
+    assert (directory / NAME[1:]).stat().st_size == MAX_BYTES
 
 
 def test_what_is_given_up_is_free_at_once_whatever_others_have_of_it(
@@ -104,7 +104,7 @@ print(data[4096], flush=True)
         assert reader.stdout is not None
         assert reader.stdout.readline() == "mapped\n"
         status = (directory / NAME[1:]).stat()
-        assert status.st_blocks * 512 == MOST_BYTES
+        assert status.st_blocks * 512 == MAX_BYTES
         fd = os.open(directory / NAME[1:], os.O_RDONLY)
         memory.give_up(chunk)
         assert not list(directory.iterdir())
@@ -130,13 +130,6 @@ def test_who_may_read_it(directory: Path) -> None:
     assert (stat.S_IMODE(status.st_mode), status.st_gid) == (0o640, os.getgid())
     memory.remove(NAME)
     memory.close()
-
-
-def test_a_name_that_is_taken_is_not_taken_over(memory: ChunkMemory, directory: Path) -> None:
-    (directory / NAME[1:]).write_bytes(b"somebody's")
-    with pytest.raises(FileExistsError):
-        memory.create(new_header(IDENTITY))
-    assert (directory / NAME[1:]).read_bytes() == b"somebody's"
 
 
 def test_where_there_is_no_memory_nothing_changes(memory: ChunkMemory, directory: Path) -> None:
@@ -175,7 +168,7 @@ def test_where_nothing_more_can_be_mapped_no_name_stays(
 
 
 @pytest.mark.root
-def test_what_is_somebody_else_s_is_not_ours_to_take_over(memory: ChunkMemory, directory: Path) -> None:
+def test_another_user_s_files_are_not_taken_over(memory: ChunkMemory, directory: Path) -> None:
     memory.create(new_header(IDENTITY)).close()
     theirs = [directory / f"{PREFIX[1:]}0_0_0.3"]
     for path in theirs:
@@ -223,3 +216,35 @@ def test_a_link_or_a_pipe_of_that_name_is_refused(memory: ChunkMemory, directory
     os.mkfifo(directory / NAME[1:])
     with pytest.raises(SegmentCorrupt, match="0 bytes"):
         memory.open(NAME)
+
+
+def test_a_record_is_kept_while_there_are_chunks(memory: ChunkMemory, directory: Path) -> None:
+    path = directory / f"{PREFIX[1:]}undo"
+    memory.record("undo", 8192)[100:103] = b"abc"
+    assert (path.stat().st_size, path.stat().st_mode & 0o777) == (8192, 0o600)
+    memory.create(new_header(IDENTITY)).close()
+    again = ChunkMemory(str(directory), PREFIX)
+    again.close()
+    assert bytes(memory.record("undo", 8192)[100:103]) == b"abc"
+    memory.remove(NAME)
+    ChunkMemory(str(directory), PREFIX).close()
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link", pytest.param("another user's", marks=pytest.mark.root)])
+def test_a_record_that_others_could_write_is_refused(
+    memory: ChunkMemory, directory: Path, tmp_path: Path, kind: str
+) -> None:
+    """Who could write it would write chunks."""
+    path = directory / f"{PREFIX[1:]}undo"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "link":
+        path.symlink_to(tmp_path / "elsewhere")
+    else:
+        path.write_bytes(bytes(100))
+        os.chown(path, MEMBER, -1)
+    with pytest.raises((CannotStart, OSError), match=r"is not a file of this user|symbolic links"):
+        memory.record("undo", 8192)
+    assert not (tmp_path / "elsewhere").exists()
+    path.unlink()

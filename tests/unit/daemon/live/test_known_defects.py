@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import errno
 import os
-import tempfile
 import threading
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,20 +20,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shmmap.chunks.applying import UNDO_BYTES, UndoRecord
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.voxels import CHUNK_SIDE, ChunkKey
-from shmmap.daemon.live import live_map
+from shmmap.daemon.live import paged_map
 from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
-from shmmap.daemon.live.folder import Files, Folder
-from shmmap.daemon.live.live_map import LiveMap
-from shmmap.daemon.live.map_files import MapFiles
-from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.paging.residency import Residency
+from shmmap.daemon.live.disk.folder import Files, Folder
+from shmmap.daemon.live.disk.map_files import MapFiles
+from shmmap.daemon.live.paged_map import PagedMap
+from shmmap.daemon.live.paging.durability import Chunk, Scan, State
+from shmmap.daemon.live.paging.residency import Limits, Residency
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.disks import CutDisk
-from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, Voxel, voxels_on_disk
+from tests.support.live_drive import FILTER, RESOLUTION, SETTINGS, Observed, Voxel, voxels_on_disk
 
 SIDE_M = CHUNK_SIDE * RESOLUTION
 FAR_AWAY = (900.0, 900.0, 900.0)
@@ -64,19 +62,17 @@ def unbounded(scans: list[Marks]) -> dict[Voxel, int]:
 class World:
     """A live map, a mapper that is its only client, and the worker's loop."""
 
-    def __init__(self, shm: Path, files: Files, kind: type[LiveMap] = LiveMap, **limits: Any) -> None:
+    def __init__(self, shm: Path, files: Files, kind: type[PagedMap] = PagedMap, **limits: Any) -> None:
         self.now_s = 0.0
         self.scans = 0
         allowed = {"hysteresis": 0.0, "linger_s": 0.0, "checkpoint_s": 1e9, **limits}
-        self.map = kind(
-            MapFiles(files, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")),
-            UndoRecord(bytearray(UNDO_BYTES)), Limits(10**9, **allowed),
-        )  # fmt: skip
+        memory = ChunkMemory(str(shm), live_prefix("test", "lidar"))
+        self.map = kind(MapFiles(files, SETTINGS), memory, Limits(10**9, **allowed), Observed())
 
     def turn(self, *, save_all: bool = False) -> None:
         """One turn."""
         self.now_s += 0.2
-        self.map.turn(self.now_s, 1, save_all=save_all)
+        self.map.run_turn(self.now_s, 1, save_all=save_all)
 
     def send(self, marks: Marks, at: Position) -> Scan:
         """A scan, until it is applied."""
@@ -109,16 +105,10 @@ class World:
 
 
 @pytest.fixture
-def shm() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
-        yield Path(path)
-
-
-@pytest.fixture
-def driven(shm: Path, tmp_path: Path) -> Callable[[type[LiveMap]], dict[Voxel, int]]:
+def driven(shm: Path, tmp_path: Path) -> Callable[[type[PagedMap]], dict[Voxel, int]]:
     """What a map makes of `crossing`."""
 
-    def drive(kind: type[LiveMap]) -> dict[Voxel, int]:
+    def drive(kind: type[PagedMap]) -> dict[Voxel, int]:
         for name in shm.iterdir():
             name.unlink()
         world = World(shm, folder := Folder(tmp_path / kind.__name__), kind)
@@ -150,25 +140,25 @@ def chunk_of(voxel: Voxel) -> ChunkKey:
 # --- what a scan comes to -----------------------------------------------------------------------
 
 
-class _WithoutItsOwn(LiveMap):
+class _WithoutItsOwn(PagedMap):
     def add(self, mapper: int, number: int, marks: Marks, nbytes: int) -> Scan:
         own = self.residency.windows.center("mapper")
         return super().add(mapper, number, remade(marks, lambda key: None if key == own else key), nbytes)
 
 
-def test_own_chunk_never_updated(driven: Callable[[type[LiveMap]], dict[Voxel, int]]) -> None:
+def test_own_chunk_never_updated(driven: Callable[[type[PagedMap]], dict[Voxel, int]]) -> None:
     """v1: what was to be updated were neighbours of the sensor's chunk, and that is none of its own.
 
     After one scan there were 0 occupied voxels in it instead of 2190.
     """
     own = {ChunkKey(*(int(value // SIDE_M) for value in at)) for _, at in crossing()}
-    right = driven(LiveMap)
+    right = driven(PagedMap)
     assert right == unbounded([marks for marks, _ in crossing()])
     assert own <= {chunk_of(voxel) for voxel, value in right.items() if value > 0}
     assert driven(_WithoutItsOwn) != right
 
 
-class _ShiftedAtCrossings(LiveMap):
+class _ShiftedAtCrossings(PagedMap):
     shift = (0, 0, 0)
 
     def move(self, client: object, xyz: Position) -> None:
@@ -184,7 +174,7 @@ class _ShiftedAtCrossings(LiveMap):
         return super().add(mapper, number, shifted, nbytes)
 
 
-def test_phantom_voxels_at_crossings(driven: Callable[[type[LiveMap]], dict[Voxel, int]]) -> None:
+def test_phantom_voxels_at_crossings(driven: Callable[[type[PagedMap]], dict[Voxel, int]]) -> None:
     """v1: the scan of a crossing was put where the window had been, one chunk off.
 
     276 occupied voxels where nothing was after the first crossing, thousands later: its issue 7, "fixed" by
@@ -192,38 +182,38 @@ def test_phantom_voxels_at_crossings(driven: Callable[[type[LiveMap]], dict[Voxe
     """
     scans = [marks for marks, _ in crossing()]
     occupied = {voxel for voxel, value in unbounded(scans).items() if value > 0}
-    right, wrong = driven(LiveMap), driven(_ShiftedAtCrossings)
+    right, wrong = driven(PagedMap), driven(_ShiftedAtCrossings)
     assert {voxel for voxel, value in right.items() if value > 0} == occupied
     assert {voxel for voxel, value in wrong.items() if value > 0} - occupied
 
 
-class _DropsWhatIsNotThere(LiveMap):
+class _DropsWhatIsNotThere(PagedMap):
     def add(self, mapper: int, number: int, marks: Marks, nbytes: int) -> Scan:
         return super().add(
             mapper, number, remade(marks, lambda key: key if key in self.chunks else None), nbytes
         )
 
 
-def test_rays_lost_while_a_chunk_loads(driven: Callable[[type[LiveMap]], dict[Voxel, int]]) -> None:
+def test_rays_lost_while_a_chunk_loads(driven: Callable[[type[PagedMap]], dict[Voxel, int]]) -> None:
     """v1 dropped scans while a chunk was loaded, v2 the points, with their rays, that ended in such a chunk.
 
     3 % of a drive's points in v2.  (Rays that Bonxai loses are in the tests of marking.)
     """
     right = unbounded([marks for marks, _ in crossing()])
-    assert driven(LiveMap) == right
+    assert driven(PagedMap) == right
     assert driven(_DropsWhatIsNotThere) != right
 
 
 # --- memory -------------------------------------------------------------------------------------
 
 
-class _KeepsAll(LiveMap):
+class _KeepsAll(PagedMap):
     def add(self, mapper: int, number: int, marks: Marks, nbytes: int) -> Scan:
         self.__dict__.setdefault("hoard", []).append(marks)
         return super().add(mapper, number, marks, nbytes)
 
 
-def growth(shm: Path, kind: type[LiveMap], scans: int) -> int:
+def growth(shm: Path, kind: type[PagedMap], scans: int) -> int:
     """Bytes that a map takes more after so many scans, marked and saved, of a place that it knows."""
     points = np.random.default_rng(3).normal(0.0, 3.0, (300, 3))
     marker, pose = Marker(RESOLUTION, FILTER), np.eye(4)
@@ -253,7 +243,7 @@ def test_leak(shm: Path) -> None:
     """
     marks, _ = Marker(RESOLUTION, FILTER).mark(np.random.default_rng(3).normal(0.0, 3.0, (300, 3)), np.eye(4))
     of_one = marks.bits.nbytes + marks.words.nbytes
-    assert growth(shm, LiveMap, 30) < 10 * of_one
+    assert growth(shm, PagedMap, 30) < 10 * of_one
     assert growth(shm, _KeepsAll, 30) > 20 * of_one
 
 
@@ -289,7 +279,7 @@ def test_reload_before_save(
 
     88 to 90 % of the voxels were lost.
     """
-    monkeypatch.setattr(live_map, "Residency", kind)
+    monkeypatch.setattr(paged_map, "Residency", kind)
     marks, at = crossing()[0]
     world = World(shm, folder := _HeldFolder(tmp_path), saves=100)
     world.send(marks, at)
@@ -323,40 +313,22 @@ class _FullAtFirst(CutDisk):
         super().write(name, data)
 
 
-def test_what_cannot_be_saved_is_told_until_it_is(shm: Path) -> None:
-    marks, at = crossing()[0]
-    world = World(shm, _FullAtFirst())
-    world.send(marks, at)
-    told: set[str] = set()
-
-    class Noted(dict[str, str]):
-        def __setitem__(self, what: str, text: str) -> None:
-            told.add(text)
-            super().__setitem__(what, text)
-
-    world.map.problems = Noted()
-    world.until(lambda: world.map.all_durable, save_all=True)
-    assert told
-    assert all(text.endswith("No space left on device") for text in told)
-    assert not world.map.problems
-
-
-class _StopsAtOnce(LiveMap):
+class _StopsAtOnce(PagedMap):
     @property
     def all_durable(self) -> bool:
         return True
 
 
-class _LeavesWhatIsOnItsWay(LiveMap):
+class _LeavesWhatIsOnItsWay(PagedMap):
     @property
     def all_durable(self) -> bool:
         return not self.residency._dirty
 
 
 @pytest.mark.parametrize(
-    ("kind", "right"), [(LiveMap, True), (_StopsAtOnce, False), (_LeavesWhatIsOnItsWay, False)]
+    ("kind", "right"), [(PagedMap, True), (_StopsAtOnce, False), (_LeavesWhatIsOnItsWay, False)]
 )
-def test_dirty_chunks_lost_at_exit(shm: Path, kind: type[LiveMap], *, right: bool) -> None:
+def test_dirty_chunks_lost_at_exit(shm: Path, kind: type[PagedMap], *, right: bool) -> None:
     """v1 and v2: who stopped looked at the flag before the queue; 29 changed chunks, none of them written.
 
     Here the disk is full for a while, and the machine goes off at the end.
@@ -387,7 +359,7 @@ def test_unreadable_chunk_overwritten(
     damaged[-1] ^= 1
     victim.write_bytes(damaged)
     if not kept:
-        monkeypatch.setattr(MapFiles, "put_aside", lambda self, key, _why: self.rows.pop(key))
+        monkeypatch.setattr(MapFiles, "quarantine", lambda self, key, _why: self.rows.pop(key))
     for name in shm.iterdir():
         name.unlink()
     world = World(shm, folder)

@@ -9,14 +9,11 @@ import random
 import signal
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from shmmap.chunks.layout import OUT_OF_SERVICE
-from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.chunk_memory import ChunkMemory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.forked_programs import run_verb
@@ -35,12 +32,6 @@ def reference() -> dict[Voxel, int]:
     for number, marks in enumerate(marked(), 1):
         unbounded.apply(marks, scan=number)
     return unbounded.voxels()
-
-
-@pytest.fixture
-def shm() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(dir="/dev/shm") as path:
-        yield Path(path)
 
 
 def run(
@@ -146,7 +137,7 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
 ) -> None:
     """Out of service, and its name still there: nobody is to have that; and what cannot be opened stays."""
     run(shm, tmp_path, 1)
-    name = max(shm.glob("shmmap-live.*"))
+    name = max(shm.glob("shmmap-live.*_*"))
     made, folder = opened(shm, tmp_path, 10**9)
     key = next(key for key, chunk in made.chunks.items() if chunk.name == f"/{name.name}")
     made.chunks[key].view.state["state"] = OUT_OF_SERVICE
@@ -168,23 +159,3 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
 
 def _too_many_files(*_: object) -> None:
     raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
-
-
-def test_what_is_damaged_on_disk_is_kept_and_mapping_goes_on(shm: Path, tmp_path: Path) -> None:
-    run(shm, tmp_path, 1)
-    for name in os.listdir(shm):
-        (shm / name).unlink()
-    victim = max(tmp_path.glob("*.chunk"), key=lambda path: path.stat().st_size)
-    damaged = bytearray(victim.read_bytes())
-    damaged[len(damaged) // 2] ^= 1
-    victim.write_bytes(damaged)
-    made, folder = opened(shm, tmp_path, 10**9)
-    key = ChunkKey.from_text(victim.name.removesuffix(".chunk"))
-    made.add(1, 99, next(marks for marks in marked() if key in marks.chunks), 1)
-    for number in range(200):
-        made.turn(float(number), number, save_all=True)
-        made.wait(0.05)
-    assert (tmp_path / f"{victim.name}.damaged.1").read_bytes() == damaged
-    assert key in made.files.rows
-    made.close()
-    folder.close()

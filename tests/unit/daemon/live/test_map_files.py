@@ -17,10 +17,11 @@ from shmmap.chunks.chunk_file import decode_chunk, encode_chunk
 from shmmap.chunks.layout import ChunkIdentity, ChunkView, new_header
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings, Row
-from shmmap.daemon.live.unflushed_files import UnflushedFiles
-from shmmap.errors import ConfigError, InstanceBusy, MapDataError
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_files import SCANS_AHEAD, MapFiles
+from shmmap.daemon.live.disk.map_record import MapSettings, Row
+from shmmap.daemon.live.disk.unflushed_files import UnflushedFiles
+from shmmap.errors import ConfigError, MapDataError
 from tests.support.disks import CutDisk, PowerCut
 
 SETTINGS = MapSettings(resolution=0.1)
@@ -48,7 +49,7 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     folder = Folder(tmp_path / "state" / "lidar")
     made = MapFiles(folder, SETTINGS)
     assert (made.settings, made.mappers, made.rows) == (SETTINGS, [], {})
-    assert made.begin_life() == 1
+    assert made.begin_run() == 1
     mapper = made.add_mapper(1000, "front")
     made.expect_scan(mapper, 0)
     made.save(KEYS[0], chunk(made, KEYS[0], 3))
@@ -58,30 +59,13 @@ def test_a_map_is_made_and_found_again(tmp_path: Path) -> None:
     assert (tmp_path / "state" / "lidar").stat().st_mode & 0o777 == 0o700
     again = MapFiles(folder := Folder(tmp_path / "state" / "lidar"), SETTINGS)
     assert again.map_id == made.map_id
-    assert again.begin_life() == 2
+    assert again.begin_run() == 2
     assert [(m.number, m.uid, m.name, m.scans) for m in again.mappers] == [(1, 1000, "front", SCANS_AHEAD)]
     assert again.rows == {KEYS[0]: Row(3, 2688, 0, 0, 0, 0), KEYS[1]: Row(1, 2688, 0, 0, 0, 0)}
     assert [version_of(again, key) for key in KEYS] == [3, 1, 0]
     assert not again.missing
     assert not again.damaged
     folder.close()
-
-
-def test_the_number_of_a_mapper_is_never_given_again() -> None:
-    disk = CutDisk()
-    made = MapFiles(disk, SETTINGS)
-    first = made.add_mapper(0, "a")
-    made.forget_mapper(first)
-    assert MapFiles(disk, SETTINGS).add_mapper(0, "a").number == 2
-
-
-def test_scans_are_expected_ahead() -> None:
-    disk = CutDisk()
-    made = MapFiles(disk, SETTINGS)
-    mapper = made.add_mapper(0, "a")
-    for scan in (1, 2, SCANS_AHEAD, SCANS_AHEAD + 1, 2 * SCANS_AHEAD + 1, 2 * SCANS_AHEAD + 2, 1 << 40):
-        made.expect_scan(mapper, scan)
-        assert MapFiles(disk, SETTINGS).mappers[0].scans > scan
 
 
 @pytest.mark.parametrize(
@@ -120,15 +104,7 @@ def test_chunks_without_a_map_are_left_alone() -> None:
     assert disk.names() == ["0_0_0.chunk"]
 
 
-def test_one_process_at_a_time(tmp_path: Path) -> None:
-    folder = Folder(tmp_path)
-    with pytest.raises(InstanceBusy, match=str(tmp_path)):
-        Folder(tmp_path)
-    folder.close()
-    Folder(tmp_path).close()
-
-
-def test_a_damaged_file_is_put_aside_and_never_overwritten(tmp_path: Path) -> None:
+def test_a_damaged_file_is_quarantined_and_never_overwritten(tmp_path: Path) -> None:
     folder = Folder(tmp_path)
     made = MapFiles(folder, SETTINGS)
     for key in KEYS:
@@ -149,7 +125,7 @@ def test_a_damaged_file_is_put_aside_and_never_overwritten(tmp_path: Path) -> No
     assert set(again.missing) == set(KEYS)
     again.save(KEYS[0], chunk(again, KEYS[0], 1))
     again.flush()
-    assert again.put_aside(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
+    assert again.quarantine(KEYS[0], "its body is damaged") == "0_0_0.chunk.damaged.2"
     assert (tmp_path / "0_0_0.chunk.damaged.1").read_bytes() == b"CORRUPTED DATA"
     assert again.load(KEYS[0]) is None
     folder.close()
@@ -171,24 +147,24 @@ def test_a_file_that_did_not_get_its_name_is_taken_if_it_is_newer() -> None:
     assert sorted(disk.names()) == sorted([*(key.text + ".chunk" for key in KEYS), "map.json"])
 
 
-def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    folder = Folder(tmp_path)
-    made = MapFiles(folder, SETTINGS)
-    made.save(KEYS[0], chunk(made, KEYS[0], 1))
-    made.flush()
-    names = sorted(folder.names())
+@pytest.mark.parametrize(("what", "before"), [("write", 1), ("overwrite", 2)])
+def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, what: str, before: int) -> None:
+    """All that is spare gives its room back."""
+    disk = CutDisk()
+    made = MapFiles(disk, SETTINGS)
+    for version in range(1, before + 1):
+        for key in KEYS:
+            made.save(key, chunk(made, key, version))
+        made.flush()
     with monkeypatch.context() as patch:
-        patch.setattr(folder, "write", _full)
+        patch.setattr(disk, what, _full)
         with pytest.raises(OSError, match="No space"):
-            made.save(KEYS[0], chunk(made, KEYS[0], 2))
-    assert sorted(folder.names()) == names
-    assert version_of(made, KEYS[0]) == 1
-    made.save(KEYS[0], chunk(made, KEYS[0], 2))
+            made.save(KEYS[0], chunk(made, KEYS[0], 9))
+    assert sorted(disk.names()) == sorted([*(key.text + ".chunk" for key in KEYS), "map.json"])
+    assert [version_of(made, key) for key in KEYS] == [before] * 3
+    made.save(KEYS[0], chunk(made, KEYS[0], 10))
     made.flush()
-    made.remove_spare()
-    assert sorted(folder.names()) == names
-    assert version_of(made, KEYS[0]) == 2
-    folder.close()
+    assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 10
 
 
 def test_files_are_written_over_again(tmp_path: Path) -> None:
@@ -219,23 +195,6 @@ def test_a_file_system_that_cannot_exchange_names(exchanges: bool) -> None:
     assert len([name for name in disk.names() if name.endswith(".tmp")]) == exchanges
     assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 2
     assert sorted(disk.names()) == ["0_0_0.chunk", "map.json"], "the older one goes"
-
-
-def test_what_cannot_be_written_over_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All that is spare gives its room back."""
-    disk = CutDisk()
-    made = MapFiles(disk, SETTINGS)
-    for version in (1, 2):
-        for key in KEYS:
-            made.save(key, chunk(made, key, version))
-        made.flush()
-    assert len([name for name in disk.names() if name.endswith(".tmp")]) == len(KEYS)
-    with monkeypatch.context() as patch:
-        patch.setattr(disk, "overwrite", _full)
-        with pytest.raises(OSError, match="No space"):
-            made.save(KEYS[0], chunk(made, KEYS[0], 3))
-    assert not [name for name in disk.names() if name.endswith(".tmp")]
-    assert [version_of(made, key) for key in KEYS] == [2, 2, 2]
 
 
 def test_who_reads_a_file_that_is_written_over_reads_the_one_in_its_place(
@@ -298,7 +257,8 @@ def test_what_a_disk_does_not_flush_is_kept_and_written_again(
     made.remove_spare()
     assert sorted(disk.names()) == names
     assert made.unflushed_bytes == 0
-    assert [version_of(MapFiles(disk, SETTINGS), key) for key in KEYS] == [2, 3, 2]
+    after = MapFiles(disk.after(lambda: False, lambda _size: 0), SETTINGS)
+    assert [version_of(after, key) for key in KEYS] == [2, 3, 2]
 
 
 def test_what_is_saved_often_is_flushed_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -342,33 +302,6 @@ def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch, *, a
     assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 2
 
 
-def test_what_was_not_flushed_is_flushed_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A flush that fails makes nothing durable, nor does the next one by doing nothing."""
-    disk = CutDisk()
-    made = MapFiles(disk, SETTINGS)
-    made.save(KEYS[0], chunk(made, KEYS[0], 1))
-    with monkeypatch.context() as patch:
-        patch.setattr(disk, "sync_names", _full)
-        with pytest.raises(OSError, match="No space"):
-            made.flush()
-    made.flush()
-    assert version_of(MapFiles(disk.after(lambda: False, lambda _size: 0), SETTINGS), KEYS[0]) == 1
-
-
-def test_what_cannot_be_read_just_now_is_not_put_aside(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    folder = Folder(tmp_path)
-    made = MapFiles(folder, SETTINGS)
-    made.save(KEYS[0], chunk(made, KEYS[0], 1))
-    with monkeypatch.context() as patch:
-        patch.setattr(folder, "size", _full)
-        with pytest.raises(OSError, match="No space"):
-            MapFiles(folder, SETTINGS)
-    assert version_of(MapFiles(folder, SETTINGS), KEYS[0]) == 1
-    folder.close()
-
-
 def _full(*_: object) -> None:
     raise OSError(28, os.strerror(28))
 
@@ -398,7 +331,7 @@ class Drive:
         made = MapFiles(self._disk, SETTINGS)
         self.map_id = made.map_id
         saved: dict[ChunkKey, int] = {key: row.version for key, row in made.rows.items()}
-        self.lives = made.begin_life()
+        self.lives = made.begin_run()
         for _ in range(30):
             what = rng.random()
             key = rng.choice(KEYS)
@@ -419,7 +352,7 @@ class Drive:
 @pytest.mark.parametrize("exchanges", [True, False])
 @pytest.mark.parametrize("seed", range(60))
 def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int, exchanges: bool) -> None:
-    """The disk may then be in any state that is allowed; and the power may fail again in the next life."""
+    """The disk may then be in any state that is allowed; and the power may fail again in the next run."""
     rng = random.Random(seed)
     disk = CutDisk(rng.randint(0, 70), exchanges)
     durable: dict[ChunkKey, int] = {}
@@ -440,7 +373,7 @@ def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int, exchanges
             assert version_of(made, key) == made.rows[key].version
         assert not [name for name in disk.names() if name.endswith(".tmp")]
         assert made.add_mapper(0, "next").number > mappers
-        assert made.begin_life() > lives
+        assert made.begin_run() > lives
         mappers += 1
         disk.operations, disk.exchanges = rng.randint(0, 70), exchanges
 
@@ -580,7 +513,7 @@ def test_any_bit_of_any_file_may_flip() -> None:
             assert name == "map.json"
             continue
         assert KEYS[0] in again.rows or name != "manifest.json"
-        assert again.begin_life() < 1 << 31
+        assert again.begin_run() < 1 << 31
         assert len(again.applied) <= 1
 
 

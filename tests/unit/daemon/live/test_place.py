@@ -79,7 +79,7 @@ def test_an_eighth_of_what_the_cells_leave(
     assert placed(cells, cells_budget=cells_budget).budget_bytes == budget
 
 
-def test_what_an_earlier_life_left_counts_as_free(
+def test_what_an_previous_run_left_counts_as_free(
     cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 0)
@@ -93,21 +93,21 @@ def test_what_an_earlier_life_left_counts_as_free(
 
 def test_both_budgets_fit_in_the_file_system(cells: ShmDirectory) -> None:
     assert placed(cells, budget=FREE, cells_budget=SIZE - FREE).budget_bytes == FREE
-    with pytest.raises(ConfigError, match="of 4,096 MiB and cells of 4,097 MiB do not fit") as told:
+    with pytest.raises(ConfigError, match="of 4,096 MiB and cells of 4,097 MiB do not fit") as caught:
         placed(cells, budget=FREE, cells_budget=SIZE - FREE + MIB)
-    assert told.value.key == "live_budget"
-    assert "lower --live-budget or --budget" in told.value.hint
-    with pytest.raises(CannotStart, match="4,096 MiB free") as told_of_room:
+    assert caught.value.key == "live_budget"
+    assert "lower --live-budget or --budget" in caught.value.hint
+    with pytest.raises(CannotStart, match="4,096 MiB free") as no_room:
         placed(cells, budget=FREE + MIB)
-    assert "free some" in told_of_room.value.hint
+    assert "free some" in no_room.value.hint
 
 
 def test_each_map_gets_a_few_chunks(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
     names = [f"m{number}" for number in range(5)]
     assert placed(cells, *names, budget=20 * MIB).budget_bytes == 20 * MIB
-    with pytest.raises(ConfigError, match="5 live maps share 19 MiB; each needs 4") as told:
+    with pytest.raises(ConfigError, match="5 live maps share 19 MiB; each needs 4") as caught:
         placed(cells, *names, budget=19 * MIB)
-    assert "20M at least" in told.value.hint
+    assert "20M at least" in caught.value.hint
     monkeypatch.setattr(ShmDirectory, "free_bytes", lambda _self: 0)
     assert placed(cells, *names).budget_bytes == 20 * MIB
 
@@ -125,10 +125,10 @@ def test_a_directory_with_huge_pages_is_not_used(
     mounted(monkeypatch, ("/", "rw"), ("/dev/shm", "rw"), (cells.path, options))
     assert placed(cells).shm_dir == ("/dev/shm" if huge else cells.path)
     if huge:
-        with pytest.raises(ConfigError, match="has huge pages") as told:
+        with pytest.raises(ConfigError, match="has huge pages") as caught:
             placed(cells, shm_dir=cells.path)
-        assert told.value.key == "live_shm_dir"
-        assert "without them" in told.value.hint
+        assert caught.value.key == "live_shm_dir"
+        assert "without them" in caught.value.hint
 
 
 def test_the_innermost_and_last_mount_counts(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:

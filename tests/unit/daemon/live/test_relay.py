@@ -16,15 +16,15 @@ from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.live import messages, relay
 from shmmap.daemon.live.relay import (
-    BEGINNING_S,
     END_S,
-    IN_ORDER_S,
-    MOST_BYTES,
-    MOST_UNSENT,
+    MAX_BYTES,
+    MAX_UNSENT,
     PAUSES_S,
+    REFUSED_PER_TURN,
+    STABLE_S,
+    START_END_S,
     LiveRelay,
 )
-from shmmap.daemon.live.tickets import REFUSED_AT_ONCE
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet
@@ -87,7 +87,7 @@ class World:
         self.say(messages.Begun(1, 0))
 
     def heard(self) -> list[Any]:
-        """What the worker is told."""
+        """Messages that the worker received."""
         found: list[Any] = []
         while True:
             try:
@@ -100,11 +100,11 @@ class World:
 
     def say(self, message: messages.FromLive) -> None:
         self.workers[-1].send(messages.encode(message))
-        self.relay.hear()
+        self.relay.on_readable()
 
     def die(self) -> None:
         self.workers[-1].close()
-        self.relay.hear()
+        self.relay.on_readable()
         while self.relay.next_s <= self.now_s:
             self.relay.turn(self.now_s)
 
@@ -114,14 +114,21 @@ class World:
 
 
 @pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+def starting(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    """A relay that may have started workers, which have sent nothing yet."""
     one = World(monkeypatch)
-    one.started()
     yield one
     one.relay._forget()
     for worker in one.workers:
         worker.close()
     one.watched.close()
+
+
+@pytest.fixture
+def world(starting: World) -> World:
+    """A relay whose worker serves all maps."""
+    starting.started()
+    return starting
 
 
 def test_each_gets_its_own_answer(world: World) -> None:
@@ -139,40 +146,28 @@ def test_each_gets_its_own_answer(world: World) -> None:
     assert len(world.relay._tickets) == 0
 
 
-def test_a_session_waits_for_so_many_and_no_more(world: World) -> None:
-    a, b = Asker(1), Asker(2)
-    for number in range(messages.MOST_OF_A_SESSION):
-        world.ask(a, number)
-    with pytest.raises(Busy, match="64 requests"):
-        world.ask(a)
-    world.ask(b)
-    first = world.heard()[0]
-    world.say(messages.Answer(first.ticket, b"x"))
-    world.ask(a)
-    with pytest.raises(Busy, match="64 requests"):
-        world.ask(a)
-
-
 def test_a_session_that_has_ended_is_answered_nothing(world: World) -> None:
     a, silent = Asker(1), Asker(3)
     world.ask(a)
     (asked,) = world.heard()
-    world.relay.left(a)  # type: ignore[arg-type]
-    world.relay.left(silent)  # type: ignore[arg-type]
-    assert world.heard() == [messages.Left(1)], "of one that asked for nothing the worker knows nothing"
+    world.relay.on_disconnect(a)  # type: ignore[arg-type]
+    world.relay.on_disconnect(silent)  # type: ignore[arg-type]
+    assert world.heard() == [messages.Disconnected(1)], (
+        "of one that asked for nothing the worker knows nothing"
+    )
     world.say(messages.Answer(asked.ticket, b"x"))
     assert a.answered == []
-    assert (len(world.relay._tickets), world.relay._askers) == (0, set())
+    assert (len(world.relay._tickets), world.relay._known_sessions) == (0, set())
 
 
 def test_a_request_that_is_too_long(world: World) -> None:
     message, asker = LiveMove(1, "lidar", (0.0, 0.0, 0.0)), Asker(1)
     with pytest.raises(BadRequest, match="at most"):
-        world.relay.ask(asker, message, bytes(MOST_BYTES + 1), 0.0)  # type: ignore[arg-type]
+        world.relay.ask(asker, message, bytes(MAX_BYTES + 1), 0.0)  # type: ignore[arg-type]
     assert world.heard() == []
 
 
-def test_a_worker_that_hears_nothing_costs_little(world: World) -> None:
+def test_a_worker_that_reads_nothing_costs_little(world: World) -> None:
     """Sessions come, ask as much as they may, and go: what is kept for the worker is bounded."""
 
     def come_ask_and_go() -> None:
@@ -180,21 +175,21 @@ def test_a_worker_that_hears_nothing_costs_little(world: World) -> None:
             asker = Asker(slot)
             for number in range(8):
                 world.ask(asker, number)
-            world.relay.left(asker)  # type: ignore[arg-type]
+            world.relay.on_disconnect(asker)  # type: ignore[arg-type]
 
     with pytest.raises(Busy, match="hears nothing"):
         come_ask_and_go()
-    assert len(world.relay._unsent) <= MOST_UNSENT + 1
+    assert len(world.relay._unsent) <= MAX_UNSENT + 1
     asked = 0
     while world.relay._unsent:
         asked += len(world.heard())
-        world.relay.hear()
+        world.relay.on_readable()
     asked += len(world.heard())
-    assert asked > MOST_UNSENT, "what was taken is passed on when it hears again"
+    assert asked > MAX_UNSENT, "what was taken is passed on when it hears again"
     world.ask(Asker(5))
 
 
-def test_who_waits_when_the_worker_dies_is_told(world: World) -> None:
+def test_requests_are_refused_when_the_worker_dies(world: World) -> None:
     a, b = Asker(1), Asker(2)
     world.ask(a, 11)
     world.ask(b, 22)
@@ -204,7 +199,7 @@ def test_who_waits_when_the_worker_dies_is_told(world: World) -> None:
     assert world.relay.restarts == 1
     with pytest.raises(LiveInterrupted):
         world.ask(a)
-    world.relay.left(a)  # type: ignore[arg-type]
+    world.relay.on_disconnect(a)  # type: ignore[arg-type]
     world.started()
     world.ask(b, 23)
     assert [message.body for message in world.heard()] == [b"23"]
@@ -212,7 +207,7 @@ def test_who_waits_when_the_worker_dies_is_told(world: World) -> None:
 
 def test_one_that_dies_again_and_again_is_not_started_all_the_time(world: World) -> None:
     """The first time at once; then there are pauses, also where it dies just after it began."""
-    world.now_s += IN_ORDER_S
+    world.now_s += STABLE_S
     for number, pause_s in enumerate([*PAUSES_S, PAUSES_S[-1]]):
         world.die()
         if pause_s:
@@ -224,28 +219,17 @@ def test_one_that_dies_again_and_again_is_not_started_all_the_time(world: World)
         if number % 2:
             world.say(messages.Begun(1, 0))
     world.say(messages.Begun(1, 0))
-    world.now_s += IN_ORDER_S
+    world.now_s += STABLE_S
     world.die()
     world.relay.beat(world.now_s)
     assert len(world.workers) == len(PAUSES_S) + 3, "it had been in order"
-
-
-@pytest.fixture
-def starting(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
-    """A relay whose worker has begun and said nothing yet."""
-    one = World(monkeypatch)
-    one.relay.start()
-    yield one
-    one.relay._forget()
-    for worker in one.workers:
-        worker.close()
-    one.watched.close()
 
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_settings_refuse_the_start_where_there_is_nothing_else_to_serve(
     starting: World, *, alone: bool
 ) -> None:
+    starting.relay.start()
     starting.workers[-1].send(
         messages.encode(messages.Begun(0, 0, "bad_config", "resolution = 0.5", "leave it"))
     )
@@ -265,6 +249,7 @@ def test_a_worker_that_says_nothing_keeps_nobody_waiting(
         starting.now_s += seconds
 
     monkeypatch.setattr(starting.relay, "_wait", wait)
+    starting.relay.start()
     starting.relay.wait_until_serving(2.0, alone=False)
     asker = Asker(1)
     with pytest.raises(LiveInterrupted, match="is being started"):
@@ -360,7 +345,7 @@ def test_memory_stays_where_no_worker_starts_to_save_it(
     begin_s = world.now_s
     world.relay.close(keep=False)
     assert len(world.workers) == 2
-    assert world.now_s <= begin_s + END_S + BEGINNING_S
+    assert world.now_s <= begin_s + END_S + START_END_S
     assert "does not start: what is in memory stays" in caplog.text
 
 
@@ -375,54 +360,62 @@ def test_where_there_are_no_live_maps() -> None:
     none = relay.NoLiveMaps()
     none.ask(asker, LiveList(7), b"", 0.0)
     assert asker.answered == [encode(LiveListed(7, ()))]
-    with pytest.raises(BadRequest, match="no live maps") as told:
+    with pytest.raises(BadRequest, match="no live maps") as caught:
         none.ask(asker, LiveMove(1, "lidar", (0.0, 0.0, 0.0)), b"", 0.0)
-    assert "--live NAME" in told.value.hint
+    assert "--live NAME" in caught.value.hint
 
 
-def test_a_turn_of_the_loop_hears_a_bounded_number_of_messages(world: World) -> None:
+def test_a_turn_of_the_loop_takes_a_bounded_number_of_messages(world: World) -> None:
     """Whatever the worker has to say, clients are heard in between."""
     worker = world.workers[0]
-    for number in range(relay.HEARD_AT_ONCE + 3):
+    for number in range(relay.MESSAGES_PER_TURN + 3):
         worker.send(messages.encode(messages.Answer(10_000 + number, b"")))
-    told: list[object] = []
-    hear = world.relay._told
-    world.relay._told = lambda message: (told.append(message), hear(message))[1]  # type: ignore[method-assign,func-returns-value]
-    world.relay.hear()
-    assert len(told) == relay.HEARD_AT_ONCE
-    world.relay.hear()
-    assert len(told) == relay.HEARD_AT_ONCE + 3
+    taken: list[object] = []
+    hear = world.relay._take
+    world.relay._take = lambda message: (taken.append(message), hear(message))[1]  # type: ignore[method-assign,func-returns-value]
+    world.relay.on_readable()
+    assert len(taken) == relay.MESSAGES_PER_TURN
+    world.relay.on_readable()
+    assert len(taken) == relay.MESSAGES_PER_TURN + 3
 
 
-def test_a_process_waits_for_so_many_and_no_more_and_so_do_all(world: World) -> None:
-    """Whoever has very many sessions, or processes, keeps nobody else's answers from being waited for."""
-
-    def ask_all(askers: list[Asker]) -> None:
-        for asker in askers:
-            for number in range(messages.MOST_OF_A_SESSION):
-                world.ask(asker, number)
-                world.heard()
-
-    with pytest.raises(Busy, match="256 requests of this process"):
-        ask_all([Asker(slot, asker=7) for slot in range(1, 10)])
-    world.ask(Asker(100, asker=8))
-    with pytest.raises(Busy, match="4096 requests of all sessions"):
-        ask_all([Asker(slot) for slot in range(200, 300)])
-
-
-def test_very_many_that_wait_are_told_some_at_a_time(world: World) -> None:
+def test_very_many_that_wait_are_refused_some_at_a_time(world: World) -> None:
     askers = [Asker(slot) for slot in range(1, 11)]
     for asker in askers:
         for number in range(20):
             world.ask(asker, number)
     world.workers[-1].close()
-    world.relay.hear()
-    world.relay.left(askers[0])  # type: ignore[arg-type]
+    world.relay.on_readable()
+    world.relay.on_disconnect(askers[0])  # type: ignore[arg-type]
     turns = 0
     while world.relay.next_s <= world.now_s:
         before = sum(len(asker.refused) for asker in askers)
         world.relay.turn(world.now_s)
-        assert sum(len(asker.refused) for asker in askers) - before <= REFUSED_AT_ONCE
+        assert sum(len(asker.refused) for asker in askers) - before <= REFUSED_PER_TURN
         turns += 1
     assert turns == 3
     assert [len(asker.refused) for asker in askers] == [0] + [20] * 9
+
+
+def test_waiting_requests_are_bounded_by_session_by_process_and_in_all(world: World) -> None:
+    asked: list[Any] = []
+
+    def ask(*askers: Asker, most: int = messages.MAX_PER_SESSION) -> None:
+        for asker in askers:
+            for number in range(most):
+                world.ask(asker, number)
+                asked.extend(world.heard())
+
+    one = Asker(1)
+    ask(one)
+    with pytest.raises(Busy, match="64 requests of this session"):
+        ask(one)
+    world.say(messages.Answer(asked[0].ticket, b"x"))
+    ask(one, most=1)
+    with pytest.raises(Busy, match="64 requests of this session"):
+        ask(one)
+    with pytest.raises(Busy, match="256 requests of this process"):
+        ask(*(Asker(slot, asker=7) for slot in range(2, 12)))
+    ask(Asker(100, asker=8))
+    with pytest.raises(Busy, match="4096 requests of all sessions"):
+        ask(*(Asker(slot) for slot in range(200, 300)))

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from shmmap.chunks.occupancy import Occupancy, probability
 from shmmap.daemon.live.disk.exporting import ExportedVoxels, Format, Voxels, export
+from shmmap.daemon.live.disk.folder import Folder
+from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
-from shmmap.daemon.live.folder import Folder
-from shmmap.daemon.live.map_files import MapSettings
 from shmmap.dividing.frame import Translation
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.cloud import read_cloud

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.paging.durability import TOGETHER_S
-from shmmap.daemon.live.paging.records import Chunk, Limits, Scan, State
-from shmmap.daemon.live.paging.residency import RETRY_S, REVIEW_S, Residency
-from shmmap.daemon.live.paging.windows import Windows
+from shmmap.daemon.live.paging.durability import TOGETHER_S, Chunk, Scan, State
+from shmmap.daemon.live.paging.residency import RETRY_S, REVIEW_S, Limits, Residency
+from shmmap.daemon.live.paging.windows import Windows, place_ahead
 
 HERE = ChunkKey(0, 0, 0)
 PLENTY = Limits(budget_bytes=10**9, radius=0, loads=100, saves=100)
@@ -108,20 +107,6 @@ def test_jitter_at_a_border_moves_nothing() -> None:
         assert one.next_eviction(float(number)) is None
 
 
-def test_several_clients_have_all_their_windows() -> None:
-    one = Residency(Limits(10**9, radius=1, loads=100))
-    one.move("a", (0.5, 0.5, 0.5))
-    one.move("b", (1.5, 0.5, 0.5))
-    while one.next_load(0.0) is not None:
-        pass
-    assert len(one.chunks) == 27 + 9
-    for chunk in one.chunks.values():
-        one.loaded(chunk, version=0, nbytes=10, active=0)
-    one.leave("b")
-    assert len(one.windows.near) == 27
-    assert one.next_eviction(1.0) is None, "there is room: what nobody is near stays, too"
-
-
 def test_only_what_is_near_nobody_makes_room_for_what_is_near() -> None:
     one = Residency(Limits(27 * 10, radius=1, hysteresis=0.0, loads=100), new_bytes=10)
     one.move("a", (0.5, 0.5, 0.5))
@@ -144,39 +129,6 @@ def test_only_what_is_near_nobody_makes_room_for_what_is_near() -> None:
 # --- scans --------------------------------------------------------------------------------------
 
 
-def test_what_waits_is_bounded() -> None:
-    one = Residency(Limits(10**9, waiting_bytes=25))
-    assert one.has_room(1000), "a single one may always wait"
-    one.add(scan_of(HERE, number=1))
-    one.add(scan_of(HERE, number=2))
-    assert one.waiting_bytes == 20
-    assert not one.has_room(10)
-    chunk = load(one)
-    apply(one, chunk)
-    assert one.has_room(10)
-
-
-def test_scans_of_a_chunk_come_in_order() -> None:
-    one = Residency(PLENTY)
-    first, second = scan_of(HERE, number=1), scan_of(HERE, number=2)
-    one.add(first)
-    one.add(second)
-    assert one.ready() == []
-    chunk = load(one)
-    assert one.ready() == [(chunk, first)]
-    with pytest.raises(ValueError, match="in the order"):
-        one.applied(chunk, second, version=1, nbytes=10, active=0, now_s=0.0)
-    apply(one, chunk)
-    assert one.ready() == [(chunk, second)]
-
-
-def test_a_scan_that_touches_nothing_is_applied() -> None:
-    one = Residency(PLENTY)
-    scan = scan_of()
-    one.add(scan)
-    assert (scan.applied, scan.durable, one.waiting_bytes) == (True, True, 0)
-
-
 # --- saving -------------------------------------------------------------------------------------
 
 
@@ -193,22 +145,6 @@ def test_a_change_is_saved_in_time_the_oldest_first() -> None:
     assert one.next_save(in_time) is chunks[0]
     assert one.next_save(in_time) is None
     assert one.next_save(in_time, everything=True) is chunks[1]
-
-
-def test_a_chunk_that_is_written_while_it_is_saved_is_dirty_again() -> None:
-    one = Residency(PLENTY)
-    one.move("a", (0.5, 0.5, 0.5))
-    chunk = written(one, HERE)
-    assert one.next_save(20.0) is chunk
-    one.add(scan_of(HERE, number=2))
-    apply(one, chunk, 20.0)
-    assert one.next_save(99.0, everything=True) is None, "one save of a chunk at a time"
-    one.saved(chunk, 1, 21.0)
-    in_time = 21.0 + PLENTY.checkpoint_s - TOGETHER_S
-    assert one.next_save(in_time - 0.1) is None
-    assert one.next_save(in_time) is chunk
-    one.saved(chunk, 2, 31.0)
-    assert one.next_save(99.0, everything=True) is None, "it is clean"
 
 
 def test_durable_is_what_was_flushed() -> None:
@@ -230,35 +166,6 @@ def test_durable_is_what_was_flushed() -> None:
     assert flush(one) == [first]
     assert first.to_save == {}
     assert flush(one) == []
-
-
-def test_what_was_given_up_before_it_was_durable_is_not_durable_when_it_comes_back() -> None:
-    """A file that has its name, and may lose it: a scan that comes again is durable after the flush."""
-    one = Residency(PLENTY)
-    chunk = written(one, HERE)
-    assert one.next_save(50.0) is chunk
-    one.saved(chunk, 1, 50.0)
-    ask_for_room(one)
-    assert one.next_eviction(50.0) is chunk
-    again = scan_of(HERE)
-    one.asked_bytes = 0
-    one.add(again)
-    back = load(one, version=1)
-    one.applied(back, again, version=1, nbytes=10, active=1, now_s=50.0)
-    assert again.applied
-    assert not again.durable
-    assert again in flush(one)
-    assert again.durable
-
-
-def test_a_disk_that_is_full_is_tried_again() -> None:
-    one = Residency(PLENTY)
-    chunk = written(one, HERE)
-    assert one.next_save(50.0) is chunk
-    one.save_failed(chunk, 50.0)
-    assert one.next_save(50.0 + RETRY_S / 2, everything=True) is None
-    assert one.next_eviction(50.0 + RETRY_S / 2) is None
-    assert one.next_save(50.0 + RETRY_S, everything=True) is chunk
 
 
 def test_a_file_that_cannot_be_read_just_now_is_tried_again() -> None:
@@ -296,17 +203,6 @@ def test_what_nobody_wants_is_given_up_first_the_furthest_of_it() -> None:
     ask_for_room(one)
     gone = [victim.key.x for _ in range(6) if (victim := one.next_eviction(2.0)) is not None]
     assert gone == [9, 4, 2, 1, 0]
-
-
-def test_a_dirty_chunk_is_saved_before_it_is_given_up() -> None:
-    one = Residency(PLENTY)
-    chunk = written(one, HERE)
-    ask_for_room(one)
-    assert one.next_eviction(5.0) is None
-    assert one.next_save(5.0) is chunk, "before its time"
-    one.saved(chunk, 1, 5.0)
-    assert one.next_eviction(5.0) is chunk
-    assert (one.chunk_bytes, one.active, len(one.chunks), len(one.index)) == (0, 0, 0, 0)
 
 
 @pytest.mark.parametrize("dirty_x", [1, 6, 9])
@@ -359,52 +255,7 @@ def test_room_that_was_made_for_one_is_not_another_s() -> None:
     assert one.chunk_bytes == 35
 
 
-def test_what_is_beside_the_chunks_is_in_the_budget() -> None:
-    one = Residency(Limits(100, reserve_bytes=20, radius=0, loads=100), new_bytes=10)
-    for number in range(8):
-        one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=1, now_s=0.0)
-    assert not one.fits(25)
-    one.asked_bytes = 25
-    assert one.next_eviction(5.0) is not None
-    assert one.next_eviction(5.0) is None, "no more than is needed"
-    one.beside_bytes, one.asked_bytes = 25, 0
-    one.add(scan_of(HERE, number=1))
-    chunk = one.chunks[HERE]
-    assert not one.may_grow(chunk, 10)
-    assert one.next_eviction(5.0) is not None
-    assert one.may_grow(chunk, 10)
-
-
-def test_what_is_beside_the_chunks_keeps_no_map_from_being_written() -> None:
-    one = Residency(Limits(80, reserve_bytes=20, radius=0, loads=100), new_bytes=10)
-    one.beside_bytes = 75
-    for number in range(1, 5):
-        one.add(scan_of(ChunkKey(number, 0, 0), number=number))
-        for now_s in (10.0 * number, 10.0 * number + 1):
-            if (chunk := one.next_save(now_s)) is not None:
-                one.saved(chunk, chunk.version, now_s)
-            one.next_eviction(now_s)
-        apply(one, load(one, 10.0 * number + 1), 10.0 * number)
-        assert one.chunk_bytes <= 20
-
-
-def test_there_are_no_more_chunks_than_may_be_mapped() -> None:
-    one = Residency(Limits(10**9, most_chunks=2, radius=0, loads=100), new_bytes=10)
-    for number in range(4):
-        one.add(scan_of(ChunkKey(number, 0, 0), number=number + 1))
-    for _ in range(2):
-        apply(one, load(one))
-    assert one.next_load(0.0) is None
-    for number in range(2):
-        dirty = one.next_save(5.0)
-        assert dirty is not None
-        one.saved(dirty, 1, 5.0)
-        assert one.next_eviction(5.0) is dirty
-        apply(one, load(one, 5.0), 5.0)
-        assert len([chunk for chunk in one.chunks.values() if chunk.nbytes]) == 2, number
-
-
-def test_where_all_chunks_wait_for_room_some_give_way() -> None:
+def test_where_all_chunks_wait_for_room_some_are_given_up() -> None:
     """What they have to take in still waits for them."""
     one = Residency(Limits(40, radius=0, loads=100), new_bytes=10)
     keys = [HERE, ChunkKey(1, 0, 0), ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)]
@@ -423,32 +274,6 @@ def test_where_all_chunks_wait_for_room_some_give_way() -> None:
 
 
 # --- sleeping -----------------------------------------------------------------------------------
-
-
-def test_nothing_is_due_while_a_chunk_is_loaded_or_has_no_room() -> None:
-    one = Residency(Limits(20, radius=0), new_bytes=10)
-    one.add(scan_of(HERE))
-    assert one.next_load(5.0) is not None
-    assert one.next_event_s(5.0) == math.inf
-    full = Residency(Limits(20, radius=0), new_bytes=10)
-    full.beside_bytes = 20
-    full.add(scan_of(HERE))
-    assert full.next_load(5.0) is None
-    assert full.next_event_s(5.0) == 5.0 + REVIEW_S
-
-
-def test_nothing_is_due_while_as_many_files_are_written_as_may_be() -> None:
-    one = Residency(Limits(10**9, radius=0, loads=9, saves=1))
-    chunks = []
-    for x in range(2):
-        one.move(x, (x + 0.5, 0.5, 0.5))
-        chunks.append(written(one, ChunkKey(x, 0, 0)))
-    assert one.next_event_s(20.0) == 20.0
-    assert one.next_save(20.0) is chunks[0]
-    assert one.next_event_s(20.0) == math.inf
-    one.saved(chunks[0], 1, 21.0)
-    assert one.next_event_s(21.0) == 21.0
-    assert one.next_save(21.0) is chunks[1]
 
 
 def test_where_one_file_cannot_be_written_no_other_is_tried_at_once() -> None:
@@ -480,24 +305,6 @@ def test_what_has_no_memory_keeps_nobody_from_what_has() -> None:
     assert one.next_eviction(9.0) is not None
     seen.append(one.is_ready)
     assert seen == [True, False, True], "there is room now"
-
-
-def test_what_was_given_up_is_missing_until_it_is_flushed() -> None:
-    one = Residency(PLENTY)
-    chunk = written(one, HERE)
-    durability = one.durability
-    assert durability.missing(one.chunks.values()) == [(chunk, 1)]
-    assert one.next_save(50.0) is chunk
-    one.saved(chunk, 1, 50.0)
-    ask_for_room(one)
-    assert one.next_eviction(50.0) is not None
-    assert not one.chunks
-    assert durability.missing(one.chunks.values()) == [(chunk, 1)]
-    durability.begin()
-    assert durability.missing(one.chunks.values()) == [(chunk, 1)]
-    durability.flushed()
-    assert durability.missing(one.chunks.values()) == []
-    assert chunk.durable == 1
 
 
 def test_a_chunk_near_a_client_that_a_scan_needed_the_room_of_comes_back_later() -> None:
@@ -600,3 +407,20 @@ def test_a_client_that_moves_costs_no_look_at_all_chunks(
         one.next_save(1.0)
         one.next_eviction(1.0)
     assert len(counted) == 9 * clients, "a side of each window"
+
+
+@pytest.mark.parametrize(
+    ("here", "passed_s", "found"),
+    [
+        ((1.0, 0.5, -0.25), 0.5, (5.0, 2.5, -1.25)),
+        ((0.0, 0.0, 0.0), 0.1, (0.0, 0.0, 0.0)),
+        # a drive that is played back as fast as it can be: no further, and in the same direction
+        ((2.0, -1.0, 0.5), 0.001, (12.0, -6.0, 3.0)),
+        ((0.0, -100.0, 0.0), 0.1, (0.0, -110.0, 0.0)),
+        ((1e-300, 0.0, 0.0), 1e-9, (pytest.approx(0.0), 0.0, 0.0)),
+    ],
+)
+def test_a_client_goes_on_as_it_does(
+    here: tuple[float, float, float], passed_s: float, found: tuple[float, float, float]
+) -> None:
+    assert place_ahead((0.0, 0.0, 0.0), here, passed_s, ahead_s=2.0, longest=10.0) == found

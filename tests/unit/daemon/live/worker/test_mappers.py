@@ -9,9 +9,9 @@ import os
 import pytest
 
 from shmmap.chunks.layout import MAPPERS
-from shmmap.daemon.live.map_files import SCANS_AHEAD, MapFiles, MapSettings
-from shmmap.daemon.live.worker.applied_scans import APPLIED_BYTES, AppliedScans
-from shmmap.daemon.live.worker.mappers import Mappers
+from shmmap.daemon.live.disk.map_files import SCANS_AHEAD, MapFiles
+from shmmap.daemon.live.disk.map_record import MapSettings
+from shmmap.daemon.live.worker.mappers import APPLIED_BYTES, AppliedScans, Mappers
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 from tests.support.disks import CutDisk
 
@@ -48,9 +48,9 @@ def test_only_who_opened_it_last_maps_under_a_name(mappers: Mappers) -> None:
     mappers.open(1000, "front", 2)
     with pytest.raises(BadRequest, match="another program maps as 'front'"):
         mappers.expect(number, 2, 1)
-    mappers.left(1)
+    mappers.on_disconnect(1)
     assert mappers.expect(number, 2, 2).session == 2, "the first one's end is not the second one's"
-    mappers.left(2)
+    mappers.on_disconnect(2)
     with pytest.raises(LiveInterrupted, match="nobody maps as 'front'"):
         mappers.expect(number, 2, 2)
 
@@ -62,12 +62,12 @@ def test_numbers_that_no_scan_has(mappers: Mappers, scan: int) -> None:
         mappers.expect(number, scan, 1)
 
 
-def test_the_least_recent_gives_way_and_its_late_scans_are_refused(mappers: Mappers) -> None:
+def test_the_least_recent_is_replaced_and_its_late_scans_are_refused(mappers: Mappers) -> None:
     opened = [mappers.open(1000, f"m{number}", number + 1) for number in range(MAPPERS)]
     for session in (3, 1, 2):
-        mappers.left(session)
+        mappers.on_disconnect(session)
     mappers.open(1000, "m2", 40)  # used again
-    mappers.left(40)
+    mappers.on_disconnect(40)
     new = mappers.open(1000, "new", 50)
     numbers = {one.mapper.number for one in opened}
     assert new.mapper.number not in numbers, "no number is given twice"
@@ -94,23 +94,15 @@ def test_where_all_are_in_use_another_is_refused(mappers: Mappers) -> None:
     assert opened[5].mapper.number not in mappers.by_number
 
 
-def test_what_is_durable(mappers: Mappers) -> None:
-    active = mappers.open(1000, "front", 1)
-    active.last = 7
-    assert active.durable == 7
-    active.unsaved |= {5, 6}
-    assert active.durable == 4
-
-
-def test_a_later_life_knows_what_is_in_the_map(disk: CutDisk, memory: bytearray, mappers: Mappers) -> None:
+def test_the_next_run_knows_what_is_in_the_map(disk: CutDisk, memory: bytearray, mappers: Mappers) -> None:
     """Up to the last scan before which none is missing, in whatever order they were applied."""
     front, rear = mappers.open(1000, "front", 1), mappers.open(1000, "rear", 2)
     for scan in (1, 2, 3, 4):
-        mappers.taken(front, scan)
+        mappers.accepted(front, scan)
     for scan, then in ((2, 0), (1, 2), (4, 2)):
         mappers.applied(front, scan)
         assert front.applied == then
-    mappers.taken(rear, 9)
+    mappers.accepted(rear, 9)
     mappers.applied(rear, 9)
     later = Mappers(MapFiles(disk, SETTINGS), AppliedScans(memory))
     assert (later.open(1000, "front", 1).applied, later.open(1000, "rear", 2).applied) == (2, 9)
@@ -134,7 +126,7 @@ def _noted(mapper: int, scan: int) -> bytearray:
     return memory
 
 
-def test_rows_of_mappers_that_gave_way_are_used_again() -> None:
+def test_rows_of_forgotten_mappers_are_used_again() -> None:
     record = AppliedScans(bytearray(APPLIED_BYTES))
     known = set(range(1, MAPPERS + 1))
     for mapper in known:
@@ -145,8 +137,8 @@ def test_rows_of_mappers_that_gave_way_are_used_again() -> None:
     assert (record.of(100), record.of(5), record.of(6)) == (7, 0, 60)
 
 
-def test_a_later_life_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Mappers) -> None:
-    """Also when one of an earlier life comes again first: of those after it nothing is known."""
+def test_the_next_run_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Mappers) -> None:
+    """Also when one of a previous run comes again first: of those after it nothing is known."""
     front = mappers.open(1000, "front", 1)
     for scan in range(1, 8):
         mappers.expect(front.mapper.number, scan, 1).last = scan

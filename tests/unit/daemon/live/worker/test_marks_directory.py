@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shmmap.daemon.live.worker.marks_directory import MOST_MARKS_BYTES, MarksDirectory
+from shmmap.daemon.live.worker.marks_directory import MAX_MARKS_BYTES, MarksDirectory
 from shmmap.errors import BadRequest
 from tests.support.accounts import MEMBER
 
@@ -55,7 +55,7 @@ def test_names_that_are_not_the_session_s(marks: MarksDirectory, path: Path, nam
         take(marks, name)
 
 
-@pytest.mark.parametrize("nbytes", [0, -1, MOST_MARKS_BYTES + 1, 1 << 60])
+@pytest.mark.parametrize("nbytes", [0, -1, MAX_MARKS_BYTES + 1, 1 << 60])
 def test_sizes_that_cannot_be(marks: MarksDirectory, path: Path, nbytes: int) -> None:
     (path / MINE).write_bytes(CONTENT)
     with pytest.raises(BadRequest, match="bytes"):
@@ -104,33 +104,23 @@ def test_what_is_no_file_of_marks(
         take(marks)
 
 
-def test_one_that_is_cut_while_it_is_read(
-    monkeypatch: pytest.MonkeyPatch, marks: MarksDirectory, path: Path
+@pytest.mark.parametrize("length", [4, 1 << 30])
+def test_one_that_is_changed_while_it_is_read(
+    monkeypatch: pytest.MonkeyPatch, marks: MarksDirectory, path: Path, length: int
 ) -> None:
     (path / MINE).write_bytes(CONTENT)
     read = os.pread
 
-    def cut_and_read(fd: int, size: int, at: int) -> bytes:
-        os.truncate(path / MINE, 4)
+    def change_and_read(fd: int, size: int, at: int) -> bytes:
+        os.truncate(path / MINE, length)
         return read(fd, size, at)
 
-    monkeypatch.setattr(os, "pread", cut_and_read)
-    with pytest.raises(BadRequest, match="was cut to 4 bytes"):
-        take(marks)
-
-
-def test_one_that_grows_while_it_is_read(
-    monkeypatch: pytest.MonkeyPatch, marks: MarksDirectory, path: Path
-) -> None:
-    (path / MINE).write_bytes(CONTENT)
-    read = os.pread
-
-    def grow_and_read(fd: int, size: int, at: int) -> bytes:
-        os.truncate(path / MINE, 1 << 30)
-        return read(fd, size, at)
-
-    monkeypatch.setattr(os, "pread", grow_and_read)
-    assert take(marks) == CONTENT
+    monkeypatch.setattr(os, "pread", change_and_read)
+    if length > len(CONTENT):
+        assert take(marks) == CONTENT
+    else:
+        with pytest.raises(BadRequest, match="was cut to 4 bytes"):
+            take(marks)
 
 
 @pytest.mark.root
@@ -152,7 +142,7 @@ def test_who_may_put_files_there(path: Path) -> None:
     assert not path.exists()
 
 
-def test_what_an_earlier_life_left_is_removed(path: Path) -> None:
+def test_what_an_previous_run_left_is_removed(path: Path) -> None:
     (path / "1a.9").mkdir(parents=True)
     (path / "2.2").write_bytes(CONTENT)
     one = MarksDirectory(str(path))
@@ -168,14 +158,14 @@ def test_the_files_of_a_session_go_with_it(marks: MarksDirectory, path: Path) ->
     (path / "1a.5").symlink_to("/etc/passwd")
     (path / "1a.6").mkdir()
     (path / "1a.6" / "x").touch()
-    marks.forget(SESSION)
+    marks.on_disconnect(SESSION)
     left = sorted(name.name for name in path.iterdir())
     assert left == ["1.1", "11a.1", "1a.6", "1a1.1"], "what somebody fills is theirs to empty"
     (path / "1a.6" / "x").unlink()
 
 
 @pytest.mark.root
-def test_a_directory_of_somebody_else_is_not_used(path: Path) -> None:
+def test_another_user_s_directory_is_not_used(path: Path) -> None:
     path.mkdir()
     os.chown(path, MEMBER, -1)
     before = len(os.listdir("/proc/self/fd"))

@@ -12,8 +12,8 @@ import pytest
 
 from shmmap.chunks.layout import HEADER_BYTES, new_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.map_files import Row
-from shmmap.daemon.live.paging.records import Scan
+from shmmap.daemon.live.disk.map_record import Row
+from shmmap.daemon.live.paging.durability import Scan
 from shmmap.daemon.live.worker import areas, readers
 from shmmap.errors import BadRequest
 from shmmap.protocol import live as messages
@@ -32,14 +32,14 @@ def served(serve: Callable[..., Served]) -> Served:
 def bring(served: Served, key: ChunkKey, generation: int = 1) -> None:
     """Put a new chunk into memory."""
     content = new_header(served.live.identity(key, generation))
-    served.live.take_over(served.live.memory.create(content), 0.0)
+    served.live.add_chunk(served.live.memory.create(content), 0.0)
 
 
 def page(served: Served, **asked: object) -> LiveChunkPage:
     """Ask for a page, and have readers go on until it is there."""
     ticket = served.ask(lambda n: LiveChunks(n, "lidar", **asked))  # type: ignore[arg-type]
     while ticket not in served.answers:
-        served.map.readers.turn(served.now_s)
+        served.map.readers.run_turn(served.now_s)
     found: LiveChunkPage = served.answers[ticket]
     return found
 
@@ -83,10 +83,10 @@ def test_what_changed_and_what_left(served: Served) -> None:
     assert keys_of(everything) == [a, b, c]
     assert everything.since_known
     assert keys_of(page(served, since=everything.change)) == []
-    served.map.changes.changed(b)
+    served.map.changes.note_changed(b)
     chunk = served.live.chunks.pop(c)
     served.live.residency._forget(c)
-    served.map.changes.gone(c)
+    served.map.changes.note_gone(c)
     later = page(served, since=everything.change)
     assert (keys_of(later), later.gone, later.since_known) == ([b], (c,), True)
     assert page(served, since=everything.change, after=tuple(a)).gone == (), "they were on the first page"
@@ -99,10 +99,10 @@ def test_what_changed_and_what_left(served: Served) -> None:
 
 def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> None:
     """So many rows, so many that left, and all numbers as long as they get."""
-    served.map.changes.changed(ChunkKey(0, 0, 0))
+    served.map.changes.note_changed(ChunkKey(0, 0, 0))
     since = served.map.changes.number
     for x in range(20_000):
-        served.map.changes.gone(ChunkKey(-(1 << 24) + x, -(1 << 24), -(1 << 24)))
+        served.map.changes.note_gone(ChunkKey(-(1 << 24) + x, -(1 << 24), -(1 << 24)))
     row = Row(1 << 62, 1 << 40, 1 << 18, 1 << 18, 1 << 18, 1)
     for x in range(MAX_CHUNK_ROWS):
         on_disk(served, ChunkKey(-(1 << 24) + x, 0, -(1 << 24)), row)
@@ -154,7 +154,7 @@ def test_chunks_are_listed_while_others_are_saved(served: Served, monkeypatch: p
     assert keys_of(page(served, saved=True)) == [ChunkKey(x, 0, 0) for x in range(3)]
 
 
-def test_a_file_that_was_put_aside_is_listed_no_more(served: Served) -> None:
+def test_a_file_that_was_quarantined_is_listed_no_more(served: Served) -> None:
     keys = [ChunkKey(x, 0, 0) for x in range(3)]
     for key in keys:
         on_disk(served, key, Row(1, 100, 0, 0, 0, 1))
@@ -170,9 +170,9 @@ def test_lists_of_several_readers_are_made_by_turns(served: Served) -> None:
     short = served.ask(lambda n: messages.LiveVoxels(n, "lidar", area=corner), session=2)
     gone = served.ask(lambda n: messages.LiveVoxels(n, "lidar"), session=3)
     assert served.map.next_turn_s(served.now_s) == served.now_s
-    served.map.left(3)
+    served.map.on_disconnect(3)
     while served.map.readers.are_waiting:
-        served.map.readers.turn(served.now_s)
+        served.map.readers.run_turn(served.now_s)
     assert list(served.answers) == [short, long]
     assert gone not in served.answers
     assert not isinstance(served.answers[long], ErrorReply)
@@ -190,7 +190,7 @@ def test_a_session_that_asks_for_much_waits_for_one_that_asks_for_little(
     few = served.ask(lambda n: LiveChunks(n, "lidar"), session=2)
     turns = 0
     while few not in served.answers:
-        served.map.readers.turn(served.now_s)
+        served.map.readers.run_turn(served.now_s)
         turns += 1
     assert turns <= 4
     assert list(served.answers) == [few]
@@ -218,9 +218,9 @@ def test_a_step_looks_at_few_chunks_however_many_there_are(
     most = 0
     while ticket not in served.answers:
         before = looked
-        served.map.readers.turn(served.now_s)
+        served.map.readers.run_turn(served.now_s)
         most = max(most, looked - before)
-    assert most <= 2 * readers.KEYS_A_STEP
+    assert most <= 2 * readers.KEYS_PER_STEP
     if area is not None:
         assert looked < 60, "an area is found by the index"
 
@@ -240,7 +240,7 @@ def test_the_next_page_begins_where_the_last_one_ended(
     monkeypatch.setattr(readers, "touches", touched)
     page(served, saved=True, after=(1990, 0, 0))
     assert looked[0] == (1991, 0, 0)
-    assert len(looked) <= MAX_CHUNK_ROWS + readers.KEYS_A_STEP + 9
+    assert len(looked) <= MAX_CHUNK_ROWS + readers.KEYS_PER_STEP + 9
 
 
 def test_what_changed_is_found_without_a_look_at_what_did_not(
@@ -252,7 +252,7 @@ def test_what_changed_is_found_without_a_look_at_what_did_not(
         bring(served, key)
     since = served.map.changes.number
     for key in (keys[7], keys[3], keys[7]):
-        served.map.changes.changed(key)
+        served.map.changes.note_changed(key)
     monkeypatch.setattr(readers, "merged_part", lambda *_: pytest.fail("all are looked at"))
     assert keys_of(page(served, since=since)) == [keys[3], keys[7]]
     assert keys_of(page(served, since=since, after=tuple(keys[3]))) == [keys[7]]
@@ -274,7 +274,7 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
         left = served.ask(lambda n: messages.LiveVoxels(n, "lidar", scope="disk"), session=3)
         for session in (1, 2):
             assert served.answer(served.ask(lambda n: messages.LiveVoxels(n, "lidar"), session)).count == 0
-        served.map.left(3)
+        served.map.on_disconnect(3)
         assert not served.answers.keys() & {*waits, left}
         assert served.map.readers.next_turn_s(served.now_s) > served.now_s, "nobody turns in vain"
     finally:
@@ -325,3 +325,22 @@ def test_the_busiest_readers_are_named(served: Served, monkeypatch: pytest.Monke
     assert served.map.status().readers == served.map.readers.busiest
     served.map.readers.measure(end_s + readers.MEASURED_S)
     assert served.map.readers.busiest == ()
+
+
+def test_what_is_known() -> None:
+    one = readers.Changes(100)
+    one.note_changed(ChunkKey(0, 0, 0))
+    assert one.known(100)
+    assert one.known(101)
+    assert not one.known(99), "that was a previous run"
+    assert not one.known(102), "that was another worker's, after which the clock was set back"
+
+
+def test_not_all_that_left_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readers, "MAX_GONE", 3)
+    one = readers.Changes(0)
+    for x in range(5):
+        one.note_gone(ChunkKey(x, 0, 0))
+    assert [since for since in range(6) if one.known(since)] == [2, 3, 4, 5]
+    assert one.gone(2) == [ChunkKey(x, 0, 0) for x in (2, 3, 4)]
+    assert len(one.gone(0)) == 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import socket
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -13,10 +14,14 @@ import numpy as np
 import pytest
 
 from shmmap.chunks.marks import Marks
-from shmmap.daemon.live.messages import MOST_OF_A_SESSION
+from shmmap.daemon.live import messages as worker_messages
+from shmmap.daemon.live.messages import MAX_PER_SESSION
 from shmmap.daemon.live.worker import served_map
+from shmmap.daemon.live.worker.main import MESSAGES_PER_TURN, _Worker
 from shmmap.errors import BadRequest, CannotWrite, NotPermitted
+from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol import live as messages
+from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.messages import ErrorReply
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.daemon_process import Deadline
@@ -93,7 +98,7 @@ def test_a_scan_on_its_way_is_answered_to_who_sends_it_again(
     opened = one.open(session=1)
     first = one.send(marks, opened.mapper, 1, session=1)
     one.turn()
-    one.map.left(1)
+    one.map.on_disconnect(1)
     again = one.open(session=2)
     assert (again.mapper, again.next_scan) == (opened.mapper, 2)
     second = one.send(marks, opened.mapper, 1, session=2)
@@ -115,7 +120,7 @@ def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch
     one.turn()
     waits = one.send(second, opened.mapper, 2)
     one.turn()
-    one.map.left(1)
+    one.map.on_disconnect(1)
     blocked.may.set()
     one.until(lambda: one.map.status().scans == 1)
     one.turn()
@@ -132,11 +137,11 @@ def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.Monk
     mapper = one.open().mapper
     for session in range(1, 6):
         one.open(session=session)
-        for _ in range(MOST_OF_A_SESSION):
+        for _ in range(MAX_PER_SESSION):
             one.send(marks, mapper, 1, session=session)
             one.turn()
-        one.map.left(session)
-    assert len(one.map._tickets[mapper, 1]) == MOST_OF_A_SESSION
+        one.map.on_disconnect(session)
+    assert len(one.map._tickets[mapper, 1]) == MAX_PER_SESSION
     blocked.may.set()
     one.until(lambda: one.map.status().scans)
     assert one.voxels() == reference(marks)
@@ -188,7 +193,7 @@ def test_places_that_are_nowhere(serve: Serve, place: tuple[float, float, float]
 # --- durable ------------------------------------------------------------------------------------
 
 
-def test_what_an_earlier_life_did_not_save_is_not_durable(serve: Serve) -> None:
+def test_what_an_previous_run_did_not_save_is_not_durable(serve: Serve) -> None:
     """Nobody knows which scans a chunk that was found in memory has; its mapper may send none again."""
     one = serve(**LATER)
     (marks,) = marked(1)
@@ -332,3 +337,25 @@ def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest
     assert one.map.next_turn_s(one.now_s) >= one.now_s + 0.05
     blocked.may.set()
     one.end()
+
+
+def test_answers_wait_for_a_daemon_that_is_busy() -> None:
+    """It hears nothing for a while, and the channel is full: no answer is lost."""
+    ours, theirs = channel()
+    buffer = packet_buffer()
+    with ours, theirs:
+        theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 0)  # the least there is
+        worker = _Worker(theirs)
+        for ticket in range(MESSAGES_PER_TURN):
+            message = messages.LiveList(ticket) if ticket % 2 else messages.LiveOpen(ticket, "x" * 60)
+            ours.send(worker_messages.encode(worker_messages.Ask(ticket, 1, 0, True, encode(message))))
+        hearing = threading.Thread(target=worker._receive)
+        hearing.start()
+        hearing.join(0.2)  # until it can send no more
+        for ticket in range(MESSAGES_PER_TURN):
+            answer = worker_messages.decode_from_live(receive_packet(ours, buffer)[0])
+            assert isinstance(answer, worker_messages.Answer)
+            assert answer.ticket == ticket
+            assert isinstance(decode_reply(answer.body), ErrorReply) != bool(ticket % 2)
+        hearing.join()
+        os.close(worker._done)

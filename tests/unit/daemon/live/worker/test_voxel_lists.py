@@ -45,7 +45,7 @@ def served(serve: Callable[..., Served]) -> Served:
         view.index[0] = 1
         view.state["bricks"] = view.state["version"] = 1
         view.state["active"] = view.state["occupied"] = VOXELS
-        one.live.take_over(file, 0.0)
+        one.live.add_chunk(file, 0.0)
     return one
 
 
@@ -186,7 +186,7 @@ def test_a_list_waits_until_chunks_have_made_room(served: Served, lists: VoxelLi
         next(steps)
     assert (lists.asked_bytes, lists.nbytes) == (0, 4096)
     assert residency.beside_bytes + residency.chunk_bytes == residency.limits.budget_bytes
-    lists.left(1)
+    lists.on_disconnect(1)
     assert residency.beside_bytes + residency.chunk_bytes == residency.limits.budget_bytes - 4096
 
 
@@ -204,15 +204,15 @@ def test_a_list_is_cut_when_it_was_read_or_was_there_for_long(lists: VoxelLists,
         elif how == "expired":
             lists.expire(time.monotonic() + KEPT_S)
         else:
-            lists.left(1)
+            lists.on_disconnect(1)
         assert os.fstat(file.fileno()).st_blocks == 0
         assert file.read() == b""
     assert (lists.nbytes, lists.live.residency.beside_bytes, names(shm)) == (0, 0, [])
     assert lists.next_expiry_s == math.inf
 
 
-def test_a_session_s_oldest_lists_give_way(lists: VoxelLists, shm: Path) -> None:
-    made = [collect(lists, KEYS[:1]).segment[1:] for _ in range(voxel_lists.LISTS_OF_A_SESSION + 2)]
+def test_a_session_s_oldest_lists_are_removed(lists: VoxelLists, shm: Path) -> None:
+    made = [collect(lists, KEYS[:1]).segment[1:] for _ in range(voxel_lists.LISTS_PER_SESSION + 2)]
     other = collect(lists, KEYS[:1], session=2).segment
     assert names(shm) == sorted([*made[2:], other[1:]])
     lists.release(1, other)
@@ -220,9 +220,9 @@ def test_a_session_s_oldest_lists_give_way(lists: VoxelLists, shm: Path) -> None
     assert other[1:] in names(shm), "it is not that session's"
     lists.release(1, "/" + made[3])
     assert made[3] not in names(shm)
-    lists.left(1)
+    lists.on_disconnect(1)
     assert names(shm) == [other[1:]]
-    lists.left(2)
+    lists.on_disconnect(2)
     assert (lists.nbytes, names(shm)) == (0, [])
 
 
@@ -239,11 +239,11 @@ def test_where_there_is_no_memory_no_name_stays(
     assert (lists.nbytes, names(shm)) == (0, [])
 
 
-def test_lists_of_an_earlier_life_are_removed(lists: VoxelLists, shm: Path) -> None:
+def test_lists_of_an_previous_run_are_removed(lists: VoxelLists, shm: Path) -> None:
     name = collect(lists, KEYS[:1]).segment[1:]
     other = name.replace(".lidar.", ".radar.")
     (shm / other).touch()
-    VoxelLists(lists.live, str(shm), 0o600, -1).remove_all()
+    VoxelLists(lists.live).remove_all()
     assert names(shm) == [other]
     (shm / other).unlink()
 

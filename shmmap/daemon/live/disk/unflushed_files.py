@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of chunks between being written and being on the disk: many are flushed together.
 
-A file is written under another name than its own.  `UnflushedFiles.flush` has it on the disk, gives it its
-name, and has the name on the disk, too.  Until then its bytes are kept: what the kernel could not write it
-throws away, and then the file is written anew.
+A file is written under an interim name.  `UnflushedFiles.flush` flushes its content, gives it its own name,
+and flushes the name, too.  Until then its bytes are kept: the kernel discards what it could not write, and
+then the file is written again.
 
-What was replaced is not deleted but kept for what is written next, since file systems take long to make a
-file: ext4 looks at every one that was deleted in the last seconds.  It is written over only when its own
-name, too, is on the disk as another file's, so that nothing needs it whatever happens.
+A file that was replaced is not deleted but kept as a spare for the next one to write, since file systems take
+long to create a file: ext4 looks at every one that was deleted in the last seconds.  It is written over only
+when its former name is on the disk as another file's, so that it is not needed whatever happens.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.folder import Files, write_beside
 from shmmap.daemon.live.disk.map_record import CHUNK
-from shmmap.daemon.live.folder import Files, write_beside
 from shmmap.failpoints import step
 
 __all__ = ["UnflushedFiles"]
 
 _ENTRY_BYTES: Final = 1 << 10
-"""What a file counts beside its bytes."""
+"""Memory of an unflushed file beside its content."""
 
 
 @dataclass(eq=False, slots=True)
@@ -41,17 +41,12 @@ class _Written:
 
 
 class UnflushedFiles:
-    """Those of one map; from any thread, but each chunk from one at a time.
-
-    Parameters
-    ----------
-    files
-        Of the map's directory.
+    """Unflushed files of one map; used from any thread, but for each chunk from one at a time.
 
     Attributes
     ----------
     nbytes : int
-        What they take in this process.
+        Memory that they take in this process.
     """
 
     def __init__(self, files: Files) -> None:
@@ -62,26 +57,26 @@ class UnflushedFiles:
         self._changing, self._flushing = threading.Lock(), threading.Lock()
 
     def get(self, key: ChunkKey) -> bytes | None:
-        """The newest file of a chunk; None where that has its name."""
+        """Return the newest file of a chunk; None where that has its own name."""
         written = self._written.get(key)
         return written.data if written is not None else None
 
     def write(self, key: ChunkKey, data: bytes) -> None:
-        """Write the file of a chunk; raises OSError, and then all is as it was."""
+        """Write the file of a chunk; if this raises OSError, all is as it was."""
         written = _Written(self._write(data), data)
         step("live.written")
         with self._changing:
             before = self._written.get(key)
             self._written[key] = written
             self.nbytes += written.nbytes - (before.nbytes if before is not None else 0)
-            needless = before if before is not None and not before.is_flushed else None
-            if needless is not None and not needless.failed:
-                self._spare.append(needless.interim)
-        if needless is not None and needless.failed:
-            self._remove(needless.interim)  # or an older file, which may have its own name on the disk
+            obsolete = before if before is not None and not before.is_flushed else None
+            if obsolete is not None and not obsolete.failed:
+                self._spare.append(obsolete.interim)
+        if obsolete is not None and obsolete.failed:
+            self._remove(obsolete.interim)  # or an older file, which may have its own name on the disk
 
     def _write(self, data: bytes) -> str:
-        """Write a file over a spare one, or a new one; returns its name."""
+        """Write a file over a spare one, or a new one; return its name."""
         with self._changing:
             spare = self._spare.pop() if self._spare else ""
         try:
@@ -99,25 +94,25 @@ class UnflushedFiles:
         return write_beside(self._files, CHUNK.removeprefix("."), data)
 
     def _remove(self, name: str) -> None:
-        with contextlib.suppress(OSError):  # it goes with the next start
+        with contextlib.suppress(OSError):  # the next start removes it
             self._files.remove(name)
 
     def remove_spare(self, kept: int = 0) -> None:
-        """Remove what is kept to be written over, but so many."""
+        """Remove spare files, except for this many."""
         with self._changing:
-            self._spare, needless = self._spare[:kept], self._spare[kept:]
-        for name in needless:
+            self._spare, surplus = self._spare[:kept], self._spare[kept:]
+        for name in surplus:
             self._remove(name)
 
     def flush(self) -> dict[ChunkKey, bytes]:
-        """Make durable what was written, and return it; what comes meanwhile is for the next time.
+        """Make durable what was written, and return it; what is written meanwhile is for the next flush.
 
         Raises
         ------
         OSError
-            Some of it is not on the disk; all of it is written anew the next time.
+            Some of it is not on the disk; all of it is written again by the next flush.
         """
-        with self._flushing:  # who comes second waits until it is so
+        with self._flushing:  # a second caller waits until it is durable
             with self._changing:
                 taken = dict(self._written)
                 for one in taken.values():
@@ -136,7 +131,7 @@ class UnflushedFiles:
                 self._files.sync_names()
                 step("live.flushed")
             except OSError:
-                self._keep_for_later(taken)
+                self._note_failure(taken)
                 raise
             with self._changing:
                 for key, one in taken.items():
@@ -154,7 +149,7 @@ class UnflushedFiles:
         self._files.sync(one.interim)
 
     def _give_name(self, interim: str, name: str) -> bool:
-        """Give a file its name; whether the one that had it has the other now."""
+        """Give a file its name; return whether the file that had it has the interim one now."""
         try:
             self._files.exchange(interim, name)
         except OSError:  # there is none, or the file system cannot
@@ -162,8 +157,8 @@ class UnflushedFiles:
             return False
         return True
 
-    def _keep_for_later(self, taken: dict[ChunkKey, _Written]) -> None:
-        """A flush came to nothing: all of it is written again, but what is newer by now."""
+    def _note_failure(self, taken: dict[ChunkKey, _Written]) -> None:
+        """Note that a flush failed: all of it is written again, except what is replaced by now."""
         with self._changing:
             for key, one in taken.items():
                 one.is_flushed, one.failed = False, True

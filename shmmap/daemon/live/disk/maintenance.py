@@ -1,34 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether all files of a live map are as they were written, and what can be done where they are not."""
+"""Check the files of a live map, repair what can be repaired, and reset the whole map."""
 
 from __future__ import annotations
 
+import os
+from itertools import count
 from typing import Literal
 
 import msgspec
 
-from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, read_file_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.map_record import CHUNK, MANIFEST, Row, read_manifest, write_rows
+from shmmap.daemon.live.disk.folder import Files, FilesToRead, Folder, FolderToRead, quarantine
+from shmmap.daemon.live.disk.map_record import (
+    CHUNK,
+    MANIFEST,
+    MAP_FILE,
+    FileNames,
+    Row,
+    read_header,
+    read_manifest,
+    write_rows,
+)
 from shmmap.daemon.live.disk.stored_map import StoredMap
-from shmmap.daemon.live.folder import INTERIM, Files, FilesToRead, keep_aside
 from shmmap.errors import MapDataError
+from shmmap.formats.durable_file import flush_directory
 
-__all__ = ["CheckedMap", "DamagedFile", "MissingChunk", "check", "repair"]
+__all__ = [
+    "CheckedMap",
+    "DamagedFile",
+    "MissingChunk",
+    "ResetMap",
+    "check",
+    "files_of_map",
+    "repair",
+    "reset",
+]
 
 
 class DamagedFile(msgspec.Struct):
-    """A chunk's file that is not as it was written.
-
-    Attributes
-    ----------
-    file
-        Its name.
-    reason
-        What is wrong.
-    kept_as
-        The name under which it was put aside; empty if it was not.
-    """
+    """A file that is not as it was written; ``kept_as`` is its name in quarantine, empty if it has none."""
 
     file: str
     reason: str
@@ -36,17 +46,7 @@ class DamagedFile(msgspec.Struct):
 
 
 class MissingChunk(msgspec.Struct, frozen=True):
-    """A chunk that was on the disk and is not there any more, or only as it was before.
-
-    Attributes
-    ----------
-    chunk
-        Its key.
-    version
-        Which state of it was on the disk.
-    found
-        Which one is there now, 0 for none.
-    """
+    """A chunk whose saved ``version`` is gone; the version ``found`` is on the disk now, 0 for none."""
 
     chunk: str
     version: int
@@ -54,32 +54,29 @@ class MissingChunk(msgspec.Struct, frozen=True):
 
 
 class CheckedMap(msgspec.Struct):
-    """What was found.
+    """Result of a check.
 
     Attributes
     ----------
-    path, map_id, resolution, frame_id
-        Which map; metres.
+    resolution
+        Edge of a voxel, metres.
     rows
-        The chunks that are good.
-    damaged
-        Those that are not.
+        The good chunks.
     unreadable
         Files that the system does not let this process read, or that are no regular ones, and why: they may
         be good.  `repair` quarantines them, too.
     missing
         What the manifest lists beyond the files.
     manifest
-        ``stale`` is one that does not have the chunks as the files have them: that of a daemon that was
-        killed is.
+        ``stale`` if it does not list the chunks as the files have them: as after a daemon was killed.
     interim
-        Files that were not given their names: the daemon's next start takes the good ones over.
+        Files that did not get their own names: the daemon takes over the good ones at its next start.
     aside
-        Files that were put aside before.
+        Files that were quarantined before.
     strange
-        Files called as those of chunks are, which no chunk can have.
+        Files named like those of chunks, but of chunks that cannot be.
     rewritten
-        The manifest was written anew.
+        Whether a new manifest was written.
     """
 
     path: str
@@ -98,11 +95,11 @@ class CheckedMap(msgspec.Struct):
 
     @property
     def good(self) -> bool:
-        """Whether everything that was saved is there."""
+        """Whether everything that was saved is on the disk."""
         return not (self.damaged or self.unreadable or self.missing or self.manifest == "unreadable")
 
     def total(self, what: Literal["bytes", "active", "occupied", "free", "bricks"]) -> int:
-        """Sum over the good chunks."""
+        """Return the sum over the good chunks."""
         return sum(getattr(row, what) for row in self.rows.values())
 
 
@@ -133,13 +130,12 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
             damaged.append(DamagedFile(name, reason))
     known = {one.file for one in damaged} | unreadable.keys()
     interim = []
-    for name in stored.names:
-        if name.startswith(".") and name.endswith(INTERIM):
-            try:
-                if not _is_older(files, name, rows):
-                    interim.append(name)
-            except OSError as error:
-                unreadable[name] = f"it cannot be read: {error.strerror}"
+    for name in stored.names.interim:
+        try:
+            if not _is_spare(files, name, rows):
+                interim.append(name)
+        except OSError as error:  # noqa: PERF203  the next one may be readable
+            unreadable[name] = f"it cannot be read: {error.strerror}"
     return CheckedMap(
         path=path,
         map_id=stored.map_id.hex(),
@@ -151,15 +147,15 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
         missing=_missing(listed, rows, known) if isinstance(listed, dict) else [],
         manifest=("current" if listed == rows else "stale") if isinstance(listed, dict) else listed,
         interim=interim,
-        aside=stored.aside,
-        strange=stored.strange,
+        aside=stored.names.quarantined,
+        strange=stored.names.strange,
     )
 
 
-def _is_older(files: FilesToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
-    """Whether a file is only there to be written over: its chunk's own is as new.  Raises OSError."""
+def _is_spare(files: FilesToRead, name: str, rows: dict[ChunkKey, Row]) -> bool:
+    """Whether a file is only kept to be written over: its chunk's own file is as new.  Raise OSError."""
     try:
-        header = read_file_header(files.read(name, FILE_HEADER_BYTES))
+        header = read_header(files, name)
     except (FileNotFoundError, MapDataError):
         return False
     return header.key in rows and rows[header.key].version >= header.version
@@ -174,7 +170,7 @@ def _row_or_error(stored: StoredMap, key: ChunkKey) -> Row | MapDataError:
 
 
 def _listed(files: FilesToRead) -> dict[ChunkKey, Row] | Literal["absent", "unreadable"]:
-    """The chunks that the manifest lists."""
+    """Return the chunks that the manifest lists."""
     try:
         return read_manifest(files)[0]
     except FileNotFoundError:
@@ -195,9 +191,8 @@ def _missing(listed: dict[ChunkKey, Row], rows: dict[ChunkKey, Row], known: set[
 def repair(files: Files, found: CheckedMap) -> None:
     """Quarantine files that are damaged or cannot be read, and list the good ones in a new manifest.
 
-    What was done is noted in ``found``: all that was quarantined is ``damaged`` then, with its new name.
-
-    Nobody else may work with the files since they were checked.  Nothing is deleted.
+    ``found`` is brought up to date: everything quarantined is ``damaged`` then, with its new name.  No other
+    process may have worked with the files since they were checked.  Nothing is deleted.
 
     Raises
     ------
@@ -209,7 +204,60 @@ def repair(files: Files, found: CheckedMap) -> None:
     if found.manifest == "unreadable":
         found.damaged.append(DamagedFile(MANIFEST, "it cannot be read, or does not list chunks"))
     for one in found.damaged:
-        one.kept_as = keep_aside(files, one.file)
+        one.kept_as = quarantine(files, one.file)
     if found.manifest != "current":
-        write_rows(files, found.rows, {})  # who plays scans again brings back what was damaged
+        write_rows(files, found.rows, {})  # a program that plays scans again brings back what was damaged
         found.rewritten = True
+
+
+class ResetMap(msgspec.Struct, frozen=True):
+    """Result of a reset: how many files of how many bytes, and where they are; empty if deleted."""
+
+    path: str
+    moved_to: str
+    files: int
+    bytes: int
+
+
+def files_of_map(files: FolderToRead) -> dict[str, int]:
+    """Return the map's own files and their bytes, in the order in which they may be removed."""
+    return {name: files.size(name) for name in FileNames.of(files.names()).of_map}
+
+
+def reset(folder: Folder, *, delete: bool) -> ResetMap:
+    """Move the files of a live map into a directory within its own, or delete them.
+
+    Parameters
+    ----------
+    folder
+        The directory, which no other process works with.
+    delete
+        Delete them instead of moving them.
+
+    Raises
+    ------
+    OSError
+        A file cannot be moved or deleted.
+    """
+    sizes = files_of_map(folder)
+    aside = ""
+    if not delete:
+        taken = set(folder.names())
+        name = next(one for number in count(1) if (one := f"reset.{number}") not in taken)
+        aside = os.path.join(folder.path, name)
+        os.mkdir(aside, mode=0o700)
+    for name in sizes:
+        if delete:
+            folder.remove(name)
+        else:
+            folder.rename(name, os.path.join(os.path.basename(aside), name))
+        if name in {MANIFEST, MAP_FILE}:
+            _sync(folder, aside)
+    _sync(folder, aside)
+    return ResetMap(folder.path, aside, len(sizes), sum(sizes.values()))
+
+
+def _sync(folder: Folder, aside: str) -> None:
+    if aside:
+        flush_directory(aside)
+    folder.sync_names()

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import random
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +13,11 @@ import pytest
 from shmmap.chunks.chunk_file import encode_chunk
 from shmmap.chunks.layout import ChunkView, new_header
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.daemon.live.disk.checking import CheckedMap, check, repair
+from shmmap.daemon.live.disk.folder import Folder, FolderToRead
+from shmmap.daemon.live.disk.maintenance import CheckedMap, check, repair, reset
+from shmmap.daemon.live.disk.map_files import MapFiles
 from shmmap.daemon.live.disk.map_record import write_rows
 from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
-from shmmap.daemon.live.folder import Folder, FolderToRead
-from shmmap.daemon.live.map_files import MapFiles
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 from tests.support.live_drive import SETTINGS
 from tests.support.live_reference import contents, stored_drive
@@ -63,7 +62,7 @@ def test_a_good_map(tmp_path: Path, codec: str) -> None:
     assert contents(tmp_path) == before
 
 
-def assert_found_and_put_aside(directory: Path, path: Path, damaged: bytes) -> None:
+def assert_found_and_quarantined(directory: Path, path: Path, damaged: bytes) -> None:
     """The file is the only one that is damaged, and its bytes are kept."""
     path.write_bytes(damaged)
     found = repaired(directory)
@@ -85,24 +84,6 @@ def small_map(directory: Path) -> tuple[Path, bytes]:
     return keep, keep.read_bytes()
 
 
-def test_a_file_that_was_cut_anywhere(tmp_path: Path) -> None:
-    path, whole = small_map(tmp_path)
-    for length in range(0, len(whole), 64):
-        assert_found_and_put_aside(tmp_path, path, whole[:length])
-    assert_found_and_put_aside(tmp_path, path, whole + b"\0")
-    path.write_bytes(whole)
-    assert not checked(tmp_path).damaged
-
-
-def test_a_file_with_one_bit_that_is_wrong(tmp_path: Path) -> None:
-    path, whole = small_map(tmp_path)
-    rng = random.Random(13)
-    for bit in [*range(0, 128 * 8, 5), *(rng.randrange(8 * len(whole)) for _ in range(200))]:
-        damaged = bytearray(whole)
-        damaged[bit // 8] ^= 1 << bit % 8
-        assert_found_and_put_aside(tmp_path, path, bytes(damaged))
-
-
 def test_a_file_that_contradicts_itself(tmp_path: Path) -> None:
     """Its checksums are right, and its counters are not those of its voxels."""
     path, _ = small_map(tmp_path)
@@ -111,18 +92,18 @@ def test_a_file_that_contradicts_itself(tmp_path: Path) -> None:
     view = ChunkView(new_header(SETTINGS.identity(files.map_id, key, 1)))
     view.state["active"] = 7
     folder.close()
-    assert_found_and_put_aside(tmp_path, path, encode_chunk(view, "raw"))
+    assert_found_and_quarantined(tmp_path, path, encode_chunk(view, "raw"))
 
 
 def test_a_file_of_another_chunk_or_map(tmp_path: Path) -> None:
     stored_drive(tmp_path / "one")
     stored_drive(tmp_path / "other")
     first, second = sorted((tmp_path / "one").glob("*.chunk"))[:2]
-    assert_found_and_put_aside(tmp_path / "one", first, second.read_bytes())
-    assert_found_and_put_aside(tmp_path / "one", second, (tmp_path / "other" / second.name).read_bytes())
+    assert_found_and_quarantined(tmp_path / "one", first, second.read_bytes())
+    assert_found_and_quarantined(tmp_path / "one", second, (tmp_path / "other" / second.name).read_bytes())
 
 
-def test_what_is_put_aside_never_takes_the_place_of_another(tmp_path: Path) -> None:
+def test_what_is_quarantined_never_takes_the_place_of_another(tmp_path: Path) -> None:
     stored_drive(tmp_path)
     path = largest(tmp_path)
     for number in (1, 2, 3):
@@ -281,7 +262,7 @@ def checked_as_it_is(directory: Path) -> CheckedMap:
         return check(files, str(directory))
 
 
-def test_what_is_only_there_to_be_written_over_is_not_told(tmp_path: Path) -> None:
+def test_what_is_only_there_to_be_written_over_is_not_reported(tmp_path: Path) -> None:
     stored_drive(tmp_path)
     path = largest(tmp_path)
     (tmp_path / ".chunk.abcd.tmp").write_bytes(path.read_bytes())
@@ -318,7 +299,7 @@ def test_what_is_no_live_map_stays_as_it_is(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"0_0_0.chunk": b"x", "map.json": b"{"}
 
 
-def test_somebody_works_with_it(tmp_path: Path) -> None:
+def test_another_process_works_with_it(tmp_path: Path) -> None:
     stored_drive(tmp_path)
     folder = Folder(tmp_path)
     with pytest.raises(InstanceBusy) as caught, opened_folder(str(tmp_path), "do this"):
@@ -347,3 +328,86 @@ def test_a_file_that_goes_while_the_map_is_checked(tmp_path: Path) -> None:
     files.close()
     assert [*found.damaged, *found.unreadable] == []
     assert [lost.chunk for lost in found.missing] == [gone.name.removesuffix(".chunk")]
+
+
+# --- resetting ----------------------------------------------------------------------------------
+
+
+OTHERS = {"notes.txt": b"mine", ".hidden.tmp": b"mine"}
+LEFT_OVER = [".0_0_0.chunk.abcd.tmp", ".map.json.abcd.tmp", "9_9_9.chunk.damaged.1", "odd.chunk"]
+
+
+def lived_in(directory: Path) -> dict[str, bytes]:
+    """Make a map with all kinds of files of its own, and some of others; returns its own."""
+    stored_drive(directory, 2)
+    for name in LEFT_OVER:
+        (directory / name).write_bytes(b"left")
+    own = contents(directory)
+    for name, data in OTHERS.items():
+        (directory / name).write_bytes(data)
+    return own
+
+
+def test_moved_aside(tmp_path: Path) -> None:
+    for number in (1, 2):
+        own = lived_in(tmp_path)
+        own = {name: data for name, data in own.items() if "/" not in name and name not in OTHERS}
+        folder = Folder(tmp_path)
+        done = reset(folder, delete=False)
+        folder.close()
+        assert done.moved_to == str(tmp_path / f"reset.{number}")
+        assert (done.files, done.bytes) == (len(own), sum(map(len, own.values())))
+        assert contents(tmp_path / f"reset.{number}") == own
+        assert {path.name for path in tmp_path.iterdir() if path.is_file()} == OTHERS.keys()
+        aside = Folder(tmp_path / f"reset.{number}")
+        assert check(aside, "").good
+        aside.close()
+
+
+def test_deleted(tmp_path: Path) -> None:
+    own = lived_in(tmp_path)
+    folder = Folder(tmp_path)
+    done = reset(folder, delete=True)
+    assert (done.moved_to, done.files) == ("", len(own))
+    assert contents(tmp_path) == OTHERS
+    assert MapFiles(folder, SETTINGS).rows == {}
+    folder.close()
+
+
+@pytest.mark.parametrize("delete", [False, True])
+def test_killed_at_any_moment_it_is_a_live_map_of_which_nothing_is_missing(
+    tmp_path: Path, delete: bool
+) -> None:
+    class Killed(Folder):
+        left = 0
+
+        def _count(self) -> None:
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+
+        def rename(self, old: str, new: str) -> None:
+            self._count()
+            super().rename(old, new)
+
+        def remove(self, name: str) -> None:
+            self._count()
+            super().remove(name)
+
+    for steps in range(1, 40):
+        directory = tmp_path / str(steps)
+        own = lived_in(directory)
+        folder = Killed(directory)
+        folder.left = steps
+        try:
+            reset(folder, delete=delete)
+        except KeyboardInterrupt:
+            found = check(folder, "")
+            assert found.good
+            assert not found.missing
+        else:
+            assert steps >= len(own)
+            return
+        finally:
+            folder.close()
+    raise AssertionError("it never came to its end")

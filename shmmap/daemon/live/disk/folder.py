@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few things that are done with the files of a live map, one system call each.
+"""The few operations on the files of a live map, one system call each.
 
-What is written is on the disk after `Folder.sync`, and a file's name after `Folder.sync_names`; before that
-a power cut may leave either as it was, or, of a file, any part of it.
+Content is on the disk after `Folder.sync`, and a file's name after `Folder.sync_names`.  Before that a power
+cut may leave either as it was, or any part of a file's new content.
 """
 
 from __future__ import annotations
@@ -26,18 +26,17 @@ __all__ = [
     "FilesToRead",
     "Folder",
     "FolderToRead",
-    "is_aside",
-    "keep_aside",
+    "quarantine",
     "replace_file",
     "write_beside",
 ]
 
 INTERIM: Final = ".tmp"
-"""How the name of a file ends that has not got its own yet; it begins with a dot."""
+"""Suffix of a file that does not have its own name yet; its interim name begins with a dot."""
 DAMAGED: Final = ".damaged."
-"""What stands between the name that a file had and a number when it was put aside."""
-MOST_BYTES: Final = 1 << 28
-"""That are read of any file: more than one can have that is not damaged."""
+"""Between a quarantined file's original name and a number."""
+MAX_BYTES: Final = 1 << 28
+"""Bytes that are read of any file: more than an undamaged one can have."""
 
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -48,45 +47,45 @@ class FilesToRead(Protocol):
     """Files in one directory, by name."""
 
     def names(self) -> list[str]:
-        """All names."""
+        """Return all names."""
 
     def size(self, name: str) -> int:
-        """Bytes of a file."""
+        """Return the length of a file, bytes."""
 
-    def read(self, name: str, most: int = MOST_BYTES) -> bytes:
-        """The first ``most`` bytes of a file; OSError of what is no regular file."""
+    def read(self, name: str, most: int = MAX_BYTES) -> bytes:
+        """Return the first ``most`` bytes of a file; raise OSError if it is no regular file."""
 
 
 class Files(FilesToRead, Protocol):
-    """Files that may be changed, too."""
+    """Files in one directory that may be changed, too."""
 
     def write(self, name: str, data: bytes) -> None:
-        """Make a file of a new name."""
+        """Create a file."""
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write over a file that nobody needs; if that fails it has some of both."""
+        """Write over a file that is not needed; if that fails it has some of both contents."""
 
     def sync(self, name: str) -> None:
-        """Have what was written on the disk."""
+        """Flush a file's content to the disk."""
 
     def exchange(self, one: str, other: str) -> None:
-        """Have two files each get the other's name, at once; OSError where the file system cannot."""
+        """Exchange the names of two files atomically; raise OSError where the file system cannot."""
 
     def rename(self, old: str, new: str) -> None:
-        """Give a file another name, in the place of what has it."""
+        """Rename a file, in the place of what has the new name."""
 
     def remove(self, name: str) -> None:
         """Remove a file."""
 
     def sync_names(self) -> None:
-        """Have all names on the disk as they are now."""
+        """Flush all names to the disk."""
 
     def moved(self) -> str:
-        """What has become of the directory, if it is not where it was opened; empty if it is there."""
+        """Return what became of the directory, if it is not where it was opened; else empty."""
 
 
 def write_beside(files: Files, name: str, data: bytes) -> str:
-    """Write what is to get this name under another one, which is returned."""
+    """Write a file that is to get this name under an interim one; return that."""
     interim = f".{name}.{secrets.token_hex(4)}{INTERIM}"
     try:
         files.write(interim, data)
@@ -98,7 +97,7 @@ def write_beside(files: Files, name: str, data: bytes) -> str:
 
 
 def replace_file(files: Files, name: str, data: bytes) -> None:
-    """Put a file, which is on the disk, in the place of what has its name; `sync_names` makes that last."""
+    """Write a file to the disk, in the place of what has its name; `sync_names` makes the name durable."""
     interim = write_beside(files, name, data)
     try:
         files.sync(interim)
@@ -109,36 +108,27 @@ def replace_file(files: Files, name: str, data: bytes) -> None:
         raise
 
 
-def is_aside(name: str) -> bool:
-    """Whether a file was put aside, because it was damaged or could not be read."""
-    return DAMAGED in name and name.rpartition(".")[2].isdecimal()
-
-
-def keep_aside(files: Files, name: str) -> str:
+def quarantine(files: Files, name: str) -> str:
     """Give a damaged file another name, which is on the disk when this returns it."""
     taken = set(files.names())
-    aside = next(one for number in count(1) if (one := f"{name}{DAMAGED}{number}") not in taken)
-    files.rename(name, aside)
+    other = next(one for number in count(1) if (one := f"{name}{DAMAGED}{number}") not in taken)
+    files.rename(name, other)
     files.sync_names()
-    return aside
+    return other
 
 
-def _kind(mode: int) -> str:
-    """What a file is that is no regular one."""
-    kinds = {
-        stat.S_IFDIR: "a directory", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket",
-        stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
-    }  # fmt: skip
-    return kinds.get(stat.S_IFMT(mode), "something else")
+_KINDS: Final = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+"""What is no regular file."""
 
 
 class FolderToRead:
-    """Files of a directory with which somebody else may be working: each is whole, as it was at a moment.
-
-    Parameters
-    ----------
-    path
-        The directory.
+    """Files of a directory that another process may be changing: each is read whole, as at one moment.
 
     Raises
     ------
@@ -151,15 +141,15 @@ class FolderToRead:
         self._fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
 
     def close(self) -> None:
-        """Let others have it."""
+        """Close the directory, and unlock it."""
         os.close(self._fd)
 
     def names(self) -> list[str]:
-        """All names."""
+        """Return all names."""
         return os.listdir(self._fd)
 
     def size(self, name: str) -> int:
-        """Bytes of a file."""
+        """Return the length of a file, bytes."""
         return os.stat(name, dir_fd=self._fd, follow_symlinks=False).st_size
 
     def _open(self, name: str, flags: int) -> int:
@@ -172,14 +162,15 @@ class FolderToRead:
                 raise OSError(errno.ELOOP, "it is a symbolic link, not a regular file", name) from error
             raise
 
-    def read(self, name: str, most: int = MOST_BYTES) -> bytes:
-        """The first ``most`` bytes of a file; OSError of what is no regular file."""
+    def read(self, name: str, most: int = MAX_BYTES) -> bytes:
+        """Return the first ``most`` bytes of a file; raise OSError if it is no regular file."""
         while True:
             fd = self._open(name, os.O_RDONLY)
             try:
                 before = os.fstat(fd)
                 if not stat.S_ISREG(before.st_mode):
-                    raise OSError(errno.EINVAL, f"it is {_kind(before.st_mode)}, not a regular file", name)
+                    kind = _KINDS.get(stat.S_IFMT(before.st_mode), "something else")
+                    raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", name)
                 left = min(before.st_size, most)
                 parts = []
                 while left and (part := os.read(fd, left)):
@@ -188,28 +179,28 @@ class FolderToRead:
                 after = os.fstat(fd)
                 if (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size):
                     return b"".join(parts)
-            finally:  # else another file has the name by now, and this one was written over
+            finally:  # else another file has the name now, and this one was written over
                 os.close(fd)
 
 
 class Folder(FolderToRead):
-    """Files of a directory that nobody else works with: there is a lock on it while this lives.
+    """Files of a directory that no other process works with: it is locked until it is closed.
 
     Parameters
     ----------
     path
-        Made if it is missing, for this user alone.
+        Created if it is missing, for this user alone.
 
     Raises
     ------
     InstanceBusy
-        Somebody else has it open.
+        Another process has it open.
     OSError
-        It cannot be made or opened.
+        It cannot be created or opened.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        with contextlib.suppress(FileExistsError):  # which may be something else: it cannot be opened then
+        with contextlib.suppress(FileExistsError):  # if that is no directory, it cannot be opened below
             os.makedirs(path, mode=0o700, exist_ok=True)
         super().__init__(path)
         status = os.fstat(self._fd)
@@ -224,11 +215,11 @@ class Folder(FolderToRead):
             ) from None
 
     def write(self, name: str, data: bytes) -> None:
-        """Make a file of a new name."""
+        """Create a file."""
         self._write(self._open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL), data)
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write over a file that nobody needs; if that fails it has some of both."""
+        """Write over a file that is not needed; if that fails it has some of both contents."""
         self._write(self._open(name, os.O_WRONLY), data)
 
     def _write(self, fd: int, data: bytes) -> None:
@@ -243,7 +234,7 @@ class Folder(FolderToRead):
             os.close(fd)
 
     def sync(self, name: str) -> None:
-        """Have what was written on the disk."""
+        """Flush a file's content to the disk."""
         fd = self._open(name, os.O_RDONLY)
         try:
             os.fdatasync(fd)
@@ -251,7 +242,7 @@ class Folder(FolderToRead):
             os.close(fd)
 
     def exchange(self, one: str, other: str) -> None:
-        """Have two files each get the other's name, at once; OSError where the file system cannot."""
+        """Exchange the names of two files atomically; raise OSError where the file system cannot."""
         swap = getattr(_libc, "renameat2", None)
         if swap is None:
             raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
@@ -260,7 +251,7 @@ class Folder(FolderToRead):
             raise OSError(number, os.strerror(number), one)
 
     def rename(self, old: str, new: str) -> None:
-        """Give a file another name, in the place of what has it."""
+        """Rename a file, in the place of what has the new name."""
         os.rename(old, new, src_dir_fd=self._fd, dst_dir_fd=self._fd)
 
     def remove(self, name: str) -> None:
@@ -268,11 +259,11 @@ class Folder(FolderToRead):
         os.unlink(name, dir_fd=self._fd)
 
     def sync_names(self) -> None:
-        """Have all names on the disk as they are now."""
+        """Flush all names to the disk."""
         os.fsync(self._fd)
 
     def moved(self) -> str:
-        """What has become of the directory, if it is not where it was opened; empty if it is there."""
+        """Return what became of the directory, if it is not where it was opened; else empty."""
         try:
             status = os.stat(self.path)
         except (FileNotFoundError, NotADirectoryError):

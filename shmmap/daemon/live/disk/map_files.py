@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map on disk: what it is, who maps it, and a file for each of its chunks.
+"""A live map on disk: what it is, its mappers, and a file for each of its chunks.
 
-- ``map.json`` says what the map is, and never forgets a mapper's number; it is on the disk before any of
-  that is used.
+- ``map.json`` says what the map is, and keeps every mapper's number; it is on the disk before any of it is
+  used.
 - ``3_-1_0.chunk`` is a chunk (``shmmap/chunks/CHUNKS.md``).  It is written under another name; from then on
-  no death of a process loses it, and its memory may be freed.  `MapFiles.flush` has it on the disk, then in
-  the place of an older one, and then it is *durable*.  Until that its bytes are kept, in case that the disk
-  fails, and for whoever loads it again: what is written often is flushed seldom.
-- ``manifest.json`` lists the chunks that are durable.  It is written last, and only says what somebody may
-  have taken away; all else is read from the chunks' headers.
-- What is damaged is put aside as ``3_-1_0.chunk.damaged.1``, named, and never overwritten.  What the system
-  does not let be read may be good: then the map cannot be opened, and nothing of it is changed.
+  no death of a process loses it, and its memory may be freed.  `MapFiles.flush` brings it to the disk, then
+  into the place of an older one, and then it is *durable*.  Until then its bytes are kept, in case the disk
+  fails, and for the next load: a file that is written often is flushed seldom.
+- ``manifest.json`` lists the durable chunks.  It is written last, and only shows what was removed since; all
+  else is read from the chunks' headers.
+- A damaged file is quarantined as ``3_-1_0.chunk.damaged.1``, reported, and never overwritten.  A file that
+  the system does not let this process read may be good: then the map cannot be opened, and nothing changes.
 """
 
 from __future__ import annotations
@@ -24,31 +24,32 @@ import msgspec
 
 from shmmap.chunks.chunk_file import FILE_HEADER_BYTES, ChunkFileHeader, check_file, read_file_header
 from shmmap.chunks.voxels import ChunkKey
+from shmmap.daemon.live.disk.folder import Files, quarantine, replace_file
 from shmmap.daemon.live.disk.map_record import (
     CHUNK,
     MANIFEST,
     MAP_FILE,
     MAP_FORMAT,
+    FileNames,
     Mapper,
     MapRecord,
     MapSettings,
     Row,
-    keys_of,
     read_chunk,
+    read_header,
     read_manifest,
     read_map,
     write_rows,
 )
-from shmmap.daemon.live.folder import INTERIM, Files, keep_aside, replace_file
-from shmmap.daemon.live.unflushed_files import UnflushedFiles
+from shmmap.daemon.live.disk.unflushed_files import UnflushedFiles
 from shmmap.errors import ConfigError, MapDataError
 from shmmap.failpoints import step
 from shmmap.logfmt import log
 
-__all__ = ["MapFiles", "MapSettings", "Mapper", "Row"]
+__all__ = ["MapFiles"]
 
 SCANS_AHEAD: Final = 1 << 20
-"""Numbers of scans that ``map.json`` leaves to a mapper before it is written again: a day's, at 10 Hz."""
+"""Numbers of scans that ``map.json`` allows a mapper before it is written again: a day's, at 10 Hz."""
 
 
 class MapFiles:
@@ -59,18 +60,18 @@ class MapFiles:
     files
         Of a directory that is this map's alone.
     settings
-        What a new map is to be; an old one must be the same.
+        Of a new map; an old one must have the same.
 
     Attributes
     ----------
     rows : dict
         The chunks on disk.
     damaged : dict
-        Files that were put aside since the start, and why.
+        Files that were quarantined since the start, and why.
     missing : dict
-        Chunks that were durable and are not there any more, or only in an older version.
+        Chunks that were durable and are gone, or left only in an older version.
     applied : dict
-        Up to which scan of each mapper, by its number, all are durable, as far as the manifest says.
+        The scan up to which all of each mapper's, by its number, are durable, as far as the manifest says.
 
     Raises
     ------
@@ -91,15 +92,16 @@ class MapFiles:
         self.applied: dict[int, int] = {}
         self._durable: dict[ChunkKey, Row] = {}
         self._begun = False
-        names = files.names()
-        if MAP_FILE in names:
+        names = FileNames.of(files.names())
+        if MAP_FILE in names.everything:
             with _named(MAP_FILE):
                 self._map = self._read_map(settings)
-        elif any(name.endswith(CHUNK) for name in names):
+        elif names.chunks or names.strange:
             raise MapDataError(
                 "there are chunks, but the file that says what they are is missing",
-                path=MAP_FILE, hint="choose another directory, or bring the file back",
-            )  # fmt: skip
+                path=MAP_FILE,
+                hint="choose another directory, or bring the file back",
+            )
         else:
             self._map = MapRecord(MAP_FORMAT, secrets.token_hex(16), settings)
             self._write_map()
@@ -110,20 +112,20 @@ class MapFiles:
 
     @property
     def map_id(self) -> bytes:
-        """16 bytes that no other map has."""
+        """Return 16 bytes that no other map has."""
         return bytes.fromhex(self._map.map_id)
 
     @property
     def settings(self) -> MapSettings:
-        """What was fixed when it was made."""
+        """Return what was fixed when the map was made."""
         return self._map.settings
 
     @property
     def mappers(self) -> list[Mapper]:
-        """Who maps, the one that was first heard of first."""
+        """Return all mappers, the oldest first."""
         return self._map.mappers
 
-    def begin_life(self) -> int:
+    def begin_run(self) -> int:
         """Return how many times the map was in memory, this time included; on disk when this returns."""
         if not self._begun:
             self._map.lives += 1
@@ -144,7 +146,7 @@ class MapFiles:
         return mapper
 
     def forget_mapper(self, mapper: Mapper) -> None:
-        """A mapper gives way; nobody gets its number."""
+        """Forget a mapper; no other gets its number."""
         before, self._map.mappers = self._map.mappers, [one for one in self._map.mappers if one is not mapper]
         try:
             self._write_map()
@@ -153,7 +155,7 @@ class MapFiles:
             raise
 
     def expect_scan(self, mapper: Mapper, scan: int) -> None:
-        """Make sure that the disk knows that a mapper's scans may have come to this number."""
+        """Note on the disk that a mapper's scans may have reached this number."""
         if scan >= (before := mapper.scans):
             mapper.scans = scan + SCANS_AHEAD
             try:
@@ -169,8 +171,9 @@ class MapFiles:
             if (old := old_ones[name]) != new:
                 raise ConfigError(
                     f"{name} = {new!r}: the map was made with {old!r}",
-                    key=name, hint="leave it as it was, or choose another directory for a new map",
-                )  # fmt: skip
+                    key=name,
+                    hint="leave it as it was, or choose another directory for a new map",
+                )
         return found
 
     def _write_map(self) -> None:
@@ -182,32 +185,32 @@ class MapFiles:
     # --- chunks ---------------------------------------------------------------------------------
 
     def version(self, key: ChunkKey) -> int:
-        """Version of a chunk's file; 0 where there is none."""
+        """Return the version of a chunk's file; 0 where there is none."""
         row = self.rows.get(key)
         return row.version if row is not None else 0
 
     def load(self, key: ChunkKey) -> bytes | None:
-        """Read the file of a chunk; None where there is none.  Raises OSError, and MapDataError."""
+        """Return the file of a chunk; None where there is none.  Raise OSError, and MapDataError."""
         if key not in self.rows:
             return None
         unflushed = self._unflushed.get(key)
         return unflushed if unflushed is not None else read_chunk(self.files, key.text + CHUNK)
 
-    def put_aside(self, key: ChunkKey, why: str) -> str:
-        """Keep a file that cannot be read under another name, which is returned."""
-        name = self._put_aside(key.text + CHUNK, why)
+    def quarantine(self, key: ChunkKey, why: str) -> str:
+        """Keep a file that cannot be used under another name; return that."""
+        name = self._quarantine(key.text + CHUNK, why)
         self.rows.pop(key, None)
         self._durable.pop(key, None)
         return name
 
-    def _put_aside(self, name: str, why: str) -> str:
-        aside = keep_aside(self.files, name)
-        self.damaged[aside] = why
-        log.error("file of a live map quarantined", file=aside, reason=why)
-        return aside
+    def _quarantine(self, name: str, why: str) -> str:
+        other = quarantine(self.files, name)
+        self.damaged[other] = why
+        log.error("file of a live map quarantined", file=other, reason=why)
+        return other
 
     def save(self, key: ChunkKey, data: bytes) -> None:
-        """Write the file of a chunk, which takes the place of an older one and is durable after `flush`.
+        """Write the file of a chunk, which replaces an older one and is durable after `flush`.
 
         When this returns, the chunk's memory may be freed: no death of a process loses it.
         """
@@ -216,23 +219,23 @@ class MapFiles:
         self.rows[key] = row
 
     def flush(self) -> None:
-        """Make durable what was saved; what comes meanwhile is for the next time."""
+        """Make durable what was saved; what is saved meanwhile is for the next flush."""
         for key, data in self._unflushed.flush().items():
             self._durable[key] = Row.of(read_file_header(data))
 
     @property
     def unflushed_bytes(self) -> int:
-        """What is written and not durable takes so much memory here."""
+        """Return how much memory the files take here that are written and not durable."""
         return self._unflushed.nbytes
 
     def remove_spare(self) -> None:
-        """Remove what is only there to be written over."""
+        """Remove files that are only kept to be written over."""
         self._unflushed.remove_spare()
 
     def write_manifest(self, applied: dict[int, int] | None = None) -> None:
         """Make durable what was saved, and list it.
 
-        ``applied`` says up to which scan of each mapper all are durable; None where it is not known.
+        ``applied`` is the scan up to which all of each mapper's are durable; None where it is not known.
         """
         self.flush()
         if applied is not None:
@@ -242,30 +245,27 @@ class MapFiles:
     # --- the start ------------------------------------------------------------------------------
 
     def _header(self, name: str, *, whole: bool = False) -> ChunkFileHeader | None:
-        """What a file of this map says of its chunk, if its length is right, and, if ``whole``, its body."""
+        """Return the header of a file of this map, if its length is right, and, if ``whole``, its body."""
         with contextlib.suppress(FileNotFoundError, MapDataError):
-            if whole:
-                header = check_file(read_chunk(self.files, name), name)
-            else:
-                header = read_file_header(self.files.read(name, FILE_HEADER_BYTES), name)
+            header = (
+                check_file(read_chunk(self.files, name), name) if whole else read_header(self.files, name)
+            )
             right = self.files.size(name) == FILE_HEADER_BYTES + header.stored_bytes
             if right and header.map_id == self.map_id:
                 return header
         return None
 
-    def _adopt_interim(self, names: list[str]) -> None:
-        """A file that was written and had not got its name may be the newest of its chunk; others go."""
-        for name in names:
-            if not (name.startswith(".") and name.endswith(INTERIM)):
-                continue
+    def _adopt_interim(self, names: FileNames) -> None:
+        """Give interim files that are the newest of their chunks their names, and remove the others."""
+        for name in names.interim:
             with _named(name):
                 header = self._header(name, whole=True)
                 if header is not None:
                     place = header.key.text + CHUNK
                     old = self._header(place)
                     if old is None or old.version < header.version:
-                        if old is None and place in names:
-                            self.put_aside(header.key, "it cannot be read, and a whole one was beside it")
+                        if old is None and place in names.everything:
+                            self.quarantine(header.key, "it cannot be read, and a whole one was beside it")
                         self.files.sync(name)
                         self.files.rename(name, place)
                         continue
@@ -273,26 +273,25 @@ class MapFiles:
 
     def _read_rows(self) -> None:
         """Find the chunks, and what is missing of those that the manifest lists."""
-        names = self.files.names()
-        found, strange = keys_of(names)
-        if strange:
-            log.warning("not chunks of this map", files=len(strange), first=min(strange))
-        for key, name in found.items():
+        names = FileNames.of(self.files.names())
+        if names.strange:
+            log.warning("not chunks of this map", files=len(names.strange), first=min(names.strange))
+        for key, name in names.chunks.items():
             with _named(name):
                 header = self._header(name)
             if header is None or header.key != key:
-                self.put_aside(key, "its header or its length is wrong")
+                self.quarantine(key, "its header or its length is wrong")
             else:
                 self.rows[key] = Row.of(header)
         self.files.sync_names()
         self._durable = dict(self.rows)
-        if MANIFEST not in names:
+        if MANIFEST not in names.everything:
             return
         try:
             with _named(MANIFEST):
                 listed, applied = read_manifest(self.files)
         except MapDataError as error:
-            self._put_aside(MANIFEST, error.message)  # it is written again
+            self._quarantine(MANIFEST, error.message)  # it is written again
             return
         sent = {mapper.number: mapper.scans for mapper in self.mappers}
         self.applied = {number: scan for number, scan in applied.items() if scan < sent.get(number, 0)}
@@ -304,7 +303,7 @@ class MapFiles:
 
 @contextlib.contextmanager
 def _named(name: str) -> Iterator[None]:
-    """Have what the system says of a file name it."""
+    """Name the file in the errors of the system."""
     try:
         yield
     except OSError as error:
@@ -312,6 +311,6 @@ def _named(name: str) -> Iterator[None]:
 
 
 def _flat(settings: MapSettings) -> dict[str, object]:
-    """All settings by name, those of the occupancy among them."""
+    """Return all settings by name, those of the occupancy included."""
     found = msgspec.structs.asdict(settings)
     return {**msgspec.structs.asdict(found.pop("occupancy")), **found}
