@@ -23,8 +23,7 @@ from shmmap import (
     LiveMapRow,
     ScanCounts,
 )
-from shmmap.errors import LiveInterrupted, OverBudget
-from shmmap.live import ChunkInfo, LiveMap, LiveMapper, LiveMapRow, ScanCounts
+from shmmap.errors import OverBudget
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import Decimated, RunningSpread
 

@@ -9,7 +9,6 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import KEPT
 
 from shmmap import ScanCounts
-from shmmap.live import ScanCounts
 
 
 def test_the_path_of_a_long_drive_keeps_its_ends() -> None:

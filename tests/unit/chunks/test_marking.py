@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from shmmap.chunks import marking
 from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
 from shmmap.chunks.marks import Marks
-from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.chunks.voxels import voxels_of
 from shmmap.errors import BadRequest
 from tests.support.live_drive import SlowOccupancy, Voxel

@@ -13,7 +13,6 @@ from tests.support.stored_live_map import contents, stored_drive
 from shmmap.cli.entry import main
 from shmmap.daemon.live.disk.folder import Folder
 from tests.support.divided_map import read_pcd
-from tests.support.live_reference import contents, stored_drive
 
 Captured = pytest.CaptureFixture[str]
 
