@@ -113,7 +113,7 @@ def steps(count: int) -> None:
     for number in range(count):
         appear(number, now_s)
     while not ledger.order.settled:
-        evictor.turn(now_s := now_s + 1.0)
+        evictor.run_step(now_s := now_s + 1.0)
     gc.disable()  # as the daemon does
     drivers = [sessions.open(connections.of(), "", 0.0) for _ in range(CLIENTS)]
     number, made, refreshed = count, list[float](), list[float]()
@@ -126,7 +126,7 @@ def steps(count: int) -> None:
         begin = time.thread_time()
         evictor.free(ledger.shortage(SEGMENT_BYTES), now_s)
         middle, scored = time.thread_time(), ledger.order.scored
-        evictor.turn(now_s)
+        evictor.run_step(now_s)
         end = time.thread_time()
         made.append((middle - begin) * 1e3)
         if ledger.order.scored > scored:

@@ -80,7 +80,7 @@ class NoLiveMaps:
         """Never."""
         return math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Nothing has to be done."""
 
     def close(self, *, keep: bool) -> None:
@@ -264,7 +264,7 @@ class LiveRelay:
         """When those who wait for a worker that ended are told: at once, some at a time."""
         return 0.0 if self._tickets.are_lost else math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Tell some of them."""
         del now_s
         self._tickets.refuse_some()

@@ -36,7 +36,7 @@ class OriginWatch:
         failed = self.scheduler.prefetcher.prefetch.health.failed_in_a_row
         return -math.inf if failed and not self.link.is_doubted else math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Find out whether the origin is out of reach."""
         del now_s
         self.link.doubt()

@@ -122,12 +122,19 @@ def client_row(session: Session) -> ClientRow:
     """Return what operators see of a client."""
     intent, peer = session.intent, session.peer
     return ClientRow(
-        session.slot, peer.pid, peer.uid, len(session.held), session.held_bytes, session.requests,
-        int(session.last_request_s * 1e9), session.client, session.command,
+        session.slot,
+        peer.pid,
+        peer.uid,
+        len(session.held),
+        session.held_bytes,
+        session.requests,
+        int(session.last_request_s * 1e9),
+        session.client,
+        session.command,
         (float(intent.x), float(intent.y)) if intent is not None else None,
         None if intent is None or intent.heading is None else float(intent.heading),
         _window(session.area) if session.area is not None else None,
-    )  # fmt: skip
+    )
 
 
 def _window(area: Area) -> Window:
@@ -176,7 +183,7 @@ class Sampler:
             return min(self._next_s, self._last_s + CHANGE_BEAT_S)
         return self._next_s
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Beat, or go on with it."""
         if self._beating is None:
             whole = now_s >= self._whole_s

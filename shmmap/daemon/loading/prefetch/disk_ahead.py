@@ -53,7 +53,7 @@ class DiskAhead:
             return math.inf
         return self._next_s
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Begin with one layer of a cell, if memory has no room for it and no load waits."""
         self._now_s = now_s
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)
