@@ -132,23 +132,38 @@ class Service:
         quota, budget = config.session_quota, cache.ledger.budget_bytes
         self._inbox = Inbox(statistics)
         cells = CellRequests(
-            cache, scheduler, quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
-            due=self._inbox.add_work, clock=time.monotonic,
-        )  # fmt: skip
+            cache,
+            scheduler,
+            quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
+            due=self._inbox.add_work,
+            clock=time.monotonic,
+        )
         sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
-            config, cache, sessions, self._pins, memory.map_switch, scheduler.loads, memory.event_log,
+            config,
+            cache,
+            sessions,
+            self._pins,
+            memory.map_switch,
+            scheduler.loads,
+            memory.event_log,
             events_path(socket_path),
-        )  # fmt: skip
+        )
         self._operators = operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
-            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.on_disconnect,
+            sessions,
+            cells,
+            statistics,
+            memory.event_log,
+            operators,
+            cache.survey,
+            live.on_disconnect,
             cache.events.minutes,
-        )  # fmt: skip
+        )
         paging = Paging(
             cache, scheduler, memory.map_switch, cells, queries, memory.adoption, sessions, watched
-        )  # fmt: skip
+        )
         paging.follow()
         change = MapChange(reloader, cache, scheduler, memory.map_switch, memory.event_log, paging)
         watched.watch(reloader.fd, lambda: self._collect_reload(change), "map")
@@ -165,11 +180,17 @@ class Service:
             defects,
             self._inbox.add_work,
         )
-        tasks: deque[tuple[str, BackgroundTask]] = deque([
-            ("usage", cache.survey), ("map", memory.map_switch), ("map", paging),
-            ("memory", scheduler.prefetcher), ("statistics", sampler), ("memory", cache.evictor),
-            ("answers", live),
-        ])  # fmt: skip
+        tasks: deque[tuple[str, BackgroundTask]] = deque(
+            [
+                ("usage", cache.survey),
+                ("map", memory.map_switch),
+                ("map", paging),
+                ("memory", scheduler.prefetcher),
+                ("statistics", sampler),
+                ("memory", cache.evictor),
+                ("answers", live),
+            ]
+        )
         if elsewhere is not None:
             tasks += self._tasks_of(elsewhere)
         self._handshake = handshake
@@ -218,10 +239,14 @@ class Service:
                 memory.scheduler.pool.start_one()
                 cells = len(memory.cache.catalogue)
                 log.info(
-                        "ready", endpoint=self._socket_path, instance=self._config.instance,
-                        map=self._config.map_path, cells=cells, budget_bytes=memory.cache.ledger.budget_bytes,
-                        start_s=time.monotonic() - started_s,
-                    )  # fmt: skip
+                    "ready",
+                    endpoint=self._socket_path,
+                    instance=self._config.instance,
+                    map=self._config.map_path,
+                    cells=cells,
+                    budget_bytes=memory.cache.ledger.budget_bytes,
+                    start_s=time.monotonic() - started_s,
+                )
                 self._manager.ready(f"serving {cells} cells")
                 _settle_memory()
                 if self._signals.reload_wanted:
@@ -236,9 +261,16 @@ class Service:
         passed = socket.socket(fileno=self._activated.fd) if self._activated is not None else None
         requests = SocketFile(self._socket_path, self._gid, passed)
         listener = Listener(
-            requests.socket, memory.watched, self._connections, memory.statistics, b"ROUTER", b"DEALER",
-            MAX_REQUEST_BYTES, self._inbox.receive, self._handshake.hung_up,
-        )  # fmt: skip
+            requests.socket,
+            memory.watched,
+            self._connections,
+            memory.statistics,
+            b"ROUTER",
+            b"DEALER",
+            MAX_REQUEST_BYTES,
+            self._inbox.receive,
+            self._handshake.hung_up,
+        )
         self._sockets.append((requests, listener))
         step("daemon.bind")
         events = SocketFile(events_path(self._socket_path), self._gid)
@@ -324,10 +356,12 @@ class Service:
         cache = self._memory.cache
         return status_line(
             resident=cache.ledger.cell_count,
-            cells=len(cache.catalogue), clients=len(self._memory.sessions),
-            used_bytes=cache.ledger.used_bytes, budget_bytes=cache.ledger.budget_bytes,
+            cells=len(cache.catalogue),
+            clients=len(self._memory.sessions),
+            used_bytes=cache.ledger.used_bytes,
+            budget_bytes=cache.ledger.budget_bytes,
             failed=self._memory.statistics.values["loads_failed"],
-        )  # fmt: skip
+        )
 
     # --- reload -----------------------------------------------------------------------------------
 

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DROPPED",
+    "RENAMED",
     "ROWS",
     "SECTIONS",
     "SYSTEM_CONFIG_FILE",
@@ -73,11 +74,10 @@ SECTIONS: Final = {
     "live_budget_bytes": "live maps",
 }
 """Headings in the help and in the example file, by the first setting below each."""
+DROPPED: Final = {"eviction": "what clients will need last is always evicted first"}
+"""Settings that there were, and what holds instead."""
 RENAMED: Final = {"ride_out_s": "outage_tolerance_s"}
-DROPPED: Final = {"eviction": "what clients will need last is always evicted first"} | dict.fromkeys(
-    RENAMED, ""
-)
-"""Settings that there were, and what holds instead; empty for one that is in `RENAMED`."""
+"""Former names of settings, and the present ones."""
 
 
 class Setting(NamedTuple):
@@ -383,15 +383,13 @@ def trace_settings(
 
 def _no_setting(word: str, origin: str) -> ConfigError:
     """Refuse a name that is no setting, or no longer one."""
-    if word in DROPPED:
-        new = RENAMED.get(word, "")
-        called, hint = word, "delete this line"
+    if word in DROPPED or word in RENAMED:
+        called, new, remove = word, RENAMED.get(word, ""), "delete this line"
         if origin == COMMAND_LINE:
-            called, new, hint = option_of(word), option_of(new), "leave it out"
+            called, new, remove = option_of(word), option_of(new), "leave it out"
         elif origin.startswith(_ENVIRONMENT):
-            new, hint = _ENVIRONMENT + new.upper(), f"unset {origin}"
-        why = DROPPED[word] or f"it is {new} now"
-        hint = hint if DROPPED[word] else f"write {new}"
+            new, remove = _ENVIRONMENT + new.upper(), f"unset {origin}"
+        why, hint = (f"it is {new} now", f"write {new}") if word in RENAMED else (DROPPED[word], remove)
         return ConfigError(f"{origin}: {called} is gone: {why}", key=word, origin=origin, hint=hint)
     hint = near_hint(word, [*(row.called for row in ROWS.values()), "live"])
     return ConfigError(f"{origin}: unknown setting {word!r}", key=word, origin=origin, hint=hint)

@@ -133,9 +133,11 @@ def live_settings(
     """
     if not isinstance(tables, Mapping) or not all(isinstance(table, Mapping) for table in tables.values()):
         raise ConfigError(
-            f"{origin}: live must be tables", key="live", origin=origin,
+            f"{origin}: live must be tables",
+            key="live",
+            origin=origin,
             hint="write [live.NAME], and below it the settings of that map",
-        )  # fmt: skip
+        )
     found = {name: _from_table(name, table, origin) for name, table in tables.items()}
     for flag in flags:
         name, _, path = flag.partition("=")
@@ -145,9 +147,11 @@ def live_settings(
     for one in found.values():
         if one.path and (other := paths.setdefault(_real(one.path), one.name)) != one.name:
             raise ConfigError(
-                f"live maps {other} and {one.name} are both in {one.path}", key="live", origin=origin,
+                f"live maps {other} and {one.name} are both in {one.path}",
+                key="live",
+                origin=origin,
                 hint="give each a directory of its own",
-            )  # fmt: skip
+            )
     return tuple(found.values())
 
 
@@ -163,9 +167,11 @@ def _real(path: str) -> str:
 def _checked_name(name: str, origin: str) -> str:
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"{origin}: a live map cannot be called {name!r}", key="live", origin=origin,
+            f"{origin}: a live map cannot be called {name!r}",
+            key="live",
+            origin=origin,
             hint="use 1 to 64 letters, digits, '-' or '_'",
-        )  # fmt: skip
+        )
     return name
 
 
@@ -187,9 +193,11 @@ def _from_table(name: str, table: Mapping[str, Any], origin: str) -> LiveSetting
         _ = made.occupancy
     except ConfigError as error:
         raise ConfigError(
-            f"{origin}: live.{name}.{error.key}: {error.message}", key=error.key, origin=origin,
+            f"{origin}: live.{name}.{error.key}: {error.message}",
+            key=error.key,
+            origin=origin,
             hint=error.hint,
-        ) from None  # fmt: skip
+        ) from None
     return made
 
 

@@ -108,9 +108,10 @@ def run(config: DaemonConfig) -> int:
     set_up_logging(getattr(logging, config.log_level.upper()))
     if not config.map_path and not config.live:
         raise ConfigError(
-            "no map is named", key="map_path",
+            "no map is named",
+            key="map_path",
             hint="give `shmmap serve MAP`, or set map_path; --live NAME for a live map alone",
-        )  # fmt: skip
+        )
     if is_url(config.map_path):
         read_url(config.map_path)  # may refuse: one that may hold a secret is not logged
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
@@ -136,9 +137,14 @@ def run(config: DaemonConfig) -> int:
             stack.callback(_end_threads, elsewhere)
         elif config.map_path:
             origin = find_origin(
-                config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
-                unit=config.unit, vertical_unit=config.vertical_unit, tell=notify,
-            )  # fmt: skip
+                config.map_path,
+                metadata=config.metadata,
+                strict=config.strict,
+                cache_dir=config.cache_dir,
+                unit=config.unit,
+                vertical_unit=config.vertical_unit,
+                tell=notify,
+            )
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere
             config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
@@ -188,17 +194,19 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
     path = config.map_path
     if config.trust and not is_url(path) and not os.path.isdir(path):
         raise ConfigError(
-            "--trust is for a published map", key="trust",
+            "--trust is for a published map",
+            key="trust",
             hint="name its URL or directory; `shmmap publish MAP URL --sign KEYDIR` makes one",
-        )  # fmt: skip
+        )
     if not config.trust and not is_published(path):
         return None
     for name in ("metadata", "unit", "vertical_unit", "watch"):
         if getattr(config, name):
             raise ConfigError(
-                f"{option_of(name)} is not for a published map", key=name,
+                f"{option_of(name)} is not for a published map",
+                key=name,
                 hint="--poll SECONDS looks for new versions" if name == "watch" else "",
-            )  # fmt: skip
+            )
     with needed_packages("a published map"):
         from shmmap.daemon.map.published_origin import PublishedOrigin
         from shmmap.origin.remote.opened_store import ServedFrom
@@ -253,10 +261,15 @@ def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay
         return NoLiveMaps()
     mappers = Authorization(config.live_group, "live_group")
     begin = place_live_maps(
-        config.live, instance=config.instance, cells=memory.directory,
-        cells_budget_bytes=memory.cache.ledger.budget_bytes, shm_dir=config.live_shm_dir,
-        budget_bytes=config.live_budget_bytes, gid=gid, marks_gid=mappers.gid,
-    )  # fmt: skip
+        config.live,
+        instance=config.instance,
+        cells=memory.directory,
+        cells_budget_bytes=memory.cache.ledger.budget_bytes,
+        shm_dir=config.live_shm_dir,
+        budget_bytes=config.live_budget_bytes,
+        gid=gid,
+        marks_gid=mappers.gid,
+    )
     events = LiveEvents(memory.event_log, memory.statistics)
     relay = LiveRelay(begin, memory.watched, mappers.allow, events)
     try:

@@ -75,11 +75,20 @@ class MapInMemory:
         self.directory = directory
         epoch = secrets.randbits(63) | 1
         self.identity = DaemonIdentity(
-            pid=os.getpid(), start_time_ticks=start_time_ticks(os.getpid()), pid_namespace=pid_namespace(),
-            epoch=epoch, instance=config.instance, endpoint=socket_path, map_path=config.map_path,
-            map_version=catalogue.map_version, shm_dir=directory.path, id_prefix=catalogue.id_prefix,
-            library_version=__version__, started_unix_ns=time.time_ns(), frame_id=catalogue.frame_id,
-        )  # fmt: skip
+            pid=os.getpid(),
+            start_time_ticks=start_time_ticks(os.getpid()),
+            pid_namespace=pid_namespace(),
+            epoch=epoch,
+            instance=config.instance,
+            endpoint=socket_path,
+            map_path=config.map_path,
+            map_version=catalogue.map_version,
+            shm_dir=directory.path,
+            id_prefix=catalogue.id_prefix,
+            library_version=__version__,
+            started_unix_ns=time.time_ns(),
+            frame_id=catalogue.frame_id,
+        )
         group_limit = memory_limit_bytes()
         budget = choose_budget(  # may refuse: before anything has a name
             config.budget_bytes,
@@ -123,20 +132,32 @@ class MapInMemory:
             reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
             evictor = Evictor(reclaimer)
             self.cache = CellCache(
-                catalogue, evictor, self.statistics, self.event_log,
-                instance=config.instance, mode=mode, gid=gid,
-            )  # fmt: skip
+                catalogue,
+                evictor,
+                self.statistics,
+                self.event_log,
+                instance=config.instance,
+                mode=mode,
+                gid=gid,
+            )
             self.watched = WatchedDescriptors()
             settings = (
-                directory.path, str(loader_bytes(group_limit)), config.cache_dir, str(config.cache_bytes),
+                directory.path,
+                str(loader_bytes(group_limit)),
+                config.cache_dir,
+                str(config.cache_bytes),
                 *(origin.words if origin is not None else ()),
-            )  # fmt: skip
+            )
             parent = PreparedParent(settings, self.watched, early)
             parent.start()  # it imports what loaders need while this process gets ready
             pool = WorkerPool(
-                config.loaders(), directory, parent, config.load_timeout_s, self.watched,
+                config.loaders(),
+                directory,
+                parent,
+                config.load_timeout_s,
+                self.watched,
                 places=origin.places if origin is not None else 1,
-            )  # fmt: skip
+            )
             self.map_switch = MapSwitch(self.cache)
             self.scheduler = Scheduler(
                 self.cache,

@@ -81,9 +81,11 @@ def check_file_size_limit(budget_bytes: int) -> None:
     limit = file_size_limit()
     if limit is not None and limit < budget_bytes:
         log.warning(
-            "files are limited in size", RLIMIT_FSIZE=limit, budget_bytes=budget_bytes,
+            "files are limited in size",
+            RLIMIT_FSIZE=limit,
+            budget_bytes=budget_bytes,
             hint="larger segments will be refused: ulimit -f, LimitFSIZE=",
-        )  # fmt: skip
+        )
 
 
 def choose_pins(directory: ShmDirectory) -> PinWatch:

@@ -48,7 +48,7 @@ class BackgroundTask(Protocol):
     def next_s(self) -> float:
         """When a step is due; infinity for never, any time in the past for at once."""
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Do the step that is due."""
 
 
@@ -188,7 +188,7 @@ class ServingLoop:
             kind, task = self.tasks[0]
             self.tasks.rotate(-1)
             if task.next_s <= now_s:
-                self._guarded(kind, task.turn, now_s)
+                self._guarded(kind, task.run_step, now_s)
                 break
         if now_s >= self.operators.stop_by_s:
             self.stop()

@@ -113,10 +113,13 @@ def start_child(
             }
             process = subprocess.Popen(
                 [sys.executable, "-m", module, str(theirs.fileno()), str(os.getpid()), *arguments],
-                pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                env=environment, start_new_session=new_session,
+                pass_fds=(theirs.fileno(),),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                env=environment,
+                start_new_session=new_session,
                 cwd="/",  # nothing is imported from where the parent happens to run
-            )  # fmt: skip
+            )
     except BaseException:
         ours.close()
         raise

@@ -7,7 +7,7 @@ import argparse
 import os
 
 from shmmap.cli.options import Subparsers, add_verb
-from shmmap.daemon.config import DROPPED, ROWS, SECTIONS, load_config, option_of
+from shmmap.daemon.config import DROPPED, RENAMED, ROWS, SECTIONS, load_config, option_of
 from shmmap.daemon.config_table import Row
 
 __all__ = ["add_parser", "run"]
@@ -57,7 +57,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="keep a live map, which mappers write to, with its files in DIR (default: live/NAME in the "
         "state directory); may be given again",
     )
-    for name in DROPPED:  # what is said of them, `load_config` knows
+    for name in (*DROPPED, *RENAMED):  # `load_config` refuses them
         parser.add_argument(option_of(name), dest=name, help=argparse.SUPPRESS)
 
 

@@ -245,7 +245,7 @@ class CellCache:
     def serve(self, new: CatalogueView, changed: NDArray[np.intp] | None) -> list[ShardedDict[int, Any]]:
         """Serve another state of the map.
 
-        Nothing is warm in it before `find_warm` or `MapSwitch.turn` has found it in the ledger.
+        Nothing is warm in it before `find_warm` or `MapSwitch.run_step` has found it in the ledger.
 
         Parameters
         ----------

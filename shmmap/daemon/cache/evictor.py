@@ -208,7 +208,7 @@ class Evictor:
         """When `turn` has something to do; for a while after room was needed."""
         return self._refreshed_s + REFRESH_S if self._refreshed_s < self._refresh_until_s else math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Score some new segments, or bring some scores up to date, in turn."""
         self._refreshed_s = now_s
         ledger, before = self.reclaimer.ledger, self._score

@@ -123,7 +123,7 @@ class MapSwitch:
         """When `turn` has something to do: at once, or never."""
         return 0.0 if self.busy else math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Look at some of what is in memory: it is right, out of date, or of no cell of the map any more."""
         cache = self._cache
         if self._unseen is not None:

@@ -107,7 +107,7 @@ class Survey:
             raise Busy("this session waits for too many answers of this kind", hint="wait for them first")
         self._asked.append((session, answer))
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Do a step if somebody waits, unless the one before took so long that others come first."""
         if self.idle or now_s < self._rests_until_s:
             return

@@ -10,9 +10,20 @@ import struct
 from typing import Final, NamedTuple
 
 __all__ = [
-    "ALSO", "CHANGED", "CLOSED", "CREATED", "DIRECTORY", "ENDED", "NAMES_CHANGED", "NAME_GONE", "OVERFLOW",
-    "SELF_GONE", "SELF_MOVED", "Event", "Inotify",
-]  # fmt: skip
+    "ALSO",
+    "CHANGED",
+    "CLOSED",
+    "CREATED",
+    "DIRECTORY",
+    "ENDED",
+    "NAMES_CHANGED",
+    "NAME_GONE",
+    "OVERFLOW",
+    "SELF_GONE",
+    "SELF_MOVED",
+    "Event",
+    "Inotify",
+]
 
 CLOSED: Final = 0x08 | 0x10
 """A descriptor that could write, or could not, is closed for the last time: IN_CLOSE."""

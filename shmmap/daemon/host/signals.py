@@ -13,9 +13,7 @@ from typing import Final
 
 from shmmap.logfmt import log
 
-__all__ = [
-    "KEEP_SIGNAL", "RELOAD_SIGNAL", "STOP_SIGNALS", "ServingSignals", "StartSignals", "ignore_signals"
-]  # fmt: skip
+__all__ = ["KEEP_SIGNAL", "RELOAD_SIGNAL", "STOP_SIGNALS", "ServingSignals", "StartSignals", "ignore_signals"]
 
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1

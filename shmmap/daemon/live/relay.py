@@ -151,7 +151,7 @@ class NoLiveMaps:
         """Return infinity: nothing is ever due."""
         return math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Do nothing."""
 
     def close(self, *, keep: bool) -> None:
@@ -335,7 +335,7 @@ class LiveRelay:
         """Return when to refuse requests to a worker that ended: at once, some at a time."""
         return 0.0 if self._tickets.are_lost else math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Refuse some of them."""
         del now_s
         self._tickets.refuse_some()

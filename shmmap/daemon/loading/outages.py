@@ -51,7 +51,7 @@ class OriginWatch:
         failed = self.scheduler.prefetcher.prefetch.health.failed_in_a_row
         return -math.inf if failed and not self.link.is_doubted else math.inf
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Find out whether the origin is out of reach."""
         del now_s
         self.link.doubt()
@@ -100,7 +100,7 @@ class DiskAhead:
             return math.inf
         return self._next_s
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Begin with one layer of a cell, if memory has no room for it and no load waits."""
         self._now_s = now_s
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)

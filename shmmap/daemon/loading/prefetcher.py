@@ -119,7 +119,7 @@ class Prefetcher:
         next_s = self._next_s if self.prefetch.ways else math.inf
         return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved or self.ended else next_s
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Follow some clients that moved, and wish for what is needed first of what nobody asks for."""
         self._now_s = now_s
         self._followed_s = now_s

@@ -43,8 +43,18 @@ LOOK_S: Final = 1.0
 """How often a directory that has vanished is looked for."""
 
 _REMOTE: Final = (
-    "nfs", "nfs4", "cifs", "smb3", "9p", "ceph", "lustre", "glusterfs", "afs", "fuse.sshfs", "fuse.glusterfs",
-)  # fmt: skip
+    "nfs",
+    "nfs4",
+    "cifs",
+    "smb3",
+    "9p",
+    "ceph",
+    "lustre",
+    "glusterfs",
+    "afs",
+    "fuse.sshfs",
+    "fuse.glusterfs",
+)
 
 
 def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
@@ -122,9 +132,11 @@ class FileWatch:
                 raise _refusal(refused)
             if (kind := file_system_of(directory)) in _REMOTE:
                 log.warning(
-                        "changes made on other machines are not noticed", directory=directory,
-                        file_system=kind, hint="shmmap reload",
-                    )  # fmt: skip
+                    "changes made on other machines are not noticed",
+                    directory=directory,
+                    file_system=kind,
+                    hint="shmmap reload",
+                )
 
     def follow(self, directories: Iterable[str]) -> None:
         """Watch these too, as soon as they can be; watching one twice is the same as once."""

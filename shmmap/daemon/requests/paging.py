@@ -118,7 +118,7 @@ class Paging:
         drop_s = self._rests_until_s if pages.spare() is not None else math.inf
         return min(drop_s, self.queries.next_deadline_s())
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Drop a page, if they are too many and nothing needs it."""
         self.queries.answer_overdue(now_s)
         pages = self._pages

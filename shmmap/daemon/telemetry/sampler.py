@@ -193,7 +193,7 @@ class Sampler:
             return min(self._next_s, self._last_s + CHANGE_BEAT_S)
         return self._next_s
 
-    def turn(self, now_s: float) -> None:
+    def run_step(self, now_s: float) -> None:
         """Beat, or go on with it."""
         if self._beating is None:
             whole = now_s >= self._whole_s

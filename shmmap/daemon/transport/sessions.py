@@ -229,9 +229,14 @@ class Sessions:
             slot = secrets.randbelow(MAX_SLOT) + 1
         pid = connection.peer.pid
         session = Session(
-            slot, connection, escaped(client)[:64], command_of(pid), self, last_request_s=now_s,
+            slot,
+            connection,
+            escaped(client)[:64],
+            command_of(pid),
+            self,
+            last_request_s=now_s,
             asker=pid or -slot,
-        )  # fmt: skip
+        )
         connection.slot = slot
         self.slots[slot] = session
         return session

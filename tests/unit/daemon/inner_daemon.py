@@ -167,17 +167,17 @@ class InnerDaemon:
                 callback()
         now_s = self.now_s()
         self.scheduler.lost.end_overdue(now_s)
-        self.cache.survey.turn(now_s)
+        self.cache.survey.run_step(now_s)
         self.scheduler.free(now_s)
         self.scheduler.pump(now_s)
         while self.scheduler.unfinished:
             self.scheduler.pump(now_s)
         self.cells.answer_overdue(now_s)
-        self.map_switch.turn(now_s)
+        self.map_switch.run_step(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:
-            self.scheduler.prefetcher.turn(now_s)
+            self.scheduler.prefetcher.run_step(now_s)
         if self.evictor.next_s <= now_s:
-            self.evictor.turn(now_s)
+            self.evictor.run_step(now_s)
         while not self.hold_answers and self.due:
             finish(self.due.pop(0))
         self.cache.tell_all()

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from shmmap.cli.parser import build_parser
 from shmmap.daemon.config import (
     DROPPED,
+    RENAMED,
     ROWS,
     DaemonConfig,
     installed_config_file,
@@ -114,7 +115,13 @@ def test_which_file_is_installed(tmp_path: Path) -> None:
 def test_the_command_line_has_the_options_that_errors_name() -> None:
     (verbs,) = (one for one in build_parser()._actions if isinstance(one, argparse._SubParsersAction))
     actions = {action.dest: action for action in verbs.choices["serve"]._actions}
-    assert set(actions) == {*(field.name for field in fields(DaemonConfig)), "config", "help", *DROPPED}
+    assert set(actions) == {
+        *(field.name for field in fields(DaemonConfig)),
+        "config",
+        "help",
+        *DROPPED,
+        *RENAMED,
+    }
     for name in ROWS:
         assert option_of(name) in (*actions[name].option_strings, actions[name].metavar)
         assert actions[name].default is None, "the configuration file may say"

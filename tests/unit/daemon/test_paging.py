@@ -117,7 +117,7 @@ class Paged:
         self.pages.most, looked = most, 2 * len(self.pages.needed)
         is_needed = self.paging.is_needed
         while self.pages.spare() is not None and (looked := looked - 1):
-            self.paging.turn(math.inf)
+            self.paging.run_step(math.inf)
             self.paging._rests_until_s = -math.inf
         assert len(self.pages.needed) <= most or any(map(is_needed, self.pages.needed))
         self.pages.most = len(self.pages)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a vehicle is and goes reaches the daemon with each request of its window, and by no other."""
+"""Pose, velocity and route of a vehicle reach the daemon with each request of its window, and by no other."""
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -52,11 +51,11 @@ def received(monkeypatch: pytest.MonkeyPatch) -> list[Intent]:
     return found
 
 
-@contextlib.contextmanager
-def serving(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> Iterator[WholeDaemon]:
-    one = whole(small_map.root)
-    with one.turning():
-        yield one
+@pytest.fixture
+def one(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> Iterator[WholeDaemon]:
+    served = whole(small_map.root)
+    with served.turning():
+        yield served
 
 
 def move_until(received: list[Intent], move: Callable[[], object], fits: Callable[[Intent], bool]) -> Intent:
@@ -73,9 +72,9 @@ def anything(_: Intent) -> bool:
 
 
 def test_another_route_and_another_velocity_come(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, make: MakeWindow, received: list[Intent]
+    one: WholeDaemon, make: MakeWindow, received: list[Intent]
 ) -> None:
-    with serving(whole, small_map) as one, make(one.endpoint) as window:
+    with make(one.endpoint) as window:
         window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=PATIENCE_S)
         came = move_until(received, lambda: window.move_to(0, 0, vx=5.0, route=STRAIGHT), anything)
         assert (came.vx, came.route) == (5.0, STRAIGHT)
@@ -91,9 +90,9 @@ def test_another_route_and_another_velocity_come(
 
 
 def test_nothing_is_asked_before_it_has_moved_or_time_has_passed(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, make: MakeWindow, received: list[Intent]
+    one: WholeDaemon, make: MakeWindow, received: list[Intent]
 ) -> None:
-    with serving(whole, small_map) as one, make(one.endpoint, refresh_interval=NEVER) as window:
+    with make(one.endpoint, refresh_interval=NEVER) as window:
         window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=PATIENCE_S)
         before = len(received)
         for step in range(200):
@@ -101,26 +100,19 @@ def test_nothing_is_asked_before_it_has_moved_or_time_has_passed(
         assert received[before:] == []
 
 
-def test_a_route_that_is_given_once_comes(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, received: list[Intent]
-) -> None:
+def test_a_route_that_is_given_once_comes(one: WholeDaemon, received: list[Intent]) -> None:
     """The window is not moved again: its thread asks when its interval is over."""
-    with (
-        serving(whole, small_map) as one,
-        shmmap.MapWindow(one.endpoint, 15.0, update_distance=NEVER, refresh_interval=SOON_S) as window,
-    ):
+    with shmmap.MapWindow(one.endpoint, 15.0, update_distance=NEVER, refresh_interval=SOON_S) as window:
         window.move_to(0, 0, route=STRAIGHT, wait=PATIENCE_S)
         window.move_to(0, 0, route=LEFT)
         move_until(received, lambda: time.sleep(0.01), lambda i: i.route == LEFT)
 
 
-def test_long_routes_are_thinned(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, make: MakeWindow, received: list[Intent]
-) -> None:
+def test_long_routes_are_thinned(one: WholeDaemon, make: MakeWindow, received: list[Intent]) -> None:
     """Many more places than the daemon takes; in C++ the same places are sent as in Python."""
     turns = np.linspace(0.0, 9.0, 6000)
     route = np.stack([20.0 * turns * np.cos(turns), 20.0 * turns * np.sin(turns)], axis=-1)
-    with serving(whole, small_map) as one, make(one.endpoint) as window:
+    with make(one.endpoint) as window:
         window.move_to(0, 0, route=route.tolist(), wait=PATIENCE_S)
         came = move_until(received, lambda: window.move_to(0, 0, route=route.tolist()), anything)
         assert np.array(came.route) == pytest.approx(thinned(route), abs=1e-9)
@@ -130,13 +122,11 @@ def test_long_routes_are_thinned(
         assert came.route == ((7.0, 8.0),)
 
 
-def test_long_routes_beside_a_window(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, received: list[Intent]
-) -> None:
+def test_long_routes_beside_a_window(one: WholeDaemon, received: list[Intent]) -> None:
     """Each request of a client takes a route of any length."""
     route = [(float(x), 0.0) for x in range(5000)]
     area = shmmap.Circle(0.0, 0.0, 5.0)
-    with serving(whole, small_map) as one, shmmap.connect(one.endpoint) as client:
+    with shmmap.connect(one.endpoint) as client:
         client.area(area, pose=(0.0, 0.0), route=route)
         client.differential(area, [], pose=(0.0, 0.0), route=route)
         client.selected(["0_0.pcd"], pose=(0.0, 0.0), route=route)

@@ -27,7 +27,7 @@ def test_ctrl_c_cannot_end_a_child_in_its_imports(new_session: bool) -> None:
     found = re.search(r"^SigBlk:\s*([0-9a-f]+)$", status, re.MULTILINE)
     assert found is not None
     assert int(found[1], 16) & 1 << signal.SIGINT - 1
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ()), "the parent hears it"
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ()), "the parent gets it"
 
 
 def test_a_descriptor_comes_with_its_packet_and_is_not_inherited() -> None:

@@ -29,7 +29,7 @@ def steps(one: InnerDaemon) -> int:
     """Do the rest of a change; returns how many turns it took."""
     count = 0
     while one.map_switch.busy:
-        one.map_switch.turn(one.now_s())
+        one.map_switch.run_step(one.now_s())
         count += 1
     return count
 
@@ -47,7 +47,7 @@ def test_a_turn_looks_at_a_few_segments(inner: Inner, made: DividedMap) -> None:
     assert len(one.cache.warm) == 0
     before, entered = 0, []
     while one.map_switch.busy:
-        one.map_switch.turn(one.now_s())
+        one.map_switch.run_step(one.now_s())
         entered.append(len(one.cache.warm) - before)
         before = len(one.cache.warm)
     assert max(entered) == SEGMENTS_A_STEP
@@ -66,7 +66,7 @@ def test_whoever_asks_meanwhile_is_answered_as_if_it_were_over(
     made.change("20_20.pcd", 3)
     one.reload()
     for _ in range(turns):
-        one.map_switch.turn(one.now_s())
+        one.map_switch.run_step(one.now_s())
     one.ask(one.session(), Differential(2, EVERYWHERE, packed=held, wait=30.0))
     reply = one.cells_of(2)
     assert names(reply) == ["20_20.pcd"]
@@ -85,7 +85,7 @@ def test_a_change_during_a_change(inner: Inner, made: DividedMap) -> None:
     for name in sorted(made.corners)[:5]:
         remove(made, name)
         one.reload()
-        one.map_switch.turn(one.now_s())
+        one.map_switch.run_step(one.now_s())
     steps(one)
     assert len(one.cache.warm) == one.ledger.resident_count == CELLS - 5
     assert len(one.everything(2).cells) == CELLS - 5
@@ -101,7 +101,7 @@ def test_tables_are_freed_little_by_little(
     one.reload()
     (table,) = one.map_switch._leftovers
     assert len(table) == CELLS
-    one.map_switch.turn(one.now_s())
+    one.map_switch.run_step(one.now_s())
     assert len(table) == CELLS - 7
     steps(one)
     assert len(table) == 0

@@ -99,7 +99,7 @@ def test_who_asks_hears_of_a_walk_that_began_afterwards() -> None:
     memory.users = {"47": [7], "3": [7, UNKNOWN_SLOT]}
     told: list[Usage] = []
     assert survey.next_s == float("inf")
-    survey.turn(0.0)
+    survey.run_step(0.0)
     assert memory.looked == LOOKS_AT_ONCE, "nobody asked"
     survey.ask(session(), told.append)
     survey.ask(session(), told.append)

@@ -92,7 +92,7 @@ def test_a_session_weighs_less_and_one_that_is_another_s_stays() -> None:
 @pytest.mark.skipif(not os.path.exists("/proc/self/autogroup"), reason="this kernel has no autogroups")
 def test_an_ordinary_user_s_too_though_the_kernel_takes_few_changes_a_second(tmp_path: Path) -> None:
     user = ["setpriv", "--reuid=61005", "--clear-groups"]
-    for _ in range(3):  # at once: the later ones are told to ask again
+    for _ in range(3):  # at once: the later ones have to ask again
         assert weight("session", *user)[0] == LOADER_GROUP_NICENESS
 
 

@@ -106,7 +106,7 @@ class World:
         self.workers[-1].close()
         self.relay.on_readable()
         while self.relay.next_s <= self.now_s:
-            self.relay.turn(self.now_s)
+            self.relay.run_step(self.now_s)
 
     def ask(self, asker: Asker, request: int = 1) -> None:
         message = LiveMove(request, "lidar", (0.0, 0.0, 0.0))
@@ -390,7 +390,7 @@ def test_very_many_that_wait_are_refused_some_at_a_time(world: World) -> None:
     turns = 0
     while world.relay.next_s <= world.now_s:
         before = sum(len(asker.refused) for asker in askers)
-        world.relay.turn(world.now_s)
+        world.relay.run_step(world.now_s)
         assert sum(len(asker.refused) for asker in askers) - before <= REFUSED_PER_TURN
         turns += 1
     assert turns == 3

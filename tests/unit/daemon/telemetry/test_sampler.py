@@ -32,7 +32,7 @@ def beat(sampler: Sampler, now_s: float) -> int:
     """Have the sampler do what is due; returns in how many turns."""
     count = 0
     while sampler.next_s <= now_s:
-        sampler.turn(now_s)
+        sampler.run_step(now_s)
         count += 1
     return count
 

@@ -242,15 +242,6 @@ def test_what_waits_too_long_stays_in_the_kernel(loop: Loop) -> None:
         loop.turn()
 
 
-def test_many_connections_take_turns(loop: Loop) -> None:
-    for _ in range(40):
-        loop.raw(GREETING + READY)
-    for one in loop.held:
-        one.sendall(framed(b"x"))
-    assert [loop.turn() for _ in range(3)] == [16, 16, 8]
-    assert len({connection for connection, _, _ in loop.received}) == 40
-
-
 def test_replies_that_are_not_read(loop: Loop) -> None:
     """They are kept up to a limit, whole; beyond it they and the connection are lost."""
     one = loop.raw(GREETING + READY)

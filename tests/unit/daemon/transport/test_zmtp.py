@@ -15,19 +15,19 @@ READY = framed(b"\x05READY\x0bSocket-Type\0\0\0\x06DEALER\x08Identity\0\0\0\0", 
 MORE = 1
 
 
-class Ear:
+class Receiver:
     """One end of a connection."""
 
     def __init__(self) -> None:
-        self.said: list[bytes] = []
+        self.sent: list[bytes] = []
         self.incoming = Incoming(b"ROUTER", b"DEALER", LONGEST)
 
-    def hear(self, *pieces: bytes, at_once: int = 1000) -> list[tuple[bytes, bool]]:
-        heard = []
+    def receive(self, *pieces: bytes, at_once: int = 1000) -> list[tuple[bytes, bool]]:
+        received = []
         for piece in pieces:
             self.incoming.add(piece)
-            heard += self.incoming.messages(at_once, self.said.append)
-        return heard
+            received += self.incoming.messages(at_once, self.sent.append)
+        return received
 
 
 def wire(frames: list[bytes]) -> bytes:
@@ -43,14 +43,14 @@ def wire(frames: list[bytes]) -> bytes:
 def test_any_pieces(messages: list[list[bytes]], cuts: list[int], at_once: int) -> None:
     data = GREETING + READY + b"".join(map(wire, messages))
     ends = sorted(min(cut, len(data)) for cut in cuts)
-    ear = Ear()
-    heard = ear.hear(
+    receiver = Receiver()
+    received = receiver.receive(
         *(data[a:b] for a, b in zip([0, *ends], [*ends, len(data)], strict=True)), at_once=at_once
     )
-    while ear.incoming.more:
-        heard += ear.incoming.messages(at_once, ear.said.append)
-    assert heard == [(frames[0], len(frames) > 1) for frames in messages]
-    assert len(ear.incoming) == 0
+    while receiver.incoming.more:
+        received += receiver.incoming.messages(at_once, receiver.sent.append)
+    assert received == [(frames[0], len(frames) > 1) for frames in messages]
+    assert len(receiver.incoming) == 0
 
 
 @pytest.mark.parametrize("size", [0, 255, 256, 70_000])
@@ -60,14 +60,14 @@ def test_frames_of_any_length(size: int) -> None:
     assert incoming.messages(9, lambda _data: None) == [(bytes(size), False)]
 
 
-def test_what_the_daemon_says() -> None:
+def test_what_the_daemon_sends() -> None:
     """Who it is, after the greeting; and that it is there, when asked."""
-    ear = Ear()
-    assert ear.hear(GREETING[:-1]) == []
-    assert ear.said == []
-    ear.hear(GREETING[-1:], READY, framed(b"\x04PING\x00\x05abc", 4))
+    receiver = Receiver()
+    assert receiver.receive(GREETING[:-1]) == []
+    assert receiver.sent == []
+    receiver.receive(GREETING[-1:], READY, framed(b"\x04PING\x00\x05abc", 4))
     own = framed(b"\x05READY\x0bSocket-Type\0\0\0\x06ROUTER\x08Identity\0\0\0\0", 4)
-    assert ear.said == [own, framed(b"\x04PONGabc", 4)]
+    assert receiver.sent == [own, framed(b"\x04PONGabc", 4)]
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_what_the_daemon_says() -> None:
 )
 def test_what_is_no_client(data: bytes) -> None:
     with pytest.raises(ProtocolMismatch):
-        Ear().hear(data)
+        Receiver().receive(data)
 
 
 @pytest.mark.parametrize(
@@ -99,26 +99,26 @@ def test_what_is_no_client(data: bytes) -> None:
 )
 def test_a_message_that_is_too_long(data: bytes) -> None:
     """It is known from its head; frames without end are one message."""
-    ear = Ear()
+    receiver = Receiver()
     with pytest.raises(BadRequest, match="more than 1000 bytes"):
-        ear.hear(GREETING + READY + data, at_once=2 * LONGEST)
+        receiver.receive(GREETING + READY + data, at_once=2 * LONGEST)
 
 
 def test_work_at_once_is_bounded() -> None:
-    ear = Ear()
-    heard = ear.hear(GREETING + READY + framed(b"a") * 40, at_once=16)
-    assert (len(heard), ear.incoming.more) == (15, True)
-    assert (len(ear.incoming.messages(16, ear.said.append)), ear.incoming.more) == (16, True)
-    assert (len(ear.incoming.messages(16, ear.said.append)), ear.incoming.more) == (9, False)
+    receiver = Receiver()
+    received = receiver.receive(GREETING + READY + framed(b"a") * 40, at_once=16)
+    assert (len(received), receiver.incoming.more) == (15, True)
+    assert (len(receiver.incoming.messages(16, receiver.sent.append)), receiver.incoming.more) == (16, True)
+    assert (len(receiver.incoming.messages(16, receiver.sent.append)), receiver.incoming.more) == (9, False)
 
 
 @given(st.binary(max_size=300))
 def test_any_bytes(data: bytes) -> None:
     """Messages, one of the two errors, or silence."""
     for start in (b"", GREETING, GREETING + READY):
-        ear = Ear()
+        receiver = Receiver()
         try:
-            ear.hear(start + data)
+            receiver.receive(start + data)
         except (ProtocolMismatch, BadRequest):
             continue
-        assert len(ear.incoming) <= len(start + data)
+        assert len(receiver.incoming) <= len(start + data)

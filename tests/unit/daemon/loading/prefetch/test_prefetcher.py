@@ -103,7 +103,7 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
 
     def end(after_s: float, took_s: float, out: bool) -> tuple[bool, int]:
         prefetcher.ended.append((load, True, took_s, out))
-        prefetcher.turn(now_s + after_s)
+        prefetcher.run_step(now_s + after_s)
         return health.is_out, health.failed_in_a_row
 
     for number in range(IN_A_ROW):
