@@ -60,14 +60,14 @@ def started(*lines: str) -> dict[str, tuple[object, str, str]]:
         [sys.executable, "-c", STARTS, *lines],
         cwd=ROOT, env=environment, check=True, capture_output=True, text=True,
     )  # fmt: skip
-    told: dict[str, tuple[object, str, str]] = json.loads(done.stdout)
-    return told
+    ended: dict[str, tuple[object, str, str]] = json.loads(done.stdout)
+    return ended
 
 
 def test_every_one_starts() -> None:
-    told = started(*(f"{name} --help" for name in MODULES))
-    assert {name: one for name, one in told.items() if not one[1].startswith("usage: ") or one[0]} == {}
-    assert sorted(told) == MODULES
+    ended = started(*(f"{name} --help" for name in MODULES))
+    assert {name: one for name, one in ended.items() if not one[1].startswith("usage: ") or one[0]} == {}
+    assert sorted(ended) == MODULES
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -76,10 +76,10 @@ def test_its_docstring_says_how_to_run_it(name: str) -> None:
 
 
 def test_without_data_they_say_how_to_make_some() -> None:
-    told = started(*NEED_DATA)
+    ended = started(*NEED_DATA)
     hint = "hint: python -m tests.benchmarks.make_data"  # a message instead of a code is exit 1
-    assert {name: one for name, one in told.items() if hint not in str(one[0])} == {}
-    assert sorted(told) == NEED_DATA
+    assert {name: one for name, one in ended.items() if hint not in str(one[0])} == {}
+    assert sorted(ended) == NEED_DATA
 
 
 def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
@@ -120,8 +120,8 @@ def test_localization_is_measured_on_data_that_anyone_can_make(tmp_path: Path) -
         return done.stdout
 
     run("tests.benchmarks.make_data", str(tmp_path / "data"), "--density", "20")
-    told = run("tests.benchmarks.ndt_accuracy", "--seeds", "1", "--disturbance", "planar")
-    shares = dict(re.findall(r"^(.+?) +(\d+\.\d+)% within", told, re.MULTILINE))
+    ended = run("tests.benchmarks.ndt_accuracy", "--seeds", "1", "--disturbance", "planar")
+    shares = dict(re.findall(r"^(.+?) +(\d+\.\d+)% within", ended, re.MULTILINE))
     assert len(shares) == 9
     assert shares["simulated scans, 0.5 m, 6000 points, planar, fine"] == "100.00"
     assert shares["generated city, 1500 points, planar, fine"] == "100.00"

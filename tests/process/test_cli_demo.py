@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap demo`` tells the truth and leaves nothing behind, however it ends."""
+"""``shmmap demo`` measures truly and leaves nothing behind, however it ends."""
 
 from __future__ import annotations
 
@@ -33,33 +33,33 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     demo = Demo(tmp_path, *words, command=("shmmap.cli", "demo"))
     out, err = demo.process.communicate()
     assert (demo.process.returncode, err) == (0, "")
-    told = json.loads(out)
-    assert sorted(told) == ["localization", "one_more_bytes", "outage", "rounds", "seconds", "svg", "town"]
-    town = told["town"]
+    report = json.loads(out)
+    assert sorted(report) == ["localization", "one_more_bytes", "outage", "rounds", "seconds", "svg", "town"]
+    town = report["town"]
     files = list((tmp_path / "town" / "pointcloud_map.pcd").glob("*.pcd"))
     assert town["cells"] == len(files) == 320
     assert town["file_bytes"] == sum(file.stat().st_size for file in files)
-    assert [each["consumers"] for each in told["rounds"]] == [1, 8]
-    for each in told["rounds"]:
+    assert [each["consumers"] for each in report["rounds"]] == [1, 8]
+    for each in report["rounds"]:
         _check_round(each["consumers"], each["shared"], each["private"])
-    shared, private = told["rounds"][1]["shared"], told["rounds"][1]["private"]
+    shared, private = report["rounds"][1]["shared"], report["rounds"][1]["private"]
     # one process more costs a copy, or no copy
-    more = told["one_more_bytes"]
+    more = report["one_more_bytes"]
     assert more["private"] > more["shared"] + private["map_bytes"] / 2
     # no process stopped when the daemon did, and it came back with all it had
-    outage = told["outage"]
+    outage = report["outage"]
     assert len(outage["counted"]) == 8
     assert min(outage["counted"]) > 0
     assert outage["poses"] >= 10
     assert outage["adopted"] == outage["segments"] >= shared["cells"]
     assert outage["down_s"] >= outage["poses"] * 0.1 / 2
     # the positions are those of the truth
-    found = told["localization"]
+    found = report["localization"]
     assert found["scans"] == found["trustworthy"] == 41
     assert 0.0 < found["error_m"] <= found["error_max_m"] < 0.1
-    assert 0.0 < found["first_pose_s"] < told["seconds"]
-    assert told["svg"] == str(tmp_path / "picture.svg")
-    picture = ElementTree.parse(told["svg"]).getroot()
+    assert 0.0 < found["first_pose_s"] < report["seconds"]
+    assert report["svg"] == str(tmp_path / "picture.svg")
+    picture = ElementTree.parse(report["svg"]).getroot()
     squares = [e.get("class") or "" for e in picture.iter("{http://www.w3.org/2000/svg}rect")]
     assert sum(square.startswith("cell") for square in squares) >= 320
     assert shared["cells"] <= sum(square == "cell resident" for square in squares)
@@ -103,7 +103,7 @@ def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, stage: str, number: 
 
 
 def test_a_killed_demo_leaves_no_process_and_no_memory(tmp_path: Path) -> None:
-    """Its directories stay where temporary files are, for nobody is left to remove them."""
+    """Its directories stay where temporary files are, for no process is left to remove them."""
     demo = Demo(tmp_path)
     until(demo, "Driving, 2 processes on the copy")
     demo.process.kill()

@@ -189,7 +189,7 @@ def test_sessions_come_and_go_without_a_trace(
 
 
 def test_poses_that_are_not_finite(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    """Refused, and nobody's cells are lost in the queue for it."""
+    """Refused, and no client's cells are lost in the queue for it."""
     client = connect(daemon(divided_map.root))
     nan, inf = float("nan"), float("inf")
     for intent in ([nan, 0.0], [0.0, inf], [0.0, 0.0, nan], [0.0, 0.0, 0.0, 0.0, inf, [[0.0, nan]]]):
@@ -400,7 +400,7 @@ def test_a_process_that_asks_too_much_at_once(
     serves(client)
 
 
-# --- a member of the group takes every lock there is on everything it can open: nobody else notices --
+# --- a member of the group takes every lock there is on everything it can open: others do not notice --
 
 
 _LOCKS = """
@@ -469,7 +469,7 @@ def test_locks_hold_nobody_up(daemon: DaemonFactory, connect: Connect, divided_m
         # of the statistics the daemon has a lock itself
         assert found["refused"] == ["lease", "open lock", "read lock of statistics", "write lock"]
         stats = client.ask("stats")
-        assert stats[6] == 36  # mapped by nobody known
+        assert stats[6] == 36  # mapped by unknown processes
         assert client.ask("show", "0_0.pcd")[9][0][6][0][:2] == [0, 0]
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (0, 36)

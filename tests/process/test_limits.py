@@ -99,9 +99,9 @@ def test_statistics_that_cannot_be_written_end_nobody(
     warm = [handle.segment for handle in client.area(circle(0, 0, 5)).cells]
     soft, hard = resource.prlimit(one.pid, resource.RLIMIT_FSIZE)
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (16384, hard))
-    told = 'statistics not written error="File too large"'
+    said = 'statistics not written error="File too large"'
     waiting = Deadline()
-    while waiting(told not in one.log):
+    while waiting(said not in one.log):
         os.sched_yield()
     asked = client.ask("stats")[4]["requests"]
     assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
@@ -109,7 +109,7 @@ def test_statistics_that_cannot_be_written_end_nobody(
     waiting = Deadline()
     while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
         os.sched_yield()
-    assert one.log.count(told) == 1
+    assert one.log.count(said) == 1
 
 
 def test_a_daemon_with_limited_files_says_so_at_its_start(daemon: Factory, divided_map: DividedMap) -> None:
@@ -250,7 +250,7 @@ print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 5
 
 
 def test_none_to_connect_again_with(one: DaemonProcess) -> None:
-    """The daemon is back, and this process may not open a socket: nobody blames the daemon."""
+    """The daemon is back, and this process may not open a socket: the error does not blame the daemon."""
     program = subprocess.Popen(
         [sys.executable, "-c", PROGRAM + """
 client = shmmap.connect(endpoint, timeout=1)
@@ -377,8 +377,8 @@ def run(program: str, *arguments: str) -> dict[str, Any]:
         capture_output=True, text=True, timeout=400, check=False, cwd=ROOT,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
-    told: dict[str, Any] = json.loads(done.stdout)
-    return told
+    said: dict[str, Any] = json.loads(done.stdout)
+    return said
 
 
 def test_three_thousand_cells_with_a_thousand_descriptors(
@@ -439,7 +439,7 @@ with shmmap.connect(sys.argv[1]) as client, shmmap.MapWindow(client, 30) as wind
 
 def test_a_client_loads_nothing_heavy_and_fits_40_megabytes(daemon: Factory, tmp_path: Path) -> None:
     one = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
-    told = run(COST, one.endpoint)
+    said = run(COST, one.endpoint)
     heavy = {"open3d", "numba", "scipy", "rich", "yaml", "xxhash", "lzf", "asyncio"}
-    assert not heavy & set(told["modules"])
-    assert told["megabytes"] < 40
+    assert not heavy & set(said["modules"])
+    assert said["megabytes"] < 40

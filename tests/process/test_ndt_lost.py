@@ -103,9 +103,9 @@ def test_without_a_map_every_result_says_so(drive: TownDrive, daemon: DaemonFact
     assert all(frame["no_map"] and frame["failed_limits"] == ["no_map"] for frame in frames)
     assert {frame["state"] for frame in frames} == {"lost"}
     assert (summary["no_map"], summary["trustworthy"]) == (len(KEPT), 0)
-    told = [line for line in said.splitlines() if "no map at scan" in line]
-    assert len(told) == 1, "once"
-    assert "the map spans x " in told[0]
-    assert "the pose is at (5000.000, 7.000)" in told[0]
+    warnings = [line for line in said.splitlines() if "no map at scan" in line]
+    assert len(warnings) == 1, "once"
+    assert "the map spans x " in warnings[0]
+    assert "the pose is at (5000.000, 7.000)" in warnings[0]
     code, _, _ = follow(one, drive, "--init", "5000,7,0,0,0,0", "--allow-empty")
     assert code == 0

@@ -194,7 +194,7 @@ class BootedSystemd:
         return (self._directory / "console").read_text(errors="replace")
 
     def spawn(self, *command: str, user: str = "") -> subprocess.Popen[str]:
-        """Start a command inside, as root or as somebody else with all groups of theirs."""
+        """Start a command inside, as root or as another account with all its groups."""
         become = ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"] if user else []
         return subprocess.Popen(
             [
@@ -230,7 +230,7 @@ class BootedSystemd:
         return self.run("sh", "-euc", script, check=check).stdout
 
     def properties(self, unit: str) -> dict[str, str]:
-        """What ``systemctl show`` tells about a unit."""
+        """What ``systemctl show`` prints about a unit."""
         lines = self.run("systemctl", "show", unit).stdout.splitlines()
         return dict(line.split("=", 1) for line in lines if "=" in line)
 

@@ -36,7 +36,7 @@ class ChunkMemory:
         return self.chunks[key]
 
     def grown(self, key: ChunkKey, bricks: int) -> ChunkView:
-        """The same chunk with room for so many bricks."""
+        """The same chunk with room for ``bricks`` bricks."""
         old = self.chunks[key].data
         data = bytearray(chunk_bytes(bricks))
         data[: len(old)] = old

@@ -52,10 +52,10 @@ def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
     address = ["--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir]
     done = run_verb(["doctor", "--json", *address, *words], {**environment, "PYTHONPATH": str(ROOT)})
     assert done.stdout, done.stderr
-    told = json.loads(done.stdout)
-    found = {finding["name"]: finding for finding in told["findings"]}
-    states = [finding["state"] for finding in told["findings"]]
-    assert told["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
+    report = json.loads(done.stdout)
+    found = {finding["name"]: finding for finding in report["findings"]}
+    states = [finding["state"] for finding in report["findings"]]
+    assert report["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
     return done.returncode, found
 
 

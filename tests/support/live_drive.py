@@ -61,7 +61,7 @@ def marked(scans: int = SCANS) -> list[Marks]:
 
 
 def record_in(shm: Path, name: str, nbytes: int) -> mmap.mmap:
-    """Something in shared memory that outlives whoever writes it, made of zeros if there is none."""
+    """Something in shared memory that outlives its writer, made of zeros if there is none."""
     fd = os.open(shm / name, os.O_RDWR | os.O_CREAT, 0o600)
     os.ftruncate(fd, nbytes)
     data = mmap.mmap(fd, nbytes)

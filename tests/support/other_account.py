@@ -57,7 +57,7 @@ def _read(live: LiveMap) -> list[int]:
 
 
 def main() -> None:
-    """Become somebody else, and try."""
+    """Become that account, and try."""
     uid, gid, groups, endpoint, action = sys.argv[1:6]
     with shmmap.connect(endpoint) as client:
         live = client.live("lidar")
