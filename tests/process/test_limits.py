@@ -81,7 +81,7 @@ def test_a_segment_that_the_limit_on_files_forbids(daemon: Factory, divided_map:
         assert failed.cell_id.endswith("/0_0.pcd")
         assert "RLIMIT_FSIZE is 1,048,576 bytes" in failed.message
         assert "ulimit -f" in failed.message
-        assert len(client.around(-30, -30, 5, wait=60)) == 4
+        assert len(client.around(-40, -40, 5, wait=60)) == 4
         for pid in (one.pid, *one.children()):
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         waiting = Deadline()

@@ -84,6 +84,12 @@ def all_pages() -> list[str]:
 _SERVE_S = 180.0  # a cloud is divided and kernels are compiled before a first daemon is ready
 
 
+def listens(port: int) -> bool:
+    """Whether a server of this machine takes connections at a port."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
 class Terminal:
     """A shell of a reader, which keeps directory and environment from one command to the next."""
 
@@ -128,10 +134,9 @@ class Terminal:
         )  # fmt: skip
         try:
             waiting = Deadline()
-            with socket.socket() as probe:
-                while waiting(probe.connect_ex(("127.0.0.1", port)) != 0):
-                    assert server.poll() is None, command
-                    time.sleep(0.01)
+            while waiting(not listens(port)):
+                assert server.poll() is None, command
+                time.sleep(0.01)
             yield
         finally:
             server.kill()
