@@ -58,8 +58,12 @@ def started(*lines: str) -> dict[str, tuple[object, str, str]]:
     environment = {key: value for key, value in os.environ.items() if key != "SHMMAP_TEST_DATA"}
     done = subprocess.run(
         [sys.executable, "-c", STARTS, *lines],
-        cwd=ROOT, env=environment, check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     ended: dict[str, tuple[object, str, str]] = json.loads(done.stdout)
     return ended
 
@@ -85,8 +89,11 @@ def test_without_data_they_say_how_to_make_some() -> None:
 def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--list"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     rows = [f"A{number}" for number in (*range(1, 10), 11, 12, 13, 16, 17, 21, 22)] + ["B3"]
     assert [line.split()[0] for line in done.stdout.splitlines()] == [*rows, "churn", "worst-five"]
 
@@ -95,8 +102,11 @@ def test_a_scene_that_is_over_no_limit_ends_well() -> None:
     """One of the quick ones, which time cannot fail: it shows that scenes can be played."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--scene", "A16"],
-        cwd=ROOT, check=False, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines()[-2].split() == ["A16", "-", "-", "-", "-", "-", "OK"]
 
@@ -114,8 +124,12 @@ def test_localization_is_measured_on_data_that_anyone_can_make(tmp_path: Path) -
     def run(*words: str) -> str:
         done = subprocess.run(
             [sys.executable, "-m", *words],
-            cwd=ROOT, env=environment, check=False, capture_output=True, text=True,
-        )  # fmt: skip
+            cwd=ROOT,
+            env=environment,
+            check=False,
+            capture_output=True,
+            text=True,
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 

@@ -44,8 +44,10 @@ def interpreter(name: str) -> Path | None:
     for candidate in [*on_path, *sorted(versions.glob(f"{name.removeprefix('python')}.*/bin/python3"))]:
         asked = subprocess.run(
             [candidate, "-c", "import ensurepip, sys; print(sys.executable)"],
-            check=False, capture_output=True, text=True,
-        )  # fmt: skip
+            check=False,
+            capture_output=True,
+            text=True,
+        )
         if asked.returncode == 0:  # pyenv puts programs on the path that start nothing
             return Path(asked.stdout.strip())
     return None
@@ -92,8 +94,11 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     repository = tmp_path_factory.mktemp("published") / "shmmap.git"
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
-    ).stdout  # fmt: skip
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (repository / name).parent.mkdir(parents=True, exist_ok=True)

@@ -96,10 +96,32 @@ def test_random_messages(daemon: DaemonFactory, connect: Connect, divided_map: D
     rng = random.Random(6)
     tags = ["area", "differential", "selected", "metadata", "release", "show", "hello", "stats", "x"]
     values: list[Any] = [
-        None, True, -1, 0, 2**63, 2**64 - 1, 0.5, float("nan"), float("inf"), "", "points", "0_0.pcd",
-        b"", bytes(8), bytes(9), [], ["points"], [["0_0.pcd", 5]], [["0_0.pcd", None, ["x"]]],
-        circle(0, 0, 5), ["circle", 1], ["box", 0, 0, 1e308, 1e308], {}, {"a": 1}, [[[[]]]],
-    ]  # fmt: skip
+        None,
+        True,
+        -1,
+        0,
+        2**63,
+        2**64 - 1,
+        0.5,
+        float("nan"),
+        float("inf"),
+        "",
+        "points",
+        "0_0.pcd",
+        b"",
+        bytes(8),
+        bytes(9),
+        [],
+        ["points"],
+        [["0_0.pcd", 5]],
+        [["0_0.pcd", None, ["x"]]],
+        circle(0, 0, 5),
+        ["circle", 1],
+        ["box", 0, 0, 1e308, 1e308],
+        {},
+        {"a": 1},
+        [[[[]]]],
+    ]
     for number in range(1, 1500):
         tag = rng.choice(tags)
         client.send_bytes(pack([tag, number, *(rng.choice(values) for _ in range(rng.randrange(7)))]))
@@ -441,13 +463,22 @@ def member_with_locks(one: DaemonProcess) -> Iterator[dict[str, Any]]:
     """Run the member; gives what it got."""
     process = subprocess.Popen(
         [
-            "setpriv", f"--reuid={MEMBER}", f"--regid={GROUP}", "--clear-groups", "--inh-caps=-all",
-            python_for_others(), "-I", "-c", _LOCKS, one.shm_dir, one.runtime_dir,
+            "setpriv",
+            f"--reuid={MEMBER}",
+            f"--regid={GROUP}",
+            "--clear-groups",
+            "--inh-caps=-all",
+            python_for_others(),
+            "-I",
+            "-c",
+            _LOCKS,
+            one.shm_dir,
+            one.runtime_dir,
         ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         cwd="/",
-    )  # fmt: skip
+    )
     try:
         assert process.stdout is not None
         yield json.loads(process.stdout.readline())

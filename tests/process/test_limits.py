@@ -38,8 +38,11 @@ def started_under(limit: int, value: int, arguments: list[str]) -> tuple[int, st
     done = subprocess.run(
         [sys.executable, "-m", "shmmap.daemon", *arguments],
         preexec_fn=lambda: resource.setrlimit(limit, (value, value)),
-        capture_output=True, text=True, check=False, env=without_settings(),
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        env=without_settings(),
+    )
     return done.returncode, done.stderr
 
 
@@ -175,8 +178,12 @@ def outcomes(code: str, one: DaemonProcess) -> list[str]:
     """Run a program that must end by itself and say nothing on stderr; returns its lines."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM + code, one.endpoint],
-        capture_output=True, text=True, timeout=120, check=False, cwd=ROOT,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        cwd=ROOT,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout.splitlines()
 
@@ -252,7 +259,11 @@ print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 5
 def test_none_to_connect_again_with(one: DaemonProcess) -> None:
     """The daemon is back, and this process may not open a socket: the error does not blame the daemon."""
     program = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM + """
+        [
+            sys.executable,
+            "-c",
+            PROGRAM
+            + """
 client = shmmap.connect(endpoint, timeout=1)
 print("connected", flush=True)
 while client.disconnected_since is None:
@@ -264,9 +275,14 @@ print(tried(lambda: client.around(0, 0, 50)), flush=True)
 free_files()
 client.close()
 print(tried(lambda: None if shmmap.connect(endpoint).around(0, 0, 50).complete else "no"), flush=True)
-""", one.endpoint],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
+""",
+            one.endpoint,
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
     assert program.stdout is not None
     assert program.stdout.readline() == "connected\n"
     one.stop()
@@ -374,8 +390,12 @@ sys.stdin.readline()
 def run(program: str, *arguments: str) -> dict[str, Any]:
     done = subprocess.run(
         [sys.executable, "-c", program, *arguments],
-        capture_output=True, text=True, timeout=400, check=False, cwd=ROOT,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+        cwd=ROOT,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     said: dict[str, Any] = json.loads(done.stdout)
     return said
@@ -390,8 +410,11 @@ def test_three_thousand_cells_with_a_thousand_descriptors(
     raw = connect(one)
     holder = subprocess.Popen(
         [sys.executable, "-c", MANY, one.endpoint],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
     assert holder.stdin is not None
     assert holder.stdout is not None
     try:

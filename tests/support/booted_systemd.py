@@ -153,17 +153,33 @@ class BootedSystemd:
             notify.bind(str(self.shared / "notify"))
             self._process = subprocess.Popen(
                 [
-                    "sh", "-c", enter, "sh", str(self._cgroup),
-                    "unshare", "--mount", "--pid", "--uts", "--ipc", "--net", "--cgroup", "--fork",
-                    "--kill-child", "--propagation", "private",
-                    "sh", str(script), str(self._directory), *needed_directories(),
+                    "sh",
+                    "-c",
+                    enter,
+                    "sh",
+                    str(self._cgroup),
+                    "unshare",
+                    "--mount",
+                    "--pid",
+                    "--uts",
+                    "--ipc",
+                    "--net",
+                    "--cgroup",
+                    "--fork",
+                    "--kill-child",
+                    "--propagation",
+                    "private",
+                    "sh",
+                    str(script),
+                    str(self._directory),
+                    *needed_directories(),
                 ],
                 env={"PATH": os.environ["PATH"], "SYSTEMD": systemd},
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
                 start_new_session=True,
-            )  # fmt: skip
+            )
             pidfd = os.pidfd_open(self._process.pid)
             try:
                 self._wait_until_booted(notify, pidfd)
@@ -198,8 +214,17 @@ class BootedSystemd:
         become = ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"] if user else []
         return subprocess.Popen(
             [
-                "nsenter", f"--target={self._init}", "--mount", "--pid", "--uts", "--ipc", "--net",
-                "--cgroup", "--", *become, *command,
+                "nsenter",
+                f"--target={self._init}",
+                "--mount",
+                "--pid",
+                "--uts",
+                "--ipc",
+                "--net",
+                "--cgroup",
+                "--",
+                *become,
+                *command,
             ],
             env={
                 "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
@@ -211,7 +236,7 @@ class BootedSystemd:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-        )  # fmt: skip
+        )
 
     def run(self, *command: str, user: str = "", check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run a command inside to its end."""

@@ -49,9 +49,16 @@ class ChunkMemory:
         for number, (key, hits) in enumerate(zip(marks.chunks, marks.hits.tolist(), strict=True)):
             part = slice(starts[number], starts[number + 1])
             self.writer.apply(
-                self.chunk(key), marks.words[part], marks.bits[part], hits, mapper=mapper, scan=scan,
-                now_ns=scan, grow=lambda bricks, key=key: self.grown(key, bricks), known_mappers=known,  # type: ignore[misc]
-            )  # fmt: skip
+                self.chunk(key),
+                marks.words[part],
+                marks.bits[part],
+                hits,
+                mapper=mapper,
+                scan=scan,
+                now_ns=scan,
+                grow=lambda bricks, key=key: self.grown(key, bricks),
+                known_mappers=known,  # type: ignore[misc]
+            )
 
     def voxels(self) -> dict[tuple[int, int, int], int]:
         """All known voxels; every chunk is consistent."""

@@ -264,8 +264,10 @@ class ControlLoop:
     ) -> None:
         self._process = subprocess.Popen(
             [*wrapper, program, endpoint, str(radius), str(wait)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
 
     def begin(self, steps: int, *, wait: float = 0.02, period: float = 0.01) -> None:
         """Have it begin ``rounds`` rounds."""

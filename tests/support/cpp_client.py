@@ -40,11 +40,19 @@ def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17", op
     program = folder / f"cpp_client.{compiler}.{standard}"
     subprocess.run(
         [
-            compiler, f"-std={standard}", optimize, "-g1", "-fsanitize=address,undefined",
-            "-fno-sanitize-recover=all", *FLAGS, str(SOURCE), "-o", str(program),
+            compiler,
+            f"-std={standard}",
+            optimize,
+            "-g1",
+            "-fsanitize=address,undefined",
+            "-fno-sanitize-recover=all",
+            *FLAGS,
+            str(SOURCE),
+            "-o",
+            str(program),
         ],
         check=True,
-    )  # fmt: skip
+    )
     return program
 
 
@@ -60,9 +68,12 @@ class CppProgram:
 
     def __init__(self, program: Path, environment: Mapping[str, str] = MappingProxyType({})) -> None:
         self.process = subprocess.Popen(
-            [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            [program],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1", **environment},
-        )  # fmt: skip
+        )
         self._dropped: list[int] = []
         self._cells: weakref.WeakValueDictionary[int, CppCell] = weakref.WeakValueDictionary()
 
@@ -288,10 +299,15 @@ class CppClient:
     """
 
     def __init__(
-        self, program: Path, endpoint: str, *, name: str = "cpp", timeout: float = 5.0,
+        self,
+        program: Path,
+        endpoint: str,
+        *,
+        name: str = "cpp",
+        timeout: float = 5.0,
         connect_timeout: float = 1.0,  # noqa: ARG002  it has one of its own
         environment: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.program = CppProgram(program, environment)
         try:
             ((_, session, epoch),) = self.program.call("connect", endpoint, name, timeout)
@@ -333,9 +349,13 @@ class CppClient:
         return self.area(circle, layers, wait)
 
     def differential(
-        self, area: Any, held: Iterable[CppCell | str | tuple[str, int]], layers: Any = "points",
-        wait: float | None = 5.0, by_name: bool = False,
-    ) -> CppCells:  # fmt: skip
+        self,
+        area: Any,
+        held: Iterable[CppCell | str | tuple[str, int]],
+        layers: Any = "points",
+        wait: float | None = 5.0,
+        by_name: bool = False,
+    ) -> CppCells:
         """As `shmmap.Client.differential`; what is held by cells are all that are used here."""
         some: Collection[CppCell | str | tuple[str, int]] = list(held)
         named = []
@@ -389,18 +409,35 @@ class CppWindow:
     """As `shmmap.MapWindow` without a thread."""
 
     def __init__(
-        self, program: Path, endpoint: str, radius: float = 150.0, *, layers: Any = "points",
-        shape: str = "circle", update_distance: float = 20.0, refresh_interval: float = 1.0,
-        retention: shmmap.Retention | None = None, z: tuple[float, float] | None = None, timeout: float = 5.0,
+        self,
+        program: Path,
+        endpoint: str,
+        radius: float = 150.0,
+        *,
+        layers: Any = "points",
+        shape: str = "circle",
+        update_distance: float = 20.0,
+        refresh_interval: float = 1.0,
+        retention: shmmap.Retention | None = None,
+        z: tuple[float, float] | None = None,
+        timeout: float = 5.0,
         name: str = "window",
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.client = CppClient(program, endpoint, name=name, timeout=timeout)
         self._program = self.client.program
         keep = retention if retention is not None else shmmap.Retention()
         self._program.call(
-            "window", radius, _texts(layers), shape, update_distance, refresh_interval,
-            keep.distance, keep.max_bytes, keep.max_age, *(z or ()),
-        )  # fmt: skip
+            "window",
+            radius,
+            _texts(layers),
+            shape,
+            update_distance,
+            refresh_interval,
+            keep.distance,
+            keep.max_bytes,
+            keep.max_age,
+            *(z or ()),
+        )
 
     def __enter__(self) -> CppWindow:
         return self
@@ -413,9 +450,16 @@ class CppWindow:
         self.client.close()
 
     def move_to(
-        self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0, heading: float | None = None,
-        route: Iterable[tuple[float, float]] = (), wait: float | None = None,
-    ) -> CppUpdate:  # fmt: skip
+        self,
+        x: float,
+        y: float,
+        *,
+        vx: float = 0.0,
+        vy: float = 0.0,
+        heading: float | None = None,
+        route: Iterable[tuple[float, float]] = (),
+        wait: float | None = None,
+    ) -> CppUpdate:
         """As `shmmap.MapWindow.move_to`."""
         path = [f"{route_x} {route_y}" for route_x, route_y in route]
         return CppUpdate(self._program, self._program.call("move", x, y, vx, vy, heading, wait, *path))

@@ -161,8 +161,10 @@ class HangingDirectory:
         self._path = os.fsencode(path)
         self._fd = os.open("/dev/fuse", os.O_RDWR | os.O_CLOEXEC)
         options = b"fd=%d,rootmode=40000,user_id=%d,group_id=%d,allow_other" % (
-            self._fd, os.geteuid(), os.getegid(),
-        )  # fmt: skip
+            self._fd,
+            os.geteuid(),
+            os.getegid(),
+        )
         if _libc.mount(b"hangs", self._path, b"fuse", 0, options):
             number = ctypes.get_errno()
             os.close(self._fd)

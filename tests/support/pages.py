@@ -130,8 +130,11 @@ class Terminal:
         """Run a web server from when it listens until the end of the block."""
         server = subprocess.Popen(
             ["bash", "-c", self._script(command).replace(command, f"exec {command}")],
-            cwd=self._cwd, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            cwd=self._cwd,
+            env=self._environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         try:
             waiting = Deadline()
             while waiting(not listens(port)):

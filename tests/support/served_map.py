@@ -46,9 +46,11 @@ class Served:
         self._files = 0
         self._folder = Folder(disk)
         self.live = LiveMap(
-            MapFiles(self._folder, SETTINGS), ChunkMemory(str(shm), live_prefix("test", "lidar")),
-            UndoRecord(record_in(shm, "undo", UNDO_BYTES)), Limits(budget_bytes, **limits),
-        )  # fmt: skip
+            MapFiles(self._folder, SETTINGS),
+            ChunkMemory(str(shm), live_prefix("test", "lidar")),
+            UndoRecord(record_in(shm, "undo", UNDO_BYTES)),
+            Limits(budget_bytes, **limits),
+        )
         lists = VoxelLists(self.live, str(shm), 0o600, -1)
         lists.remove_all()
         adopt(self.live, 0.0)

@@ -152,9 +152,11 @@ class Beside:
         report.note(f"daemon's private memory: idle {self._idle / mib:.1f} MiB, peak {self._peak / mib:.1f}")
         report.limit("over idle", grown, self._over_idle_mib, "MiB")
         report.figures.update(
-            p99=f"{np.percentile(probe.times_ms, 99):.1f}", probe=f"{longest:.0f}",
-            echo=f"{longest_echo:.0f}", memory=f"{grown:+.0f}",
-        )  # fmt: skip
+            p99=f"{np.percentile(probe.times_ms, 99):.1f}",
+            probe=f"{longest:.0f}",
+            echo=f"{longest_echo:.0f}",
+            memory=f"{grown:+.0f}",
+        )
         if self._newcomers_too:
             times, failures = self._newcomers.end()
             count = len(times) + failures.total()

@@ -151,8 +151,10 @@ def slow_layers(report: Report, stage: Stage) -> None:
         with Actor(asks_for_slow_layers, one.endpoint) as attacker:
             attacker.said()
             beside = cold_cell_s(client, [f"120_{y}.pcd" for y in range(-200, -100, 20)])
-        report.note(f"a cold cell took at most {alone:.3f} s alone; beside slow layers "
-                  + ", ".join(f"{took:.2f}" for took in beside))  # fmt: skip
+        report.note(
+            f"a cold cell took at most {alone:.3f} s alone; beside slow layers "
+            + ", ".join(f"{took:.2f}" for took in beside)
+        )
         report.limit("longest, over that alone", max(beside) - alone, 1.0, "s")
 
 

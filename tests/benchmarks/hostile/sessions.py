@@ -294,17 +294,22 @@ def boot(report: Report, stage: Stage) -> None:
             started = [
                 subprocess.Popen(
                     [sys.executable, "-c", _PROGRAM, one.endpoint],
-                    env=environment, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+                    env=environment,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                    cwd=ROOT,
                 )
                 for _ in range(PROGRAMS)
-            ]  # fmt: skip
+            ]
             said = [process.communicate()[1] for process in started]
             failed = [words for process, words in zip(started, said, strict=True) if process.returncode]
             took_s = time.monotonic() - begin_s
             processors = len(os.sched_getaffinity(0))
             report.limit(
                 f"start {number + 1}: of {PROGRAMS} programs on {processors} processors, {took_s:.1f} s,"
-                " could not connect", len(failed), 0,
-            )  # fmt: skip
+                " could not connect",
+                len(failed),
+                0,
+            )
             if failed:
                 report.note(f"one got: {failed[0].strip().splitlines()[-1][:160]}")
