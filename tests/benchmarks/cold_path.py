@@ -155,7 +155,7 @@ for line in sys.stdin:
 
 
 class Measuring:
-    """A program of one checkout that measures whenever it is told to."""
+    """A program of one checkout that measures on request."""
 
     def __init__(self, checkout: Path, program: str, *arguments: str) -> None:
         self._process = subprocess.Popen(

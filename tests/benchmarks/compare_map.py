@@ -4,7 +4,7 @@
 A vehicle drives through a generated town with moving cars and people, or, with ``--street``, along the
 street in SHMMAP_TEST_DATA.  A scan of 100 000 points is compared with the window around it, on one thread, by
 shmmap (``search`` layers out of shared memory) and by what a process does that keeps its own copy: a
-KD-tree (scipy's and Open3D's) over the window's points, built anew at each map update.  The voxel rule's
+KD-tree (scipy's and Open3D's) over the window's points, rebuilt at each map update.  The voxel rule's
 peer is a tree over the same centroids, by the largest difference along an axis.  All give the same
 answer, which is checked.  Times are CPU times of the process, medians; "a scan with its update" is the
 scan after the window has changed, and "per scan" has one update in ten scans (10 m at 10 m/s and 10 Hz).

@@ -3,7 +3,7 @@
 //
 //   control_loop ENDPOINT RADIUS PATIENCE
 //
-// Reads lines.  "go STEPS WAIT PERIOD": so many rounds of so many seconds each, 0.1 m along x in each; prints how long
+// Reads lines.  "go STEPS WAIT PERIOD": that many rounds of PERIOD seconds each, 0.1 m along x in each; prints how long
 // each `move_to` took, and after it a sleep of WAIT seconds alone (nanoseconds), how often each error came, how many
 // updates were current, and the cells that came and went.  "complete SECONDS": waits, and prints the cells.
 

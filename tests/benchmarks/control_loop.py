@@ -96,7 +96,7 @@ def main() -> None:
                 assert is_complete
                 assert held == {cell.id: cell.version for cell in cells}
                 assert loop.close() == 0
-        loop = ControlLoop(program, str(Path(scratch, "nobody.sock")), 40.0)
+        loop = ControlLoop(program, str(Path(scratch, "no-daemon.sock")), 40.0)
         report("there is none", loop.go(steps, wait=WAIT_S))
         loop.close()
 

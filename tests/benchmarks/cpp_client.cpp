@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the client in C++ costs, told a line at a time: see tests/benchmarks/cpp_client.py.
+// What the client in C++ costs, driven by lines: see tests/benchmarks/cpp_client.py.
 //
 //   connect ENDPOINT            hold MIN_X MIN_Y MAX_X MAX_Y     map these cells, and keep them; prints how many
-//   request COUNT VERSIONS      so many differential requests for the box, with these versions held: nanoseconds of
+//   request COUNT VERSIONS      that many differential requests for the box, with these versions held: nanoseconds of
 //                               each, and of those that passed outside of send, poll and recv
-//   attach                      let go, and map all anew: nanoseconds for each cell, from the answer's arrival on
+//   attach                      release, and map all again: nanoseconds for each cell, from the answer's arrival on
 //
 // send, poll and recv are this program's own, in front of the C library's: so their time is known.
 

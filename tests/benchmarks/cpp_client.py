@@ -8,7 +8,7 @@ handles.  Python sends bytes that are made already and decodes the answer, witho
 makes the message and cells.  Blocks of both alternate, to the same daemon.  "Own time" is what passes
 outside of send, poll and recv.
 
-Attaching: 256 cells that nobody maps, from the arrival of the answer on, a cell; Python as its client does
+Attaching: 256 unmapped cells, from the arrival of the answer on, a cell; Python as its client does
 it, with a column of each.
 
 Memory: eight processes that hold the same 100 MB.

@@ -52,7 +52,7 @@ def terrain(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def write_terrain(root: Path, side: int, points: int = CELL_POINTS, scatter: float = 0.0) -> None:
-    """Write ``side`` x ``side`` cells of so many points, off by ``scatter`` metres, as a divided map."""
+    """Write ``side`` x ``side`` cells of ``points`` points, off by ``scatter`` metres, as a divided map."""
     cells = root / "pointcloud_map.pcd"
     cells.mkdir(parents=True)
     rng = np.random.default_rng(1)

@@ -11,7 +11,7 @@
 Without options: the 99th percentile beside three hostile clients, over that beside three processes that only
 compute.  The limit is at most 3.
 
-A scene does to the daemon what somebody did to an earlier one.  Beside it another client asks for warm cells
+A scene does to the daemon what once held an earlier one up.  Beside it another client asks for warm cells
 every 5 ms, a third asks a bare ZeroMQ echo as often, and new clients come all the time.  Limits: the client's
 longest answer took at most 50 ms more than the echo's, the daemon's own memory grew by at most 100 MiB, and
 everybody got in.  Exit code 1 if a limit does not hold.

@@ -148,7 +148,7 @@ def main(argv: list[str] | None = None) -> int:
             work, longest_s, _ = scenes[name]
             try:
                 interrupter.during(work, longest_s)
-            except Busy:  # so many were interrupted
+            except Busy:  # too many were interrupted
                 pass
             except shmmap.ShmmapError as error:
                 refused[f"{name}: {error}"] += 1
@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> int:
         del opened, work
         scenes.clear()
         window = blocking = client = None
-        shmmap.connect(one.endpoint).close()  # ends what nobody could end
+        shmmap.connect(one.endpoint).close()  # ends what was left open
         left = settled(begun, one.shm_dir)
     print(f"{interrupter.count} interrupts; the slowest request after one {worst_s:.2f} s")
     print(f"swallowed where Python ignores exceptions: {sum(swallowed.values())} {dict(swallowed)}")

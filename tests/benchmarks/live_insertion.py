@@ -9,7 +9,7 @@ already in the map's frame; all three take turns scan by scan, each with a map o
 with each round.  Limit at 0.2 m, 30 m: 30 times as many points a second as OctoMap with the better of its two
 settings.  OctoMap's part needs g++ and liboctomap-dev, and is left out where they are missing.
 
-Memory is what the file system counts for all chunks, headers included, before and after somebody has read
+Memory is what the file system counts for all chunks, headers included, before and after a client has read
 every byte that can be mapped.  Limits, bytes for each known voxel: 4.0 at 0.2 m, 30 m; 3.0 at 0.05 m, 5 m.
 """
 

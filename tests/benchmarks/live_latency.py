@@ -74,7 +74,7 @@ def main() -> int:
     met = sorted(scans)[int(0.99 * len(scans))] <= LIMIT_S
     print(f"scan to applied                 {percentiles(scans)}   limit 30: {'met' if met else 'MISSED'}")
     print(f"the same, beside requests       {percentiles(both)}")
-    print(f"warm request, nobody maps       {percentiles(alone)}")
+    print(f"warm request, no mapper         {percentiles(alone)}")
     print(f"warm request, while one maps    {percentiles(beside)}")
     return 0 if met else 1
 

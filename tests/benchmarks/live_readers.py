@@ -186,7 +186,7 @@ class Greedy:
 
 
 def honest(endpoint: str, readers: int, pipe: Any) -> None:
-    """Look voxels of 512 chunks up, by so many clients in turn, and list some; say what was wrong."""
+    """Look voxels of 512 chunks up, by some clients in turn, and list some; say what was wrong."""
     maps = [shmmap.connect(endpoint).live(MAP) for _ in range(readers)]
     rng = np.random.default_rng(os.getpid())
     looks = refused = 0

@@ -154,7 +154,7 @@ def measure_requests(one: DaemonProcess, side: int, row: dict[str, float], *, wh
 
 
 def measure_reload(
-    one: DaemonProcess, side: int, changed: list[Path], told: Report, row: dict[str, float]
+    one: DaemonProcess, side: int, changed: list[Path], report: Report, row: dict[str, float]
 ) -> None:
     """Ten cells change, and the map is read again."""
     corners = np.random.default_rng(1).integers(0, side, (LOADED, 2)) * CELL_METRES
@@ -163,7 +163,7 @@ def measure_reload(
         for begin in range(0, LOADED, 500):
             client.selected(names[begin : begin + 500], wait=60.0)
     with (
-        Beside(told, one, newcomers_too=False, over_idle_mib=STATE_MIB) as beside,
+        Beside(report, one, newcomers_too=False, over_idle_mib=STATE_MIB) as beside,
         Actor(works, is_bystander=True) as worker,
     ):
         time.sleep(1.0)
@@ -171,23 +171,23 @@ def measure_reload(
             os.utime(path)
         with Actor(reloads, one.endpoint) as operator:
             took_s, failure = operator.said(FIRST_START_S)
-        told.must("the reload was answered", not failure, failure)
+        report.must("the reload was answered", not failure, failure)
         row["reload"] = took_s
         row["same work"] = worker.end()[1]
         row["turn in it"] = beside.turns.quantile_and_longest_ms(1.0)[1]
     events = read_statistics(one.instance, one.shm_dir)
-    told.must("there was one", events.counters["reloads"] == 1)
-    row["probe"], row["echo"] = float(told.figures["probe"]), float(told.figures["echo"])
+    report.must("there was one", events.counters["reloads"] == 1)
+    row["probe"], row["echo"] = float(report.figures["probe"]), float(report.figures["echo"])
     row["peak then"] = peak_bytes(one.pid) / 1e6
     row["daemon then"] = resident_bytes(one.pid) / 1e6
 
 
-def measure(side: int, stage: Stage, told: Report, *, whole: bool) -> dict[str, float]:
+def measure(side: int, stage: Stage, report: Report, *, whole: bool) -> dict[str, float]:
     """Everything about one map."""
     begin_s = time.perf_counter()
     root = stage.many_cells(side)
     changed = own_files(root, side)
-    told.tell(f"{side * side} cells; made in {time.perf_counter() - begin_s:.0f} s")
+    report.note(f"{side * side} cells; made in {time.perf_counter() - begin_s:.0f} s")
     row: dict[str, float] = {}
     one = DaemonProcess(root, "--budget", "1G")
     try:
@@ -195,17 +195,17 @@ def measure(side: int, stage: Stage, told: Report, *, whole: bool) -> dict[str, 
         turns = Turns(one)
         measure_requests(one, side, row, whole=whole)
         row["longest turn"] = turns.quantile_and_longest_ms(1.0)[1]
-        told.tell(f"turns of requests: {turns.said()}")
+        report.note(f"turns of requests: {turns.said()}")
         row["circle"] = run_measure(root, one.cache_dir / "shmmap", 2000)["circle_us"] / 1e3
-        measure_reload(one, side, changed, told, row)
+        measure_reload(one, side, changed, report, row)
         one.stop()
     finally:
         one.dispose()
     for name, most in LIMITS.items():
-        told.limit(name, row[name], most)
-    told.limit("longest turn of the reload", row["turn in it"], LONGEST_TURN_MS, "ms")
-    told.limit("longest turn of requests", row["longest turn"], LONGEST_TURN_MS, "ms")
-    told.limit("probe over echo", row["probe"] - row["echo"], OVER_ECHO_MS, "ms")
+        report.limit(name, row[name], most)
+    report.limit("longest turn of the reload", row["turn in it"], LONGEST_TURN_MS, "ms")
+    report.limit("longest turn of requests", row["longest turn"], LONGEST_TURN_MS, "ms")
+    report.limit("probe over echo", row["probe"] - row["echo"], OVER_ECHO_MS, "ms")
     return row
 
 
@@ -239,11 +239,11 @@ def main() -> int:
         stage = Stage(Path(scratch), arguments.maps or Path(scratch), lifted=arguments.lift)
         for cells in arguments.cells:
             side = round(cells**0.5)
-            told = Report(f"{cells:.0e}", "Very many cells are as good as few")
-            told.begin()
-            rows[side * side] = measure(side, stage, told, whole="whole" not in arguments.skip)
-            told.end()
-            over += told.over
+            report = Report(f"{cells:.0e}", "Very many cells are as good as few")
+            report.begin()
+            rows[side * side] = measure(side, stage, report, whole="whole" not in arguments.skip)
+            report.end()
+            over += report.over
     print("".join(f"{text:>18}" for text in ("", *map(str, rows))))
     for name, unit in UNITS.items():
         figures = (f"{row[name]:.3g} {unit}" if name in row else "-" for row in rows.values())

@@ -32,7 +32,7 @@ class Pair:
     T_guess
         (4, 4) pose to start from.
     T_truth
-        (4, 4) pose of the scan; None where nobody knows it.
+        (4, 4) pose of the scan; None where it is not known.
     """
 
     name: str

@@ -52,7 +52,7 @@ def main() -> None:
         f" {first['bytes'] / 1e6:.2f} MB; medians of {args.rounds} rounds (least)"
     )
 
-    def told(name: str) -> str:
+    def spread(name: str) -> str:
         times = [row[name] for row in rows]
         return f"{statistics.median(times):.2f} ms ({min(times):.2f})"
 
@@ -62,12 +62,12 @@ def main() -> None:
     took = statistics.median(row["ours_ms"] for row in rows)
     holds = took <= LIMIT_MS
     print(
-        f"leaves of the layer: {told('ours_ms')}; PCL's voxel grid: {told('pcl_ms')};"
+        f"leaves of the layer: {spread('ours_ms')}; PCL's voxel grid: {spread('pcl_ms')};"
         f" ratio {ratio('ours_ms', 'pcl_ms'):.4f}; limit {LIMIT_MS} ms: {'holds' if holds else 'EXCEEDED'}"
     )
     print(
-        f"a request for all leaves: {told('leaves_ms')}; for all points: {told('points_ms')};"
-        f" PCL reads the files: {told('files_ms')}; ratio {ratio('points_ms', 'files_ms'):.2f}"
+        f"a request for all leaves: {spread('leaves_ms')}; for all points: {spread('points_ms')};"
+        f" PCL reads the files: {spread('files_ms')}; ratio {ratio('points_ms', 'files_ms'):.2f}"
     )
     if not holds:
         sys.exit(1)

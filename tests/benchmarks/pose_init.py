@@ -4,7 +4,7 @@
     SHMMAP_TEST_DATA=DIR python -m tests.benchmarks.pose_init [--poses 50] [--copies 4]
 
 The street's map is laid out several times, to about 250 MB, the size with which Autoware took 6 to 7 s for
-every initialization (it reads cells anew each time).  Rough poses: true ones of scans, disturbed by 2 m and
+every initialization (it reads cells again each time).  Rough poses: true ones of scans, disturbed by 2 m and
 10 degrees (one standard deviation).  Limits: at least 95% within 0.3 m and 1 degree; the second and later
 ones at the same place under 0.5 s, no file opened and no cell loaded.
 """

@@ -7,7 +7,7 @@ A partial reply of 1 MB, and one of 38 MB, over CycloneDDS on the loopback inter
 process that answers each request of the same service type with bytes that it has ready, as many as are in
 the bridge's reply. The client of both does not look into the replies. Rounds of both alternate in one run;
 compare the ratios. Then the same cells as handles, by the Python client of shmmap, which attaches them each
-time. With ``--clients`` so many participants come, ask once and leave: what the bridge has more afterwards.
+time. With ``--clients`` that many participants come, ask once and leave: what the bridge has more afterwards.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from shmmap_clients.ros_bridge.participant import open_participant
 from shmmap_clients.ros_bridge.service_server import ServiceServer
 
 def of_size(size):
-    "A reply of one cell with so many bytes, about."
+    "A reply of one cell with about this many bytes."
     writer = CdrWriter()
     writer.uint64(0, 0)
     writer.int32(0, 0)

@@ -8,7 +8,7 @@ A daemon with eight loaders serves a map of cells of 20 m.  Each file takes a lo
 some seconds.  A vehicle drives at 12 m/s round a square of 2.4 km and asks for a circle of 200 m every 20 m;
 it starts when its first circle is in memory.  Beside it a client asks for single cells far away from it,
 which are cold, and for warm ones.  Three daemons, one after the other: one that fetches nothing ahead, one
-that is told the vehicle's poses, one that is told its route, too.
+that has the vehicle's poses, one that has its route, too.
 
 With ``--bucket`` the map is published to an S3 server (moto), which the daemon reaches over a link on which
 each answer takes such a time (another one each time), and nothing passes while it is out

@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Where a vehicle is at which time, and the way that it was told to take.
+    """Where a vehicle is at which time, and the path of its route.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ def recorded_drive(file: Path) -> Drive:
         places, times = rows[:, [11, 3]] * (1.0, -1.0), np.arange(len(rows)) * KITTI_S
     else:
         places, times = rows[:, 1:3], rows[:, 0] - rows[0, 0]
-    # the way told is smoother than what was driven
+    # the route is smoother than what was driven
     smooth = np.column_stack([np.convolve(column, np.ones(21) / 21, mode="valid") for column in places.T])
     route = np.concatenate([places[:1], smooth, places[-1:]])
     return Drive(file.stem, times.astype(np.float64), np.ascontiguousarray(places), _told(route))

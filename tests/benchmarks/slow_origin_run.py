@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One drive beside a slow origin, in simulated time: which cells are late, and what was fetched for that.
 
-Demands first, nearest first; a cell is loaded once, whoever wants it; one loader is kept free of what
-nobody has asked for.  Memory holds so many cells, and what was not asked for yet takes half of it at most;
-what gives way is chosen by the daemon's own scores.  A load that failed is tried again as
+Demands first, nearest first; a cell is loaded once, however many want it; one loader is kept free of what
+no client has asked for.  Memory is limited, and what was not asked for yet takes half of it at most;
+what is evicted is chosen by the daemon's own scores.  A load that failed is tried again as
 `shmmap.daemon.loading.loads` does it.
 """
 
@@ -30,15 +30,15 @@ from tests.benchmarks.slow_origin_model import Counts, Query, SlowOrigin
 __all__ = ["ROWS", "Setting", "simulate"]
 
 ROWS = ("none", "margin", "no route", "trajectory", "route", "oracle")
-"""What is fetched ahead: nothing; 60 m more; along the motion learnt from poses; along 150 m of way, told
+"""What is fetched ahead: nothing; 60 m more; along the motion learnt from poses; along 150 m of path, sent
 again each second; along the whole way; what will be asked for."""
-TELL_S = 1.0
-"""A window tells its pose, and asks again for what it lacks, so often."""
+POSE_PERIOD_S = 1.0
+"""How often a window sends its pose, and asks again for what it lacks."""
 TRAJECTORY_M = 150.0
 FULL_S = 1.0
 """So long nothing is fetched ahead after there was no room for it."""
-GIVE_WAY = 32
-"""Cells that give way at a time."""
+EVICTED_AT_A_TIME = 32
+"""Cells that are evicted at a time."""
 LONGEST_WARM_UP_S = 120.0
 WARM_UP_S = 30.0
 """Of rows that look no way ahead."""
@@ -123,8 +123,8 @@ class _Simulation:
 
     # --- the vehicle ------------------------------------------------------------------------------
 
-    def tell(self) -> tuple[float, float]:
-        """The client tells where it is."""
+    def send_pose(self) -> tuple[float, float]:
+        """Send where the client is."""
         x, y = self.drive.at(self.now_s)
         route: tuple[tuple[float, float], ...] = ()
         if self.setting.row in ("route", "oracle"):
@@ -140,7 +140,7 @@ class _Simulation:
 
     def ask(self) -> None:
         """The client asks for its area."""
-        x, y = self.tell()
+        x, y = self.send_pose()
         area, before = self._area(x, y), self.inside
         self.inside = self.catalogue.query(area)[0]
         self.foresight.asks(area)
@@ -154,7 +154,7 @@ class _Simulation:
         self.used[hit] = True
         inside = set(self.inside.tolist())
         for query in self.open:
-            query.lacking &= inside  # nobody waits for what was passed
+            query.lacking &= inside  # no query waits for what was passed
         self.close()
         counts = self.counts
         query = Query(self.now_s, x, y, len(new), late, lacking, 0.0, counts.fetched, counts.used)
@@ -249,14 +249,14 @@ class _Simulation:
             self.ask_again()
 
     def make_room(self, needed_in_s: float) -> bool:
-        """Have what is needed last give way; False if all is needed sooner than this."""
+        """Evict what is needed last; False if all is needed sooner than this."""
         if self.in_memory + len(self.running) < self.setting.memory_cells:
             return True
         places = places_of(self.motion, self.setting.radius_m)
         there = np.flatnonzero(self.present)
         there = np.setdiff1d(there, self.inside, assume_unique=True)
         until_s = until_needed(self.boxes[there], places, self.now_s)
-        last = np.argsort(until_s)[-GIVE_WAY:]
+        last = np.argsort(until_s)[-EVICTED_AT_A_TIME:]
         victims = there[last[until_s[last] > needed_in_s]]
         self.present[victims] = False
         self.unused -= int(np.count_nonzero(~self.used[victims]))
@@ -280,8 +280,8 @@ class _Simulation:
                 ask_at += 1
                 self.ask()
             elif self.now_s == tell_s:
-                tell_s += TELL_S
-                self.tell()
+                tell_s += POSE_PERIOD_S
+                self.send_pose()
                 self.ask_again()
             self.pump()
         self.now_s = self.drive.length_s

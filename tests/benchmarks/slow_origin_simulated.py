@@ -8,14 +8,14 @@ log-normal time, and fail in outages.  One row for each way of fetching ahead:
 
 none        what is asked for is loaded, and nothing else
 margin      60 m more, after all that is asked for
-no route    the daemon's policy; the vehicle tells nothing but where it is
-trajectory  the same; it tells its next 150 m, again each second
-route       the same; it tells its whole way
+no route    the daemon's policy; the vehicle sends its position only
+trajectory  the same; it sends its next 150 m each second
+route       the same; it sends its whole route
 oracle      what will be asked for, known beforehand, as far ahead as the policy looks
 
 "warm" is the share of queries that lack nothing, "late" the number of cells that were not there when they
 were first asked for, "stall" how long a query waits for its last cell, "fetched" the cells loaded for each
-one that was asked for before it gave way.  Counted from when the way ahead is in memory for the first time
+one that was asked for before it was evicted.  Counted from when the way ahead is in memory for the first time
 (the first two rows: from 30 s on).
 
 Checked: with the route no cell is late, and at most 1.05 are fetched for one; without, at 400 ms and no
@@ -72,7 +72,7 @@ _held = _Held([], [])
 
 
 def setting_of(case: Case) -> Setting:
-    """Return what is told and how much memory there is; what is to be bridged is the outage's length."""
+    """Return the row and how much memory there is; the outage to bridge has the outage's length."""
     outage_tolerance_s = OUTAGES[case.outages].length_s or 10.0
     return Setting(
         case.row, outage_tolerance_s=outage_tolerance_s, memory_cells=MEMORY_CELLS[outage_tolerance_s]
@@ -141,9 +141,9 @@ def main() -> int:
     began_s, missed = time.monotonic(), 0
     with multiprocessing.get_context("fork").Pool(os.cpu_count()) as pool:
         for case, counts in zip(cases, pool.imap(counts_of, cases), strict=True):
-            told = line(case, counts)
-            missed += told.endswith("MISSED")
-            print(told, flush=True)
+            printed = line(case, counts)
+            missed += printed.endswith("MISSED")
+            print(printed, flush=True)
     print(f"{len(cases)} drives in {time.monotonic() - began_s:.0f} s; limits missed: {missed}")
     return 1 if missed else 0
 

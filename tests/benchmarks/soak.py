@@ -175,7 +175,7 @@ class Soak:
             client.reload()
 
     def evict(self) -> None:
-        """Everything that nobody maps goes."""
+        """Everything that no process maps goes."""
         with shmmap.connect(self.one.endpoint, timeout=60.0, connect_timeout=60.0) as client:
             client.evict()
 
@@ -208,7 +208,7 @@ class Soak:
                 operator.evict()  # more than once: loads that the dead asked for go on
                 time.sleep(0.02)
         if self.one.segments():
-            self.problems.append(f"{len(self.one.segments())} segments are left that nobody maps")
+            self.problems.append(f"{len(self.one.segments())} segments are left that no process maps")
 
     def judge(self) -> dict[str, list[float]]:
         """Medians after the warm-up and at the end; what grew becomes a problem."""

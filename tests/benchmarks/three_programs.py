@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """NDT matcher, compare filter and elevation map as separate processes on one daemon, over a drive.
 
-The drive's scans are taken tile after tile on copies of the street side by side, for so many minutes:
+The drive's scans are taken tile after tile on copies of the street side by side, for some minutes:
 windows move, jump from tile to tile, and cells come and go in a budget that holds a small part of the
 map.  Printed are each program's times and own memory, how much of that grew in the last third, shared
 memory, and what was lost or left.  A machine of two cores shows mostly how they share them.

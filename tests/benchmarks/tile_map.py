@@ -4,7 +4,7 @@
     python -m tests.benchmarks.tile_map IN.pcd OUT [--copies 10] [--pitch 220] [--cell 20]
 
 The real street map (59 cells of 20 m within 220 m x 220 m) tiled 10 x 10 makes 5 900 cells and 4.8 GB.
-The shapes are real, the town is not: nobody drives through ten copies of the same street.
+The shapes are real, the town is not: no drive leads through ten copies of the same street.
 """
 
 from __future__ import annotations

@@ -214,7 +214,7 @@ def python(checkout: Path) -> str:
 
 
 class Measuring:
-    """A process of one checkout that measures whenever it is told to."""
+    """A process of one checkout that measures on request."""
 
     def __init__(self, checkout: Path, program: str, *arguments: str) -> None:
         self._process = subprocess.Popen(

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warm requests while cells load and while others give way, in a full cache, and with very many segments.
+"""Warm requests while cells load and while others are evicted, in a full cache, and with very many segments.
 
     python -m tests.benchmarks.warm_under_load [--passes 6] [--rounds 40] [--many 100000]
 
 The request is the packed one of `tests.benchmarks.warm_request`.  This client has one processor and all
 servers have another, as with ``--pin`` there; loaders go where there is room.
 
-- While 60 cells of 1 MB load for another process, and while cells load for which others have to give way:
+- While 60 cells of 1 MB load for another process, and while cells load for which others have to be evicted:
   round trips to the daemon and to a bare ZeroMQ echo in turn, so that both meet the same loads.  Printed are
   the 99th percentiles and how many took longer than 1 ms, a pass.  Limit: twice the echo's, no more stalls.
 - Cache: in a daemon whose budget is full, against one that has room, in alternating rounds.  Limit: 1.1.
@@ -76,7 +76,7 @@ class Other:
         return self._pipe.poll()
 
     def answer(self) -> Any:
-        """The reply; of cells, which it lets go, their number."""
+        """The reply; of cells, which it releases, their number."""
         return self._pipe.recv()
 
     def ask(self, tag: str, *elements: Any) -> Any:
@@ -110,7 +110,7 @@ class Meanwhile:
         )
 
     def until(self, other: Other, *, noted: bool = True) -> None:
-        """Until somebody has an answer; the loads that it waits for are under way."""
+        """Until a client has an answer; the loads that it waits for are under way."""
         while not other.answered():
             socket, request, times = next(self._in_turn)
             start = time.perf_counter()
@@ -119,7 +119,7 @@ class Meanwhile:
             if noted:
                 times.append((time.perf_counter() - start) * 1e6)
 
-    def told(self, what: str, passes: int) -> None:
+    def print_times(self, what: str, passes: int) -> None:
         """Print it."""
         ours, echo = (float(np.percentile(times, 99)) for times in self.times)
         stalls, echoed = (sum(one > STALL_US for one in times) / passes for times in self.times)
@@ -133,7 +133,7 @@ class Meanwhile:
 def while_loading(
     one: DaemonProcess, other: Other, meanwhile: Meanwhile, heavy: list[str], passes: int
 ) -> None:
-    """Time requests while cold cells are being loaded for somebody else."""
+    """Time requests while cold cells are being loaded for another client."""
     for number in range(passes + 1):
         other.send("selected", heavy, ["points"], 60.0)
         meanwhile.until(other, noted=number > 0)  # the first pass also starts the loaders
@@ -144,7 +144,7 @@ def while_loading(
 
 
 def while_others_give_way(other: Other, meanwhile: Meanwhile, cells: Iterator[str], passes: int) -> int:
-    """Time requests while cells are loaded for which others have to give way; returns how many gave way."""
+    """Time requests while cells are loaded for which others have to be evicted; returns their number."""
     before = other.ask("stats")[4]["evictions"]
     for _ in range(passes):
         for _ in range(LOADED // 10):
@@ -203,11 +203,11 @@ def main() -> None:
         pin(os.getpid(), {mine})
         meanwhile = Meanwhile(of_roomy, echo)
         while_loading(roomy, others_of_roomy, meanwhile, heavy, arguments.passes)
-        meanwhile.told(f"while {LOADED} cells of 1 MB load", arguments.passes)
+        meanwhile.print_times(f"while {LOADED} cells of 1 MB load", arguments.passes)
         meanwhile = Meanwhile(of_full, echo)
         cells = itertools.cycle(others)
         evicted = while_others_give_way(others_of_full, meanwhile, cells, 2 * arguments.passes)
-        meanwhile.told(f"while {evicted} cells give way to others", 2 * arguments.passes)
+        meanwhile.print_times(f"while {evicted} cells are evicted for others", 2 * arguments.passes)
         compared("a full cache against one with room", of_roomy, of_full, arguments.rounds)
 
         side = int(arguments.many**0.5) + 1

@@ -3,7 +3,7 @@
 
 A loop calls ``move_to`` and ``points_around`` at a fixed rate; every so often the pose jumps, so that a
 whole window of cells is replaced.  Compared are the loop's own times while nothing is asked
-("still") and while cells are attached and unmapped ("swap"), in the same run; and, to tell what part the
+("still") and while cells are attached and unmapped ("swap"), in the same run; and, to see what part the
 interpreter and the machine have in it, while another thread merely computes ("busy").
 
     python -m tests.benchmarks.window_swap [--seconds 8] [--cells 256] [--points 2000] [--rate 1000]
@@ -104,9 +104,9 @@ def main() -> None:
     print(f"{swapped} cells replaced by a jump; times of one turn of the loop")
     p99_still = summary(still)["p99"]
     for name, times in (("still", still), ("swap", swap), ("busy", busy)):
-        told = summary(times)
-        numbers = "".join(f"  {key} {value:8.1f} us" for key, value in told.items() if key != "turns")
-        print(f"{name:5}{len(times):7} turns{numbers}   p99 is {told['p99'] / p99_still:.2f} x still")
+        figures = summary(times)
+        numbers = "".join(f"  {key} {value:8.1f} us" for key, value in figures.items() if key != "turns")
+        print(f"{name:5}{len(times):7} turns{numbers}   p99 is {figures['p99'] / p99_still:.2f} x still")
 
 
 if __name__ == "__main__":

@@ -135,7 +135,7 @@ def test_requests_that_make_no_sense_cost_nothing_else(
     one = daemon(divided_map.root)
     with CppClient(cpp_program, one.endpoint) as client:
         with pytest.raises(shmmap.BadRequest):
-            client.program.told("area", "circle 0 0 -1", "points", 1.0)
+            client.program.call("area", "circle 0 0 -1", "points", 1.0)
         with pytest.raises(shmmap.BadRequest):
             client.around(0, 0, 10, "no such layer")
         with pytest.raises(shmmap.errors.NoColumn, match=r"no column no such .there are: xyz, intensity"):

@@ -44,7 +44,7 @@ def test_a_stopped_daemon_costs_no_call_anything(
 ) -> None:
     """Not an error either, before `patience` is over; what was asked meanwhile is answered afterwards."""
     one = daemon(divided_map.root)
-    loop = ControlLoop(loop_program, one.endpoint, RADIUS, patience=LONG_S)
+    loop = ControlLoop(loop_program, one.endpoint, RADIUS, wait=LONG_S)
     loop.go(1)
     is_whole(loop, one)
     one.send(signal.SIGSTOP)
@@ -60,7 +60,7 @@ def test_a_silent_daemon_is_an_error_in_the_end(
     daemon: DaemonFactory, divided_map: DividedMap, loop_program: Path
 ) -> None:
     one = daemon(divided_map.root)
-    loop = ControlLoop(loop_program, one.endpoint, RADIUS, patience=0.2)
+    loop = ControlLoop(loop_program, one.endpoint, RADIUS, wait=0.2)
     loop.go(1)
     is_whole(loop, one)
     one.send(signal.SIGSTOP)
@@ -128,7 +128,7 @@ def test_no_call_of_the_kernel_may_wait_longer(
     calls = tmp_path / "calls"
     waiting = "poll,ppoll,select,pselect6,epoll_wait,nanosleep,clock_nanosleep,futex,flock,fcntl"
     loop = ControlLoop(
-        loop_program, one.endpoint, RADIUS, patience=0.5, wrapper=["strace", "-o", str(calls), "-e", waiting]
+        loop_program, one.endpoint, RADIUS, wait=0.5, wrapper=["strace", "-o", str(calls), "-e", waiting]
     )
     loop.go(20)
     again = trouble(one)

@@ -50,7 +50,7 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
             seen = read_statistics(one.instance, one.shm_dir)
         one.send(signal.SIGSTOP)
         os.waitid(os.P_PID, one.pid, os.WSTOPPED)
-        answer = program.told("statistics", one.instance, one.shm_dir)
+        answer = program.call("statistics", one.instance, one.shm_dir)
         python = read_statistics(one.instance, one.shm_dir)
         one.send(signal.SIGCONT)
     assert rows(answer, "state") == [["stopped"]] == [[python.state]]
@@ -92,7 +92,7 @@ def test_how_the_daemon_is(daemon: DaemonFactory, program: CppProgram, divided_m
     one = daemon(divided_map.root)
 
     def state() -> str:
-        ((found,),) = rows(program.told("statistics", one.instance, one.shm_dir), "state")
+        ((found,),) = rows(program.call("statistics", one.instance, one.shm_dir), "state")
         return found
 
     assert state() == "healthy"

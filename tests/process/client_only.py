@@ -66,14 +66,14 @@ def check(python: str, *, separate_install: bool = True) -> None:
             wanted[source.id(name)] = hashlib.sha256(
                 xyz.tobytes() + columns["intensity"].tobytes()
             ).hexdigest()
-    told = json.loads(done.stdout)
-    if told["digests"] != wanted or not wanted:
-        raise SystemExit(f"the client saw other points than the files have: {told['digests']} {wanted}")
-    if separate_install and DAEMON_ONLY & set(told["packages"]):
-        raise SystemExit(f"this is no client-only install: {told['packages']}")
+    seen = json.loads(done.stdout)
+    if seen["digests"] != wanted or not wanted:
+        raise SystemExit(f"the client saw other points than the files have: {seen['digests']} {wanted}")
+    if separate_install and DAEMON_ONLY & set(seen["packages"]):
+        raise SystemExit(f"this is no client-only install: {seen['packages']}")
     if code != 0:
         raise SystemExit(f"the daemon ended with {code}")
-    print(f"{len(wanted)} cells seen by {told['where']} with {', '.join(told['packages'])}")
+    print(f"{len(wanted)} cells seen by {seen['where']} with {', '.join(seen['packages'])}")
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
 
 @pytest.fixture
 def private_tmpfs(tmp_path: Path) -> Iterator[Callable[[str], str]]:
-    """Mount tmpfs file systems of their own, ``private_tmpfs("16m")``: nobody else fills them."""
+    """Mount tmpfs file systems of their own, ``private_tmpfs("16m")``: no other program fills them."""
     mounted: list[str] = []
 
     def mount(size: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other user accounts: the group may read, nobody but the daemon may change anything."""
+"""Other user accounts: the group may read, only the daemon may change anything."""
 
 from __future__ import annotations
 

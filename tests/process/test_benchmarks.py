@@ -58,16 +58,20 @@ def started(*lines: str) -> dict[str, tuple[object, str, str]]:
     environment = {key: value for key, value in os.environ.items() if key != "SHMMAP_TEST_DATA"}
     done = subprocess.run(
         [sys.executable, "-c", STARTS, *lines],
-        cwd=ROOT, env=environment, check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    told: dict[str, tuple[object, str, str]] = json.loads(done.stdout)
-    return told
+        cwd=ROOT,
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    ended: dict[str, tuple[object, str, str]] = json.loads(done.stdout)
+    return ended
 
 
 def test_every_one_starts() -> None:
-    told = started(*(f"{name} --help" for name in MODULES))
-    assert {name: one for name, one in told.items() if not one[1].startswith("usage: ") or one[0]} == {}
-    assert sorted(told) == MODULES
+    ended = started(*(f"{name} --help" for name in MODULES))
+    assert {name: one for name, one in ended.items() if not one[1].startswith("usage: ") or one[0]} == {}
+    assert sorted(ended) == MODULES
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -76,17 +80,20 @@ def test_its_docstring_says_how_to_run_it(name: str) -> None:
 
 
 def test_without_data_they_say_how_to_make_some() -> None:
-    told = started(*NEED_DATA)
+    ended = started(*NEED_DATA)
     hint = "hint: python -m tests.benchmarks.make_data"  # a message instead of a code is exit 1
-    assert {name: one for name, one in told.items() if hint not in str(one[0])} == {}
-    assert sorted(told) == NEED_DATA
+    assert {name: one for name, one in ended.items() if hint not in str(one[0])} == {}
+    assert sorted(ended) == NEED_DATA
 
 
 def test_every_row_of_what_once_held_others_up_has_a_scene() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--list"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     rows = [f"A{number}" for number in (*range(1, 10), 11, 12, 13, 16, 17, 21, 22)] + ["B3"]
     assert [line.split()[0] for line in done.stdout.splitlines()] == [*rows, "churn", "worst-five"]
 
@@ -95,8 +102,11 @@ def test_a_scene_that_is_over_no_limit_ends_well() -> None:
     """One of the quick ones, which time cannot fail: it shows that scenes can be played."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.benchmarks.hostile_p99", "--scene", "A16"],
-        cwd=ROOT, check=False, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.splitlines()[-2].split() == ["A16", "-", "-", "-", "-", "-", "OK"]
 
@@ -114,14 +124,18 @@ def test_localization_is_measured_on_data_that_anyone_can_make(tmp_path: Path) -
     def run(*words: str) -> str:
         done = subprocess.run(
             [sys.executable, "-m", *words],
-            cwd=ROOT, env=environment, check=False, capture_output=True, text=True,
-        )  # fmt: skip
+            cwd=ROOT,
+            env=environment,
+            check=False,
+            capture_output=True,
+            text=True,
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     run("tests.benchmarks.make_data", str(tmp_path / "data"), "--density", "20")
-    told = run("tests.benchmarks.ndt_accuracy", "--seeds", "1", "--disturbance", "planar")
-    shares = dict(re.findall(r"^(.+?) +(\d+\.\d+)% within", told, re.MULTILINE))
+    ended = run("tests.benchmarks.ndt_accuracy", "--seeds", "1", "--disturbance", "planar")
+    shares = dict(re.findall(r"^(.+?) +(\d+\.\d+)% within", ended, re.MULTILINE))
     assert len(shares) == 9
     assert shares["simulated scans, 0.5 m, 6000 points, planar, fine"] == "100.00"
     assert shares["generated city, 1500 points, planar, fine"] == "100.00"

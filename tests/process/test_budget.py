@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The byte budget: never exceeded, judged from outside; who fills it is named; nobody starves."""
+"""The byte budget: never exceeded, judged from outside; who fills it is named; no client starves."""
 
 from __future__ import annotations
 
@@ -129,13 +129,13 @@ def test_a_full_budget_names_who_fills_it(
         assert (mine[1], mine[2], mine[3]) == (os.getpid(), os.getuid(), "the holder")
         assert mine[4] >= 10 * 4200 * 16
         assert mine[5] == 10
-        assert by_session[0][1] == 0  # a mapping that told nobody whose it is
+        assert by_session[0][1] == 0  # a mapping without a known owner
         assert by_session[0][5] == 2
         assert stranger.checksums()
         holder.drop_all()
     done: set[str] = set()
     waiting = Deadline()
-    while waiting(len(done) < 12):  # once others let go it goes on, a few at a time as the budget allows
+    while waiting(len(done) < 12):  # once others release it goes on, a few at a time as the budget allows
         reply = other.selected([i for i in ids[20:40] if i not in done][:8], wait=10.0)
         done |= {h.id for h in reply.cells}
     assert one.segment_bytes() <= budget
@@ -238,7 +238,7 @@ def test_a_file_system_smaller_than_the_budget(
 def test_a_full_file_system_is_reported_and_survived(
     daemon: DaemonFactory, connect: Connect, heavy_map: DividedMap, private_tmpfs: Callable[[str], str]
 ) -> None:
-    """Somebody else fills the tmpfs: no SIGBUS anywhere, what is there stays good, later it goes on."""
+    """Another program fills the tmpfs: no SIGBUS anywhere, what is there stays good, later it goes on."""
     directory = private_tmpfs("8m")
     one = daemon(heavy_map.root, "--budget", "6M", shm_dir=directory)
     holder = Holder(connect(one))

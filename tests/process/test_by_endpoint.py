@@ -41,8 +41,8 @@ def check_found(one: DaemonProcess, *options: str, **variables: str) -> None:
         assert done.returncode == 0 or words[0] == "doctor", (words, done.stderr)
         if words[0] == "doctor":
             assert "rm " not in done.stdout
-            (told,) = [one for one in json.loads(done.stdout)["findings"] if one["name"] == "daemon"]
-            assert told["state"] == "ok", told
+            (finding,) = [one for one in json.loads(done.stdout)["findings"] if one["name"] == "daemon"]
+            assert finding["state"] == "ok", finding
         elif words[0] == "metrics":
             assert re.search(r"^shmmap_up(\{.*\})? 1$", done.stdout, re.MULTILINE), done.stdout
 
@@ -84,7 +84,7 @@ def test_another_daemon_of_the_socket_s_name_is_not_meant(
 
 
 def test_the_instance_and_its_directory_are_enough(other_name: DaemonProcess) -> None:
-    """It listens where nobody looks who knows its name alone; its statistics have that name."""
+    """It listens where a client that knows its name alone does not look; its statistics have that name."""
     options = ("--instance", other_name.instance, "--shm-dir", other_name.shm_dir)
     for words in ("health",), ("status",), ("top", "--once"), ("metrics",):
         done = shmmap(*words, *options)
@@ -102,6 +102,6 @@ def test_what_a_live_daemon_has_is_not_to_be_removed(other_name: DaemonProcess, 
         words = ("doctor", "--json", *options, "--shm-dir", other_name.shm_dir)
         done = shmmap(*words, XDG_RUNTIME_DIR=str(short_path))
         assert done.stdout, (options, done.returncode, done.stderr)
-        (told,) = [one for one in json.loads(done.stdout)["findings"] if one["name"] == "leftovers"]
-        assert (told["state"], "rm " in told["advice"]) == ("warn", False), told
+        (finding,) = [one for one in json.loads(done.stdout)["findings"] if one["name"] == "leftovers"]
+        assert (finding["state"], "rm " in finding["advice"]) == ("warn", False), finding
     other_name.send(signal.SIGCONT)

@@ -89,7 +89,7 @@ class Life:
             self.readers.pop(self.random.randrange(len(self.readers))).process.end()
 
     def evict(self) -> None:
-        """Everything that nobody maps goes."""
+        """Everything that no process maps goes."""
         self.client.ask("evict")
 
     def evict_some(self) -> None:

@@ -83,7 +83,7 @@ def test_evict_all_after_a_cleaner(daemon: DaemonFactory, divided_map: DividedMa
 
 
 def test_retired_segments_that_a_cleaner_removes(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    """What clients map counts until they let go, as the kernel says; a name is not needed for that."""
+    """What clients map counts until they release it, as the kernel says; a name is not needed for that."""
     one, nbytes = tight(daemon, divided_map)
     with connect(one.endpoint) as client:
         held = list(client.selected(list(divided_map.corners)[:6], wait=TIMEOUT_S))

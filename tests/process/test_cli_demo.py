@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap demo`` tells the truth and leaves nothing behind, however it ends."""
+"""``shmmap demo`` measures truly and leaves nothing behind, however it ends; its programs too."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from shmmap.demo.consumer import Pose, StepReport
 from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.demo.drive import Fleet, drive_through_outage
+from shmmap.demo.process_usage import cpu_seconds
+from shmmap.demo.program import Program
 from shmmap.demo.progress import Progress
-from shmmap.errors import BadRequest
+from shmmap.errors import BadRequest, InternalError
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess, Deadline, processes_marked, wait_ended
 from tests.support.demo_process import SMALL, Demo, until
@@ -33,33 +35,33 @@ def test_demo_measures_and_draws(tmp_path: Path) -> None:
     demo = Demo(tmp_path, *words, command=("shmmap.cli", "demo"))
     out, err = demo.process.communicate()
     assert (demo.process.returncode, err) == (0, "")
-    told = json.loads(out)
-    assert sorted(told) == ["localization", "one_more_bytes", "outage", "rounds", "seconds", "svg", "town"]
-    town = told["town"]
+    report = json.loads(out)
+    assert sorted(report) == ["localization", "one_more_bytes", "outage", "rounds", "seconds", "svg", "town"]
+    town = report["town"]
     files = list((tmp_path / "town" / "pointcloud_map.pcd").glob("*.pcd"))
     assert town["cells"] == len(files) == 320
     assert town["file_bytes"] == sum(file.stat().st_size for file in files)
-    assert [each["consumers"] for each in told["rounds"]] == [1, 8]
-    for each in told["rounds"]:
+    assert [each["consumers"] for each in report["rounds"]] == [1, 8]
+    for each in report["rounds"]:
         _check_round(each["consumers"], each["shared"], each["private"])
-    shared, private = told["rounds"][1]["shared"], told["rounds"][1]["private"]
+    shared, private = report["rounds"][1]["shared"], report["rounds"][1]["private"]
     # one process more costs a copy, or no copy
-    more = told["one_more_bytes"]
+    more = report["one_more_bytes"]
     assert more["private"] > more["shared"] + private["map_bytes"] / 2
     # no process stopped when the daemon did, and it came back with all it had
-    outage = told["outage"]
+    outage = report["outage"]
     assert len(outage["counted"]) == 8
     assert min(outage["counted"]) > 0
     assert outage["poses"] >= 10
     assert outage["adopted"] == outage["segments"] >= shared["cells"]
     assert outage["down_s"] >= outage["poses"] * 0.1 / 2
     # the positions are those of the truth
-    found = told["localization"]
+    found = report["localization"]
     assert found["scans"] == found["trustworthy"] == 41
     assert 0.0 < found["error_m"] <= found["error_max_m"] < 0.1
-    assert 0.0 < found["first_pose_s"] < told["seconds"]
-    assert told["svg"] == str(tmp_path / "picture.svg")
-    picture = ElementTree.parse(told["svg"]).getroot()
+    assert 0.0 < found["first_pose_s"] < report["seconds"]
+    assert report["svg"] == str(tmp_path / "picture.svg")
+    picture = ElementTree.parse(report["svg"]).getroot()
     squares = [e.get("class") or "" for e in picture.iter("{http://www.w3.org/2000/svg}rect")]
     assert sum(square.startswith("cell") for square in squares) >= 320
     assert shared["cells"] <= sum(square == "cell resident" for square in squares)
@@ -103,7 +105,7 @@ def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, stage: str, number: 
 
 
 def test_a_killed_demo_leaves_no_process_and_no_memory(tmp_path: Path) -> None:
-    """Its directories stay where temporary files are, for nobody is left to remove them."""
+    """Its directories stay where temporary files are, for no process is left to remove them."""
     demo = Demo(tmp_path)
     until(demo, "Driving, 2 processes on the copy")
     demo.process.kill()
@@ -224,3 +226,81 @@ def test_consumers_go_on_without_the_daemon(daemon: Callable[..., DaemonProcess]
     assert "killed" in seen.events[0]
     assert "starts again" in seen.events[1]
     assert str(result.adopted) in seen.events[2]
+
+
+# --- programs beside the demonstration: read while they run or in the end, and never left behind -----
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A module ``said`` that runs the code it is given."""
+    (tmp_path / "said.py").write_text("import sys\nexec(sys.argv[1])\n", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return "said"
+
+
+def test_what_it_writes_in_the_end(program: str, tmp_path: Path) -> None:
+    with Program("one", program, ["print('{\"a\": 1}'); sys.exit(3)"], tmp_path) as one:
+        assert json.loads(one.finish(60.0, fails=True)) == {"a": 1}
+        assert one.exit_code == 3
+        assert not one.running
+        with pytest.raises(InternalError, match="one does not run"):
+            one.read_line(60.0)
+    with (
+        Program("other", program, ["raise SystemExit('no map')"], tmp_path) as other,
+        pytest.raises(InternalError, match="other ended with 1: no map"),
+    ):
+        other.finish(60.0)
+
+
+def test_what_it_writes_meanwhile(program: str, tmp_path: Path) -> None:
+    with Program("one", program, ["for n in range(3): print(n, flush=True)"], tmp_path) as one:
+        assert [json.loads(line) for line in one.lines(60.0)] == [0, 1, 2]
+        with pytest.raises(InternalError, match="one ended early"):
+            one.read_line(60.0)
+
+
+def test_it_answers_lines_and_starts_again(program: str, tmp_path: Path) -> None:
+    with Program("one", program, ["for line in sys.stdin: print(line[::-1].strip())"], tmp_path) as one:
+        for text in ("map", "cell"):
+            one.write_line(text)
+            one.end_input()
+            assert one.finish(60.0) == text[::-1]
+            one.start()
+
+
+def test_one_that_says_nothing_is_not_waited_for_forever(program: str, tmp_path: Path) -> None:
+    words = ["import signal; print('begun', flush=True); signal.pause()"]
+    with Program("one", program, words, tmp_path) as one:
+        said = one.lines(60.0)
+        assert next(said) == "begun"
+        with pytest.raises(InternalError, match="one wrote nothing"):
+            next(one.lines(0.01))
+
+
+def test_it_ends_with_all_that_it_has_started(program: str, tmp_path: Path) -> None:
+    """It starts a child, says its number, and both would wait forever."""
+    code = (
+        "import signal, subprocess\n"
+        "child = subprocess.Popen([sys.executable, '-c', 'import signal; signal.pause()'])\n"
+        "print(child.pid, flush=True); signal.pause()"
+    )
+    with Program("one", program, [code], tmp_path) as one:
+        child = int(next(one.lines(60.0)))
+        os.kill(child, 0)
+    assert wait_ended(child)
+    assert not one.running
+
+
+def test_processor_time_of_a_process_and_of_its_children_that_ended(program: str, tmp_path: Path) -> None:
+    burn = "import time\nwhile time.process_time() < 0.4: pass"
+    code = (
+        f"import subprocess; subprocess.run([sys.executable, '-c', {burn!r}])\n{burn}\n"
+        "print('burnt', flush=True); import signal; signal.pause()"
+    )
+    with Program("one", program, [code], tmp_path) as one:
+        assert next(one.lines(60.0)) == "burnt"
+        assert 0.75 <= cpu_seconds([one.pid]) < 60.0
+        assert cpu_seconds([one.pid, os.getpid()]) > cpu_seconds([one.pid])
+    with pytest.raises((ProcessLookupError, FileNotFoundError)):
+        cpu_seconds([2**22 + 1])

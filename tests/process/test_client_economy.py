@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a client saves, and what it leaves behind when nobody closes it."""
+"""What a client saves, and what it leaves behind when it is not closed."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_client_that_is_dropped_leaves_nothing_here_and_frees_what_it_held(
             assert cells.complete
         gc.collect()
         assert (set(open_files()), len(running)) == (files, threads)
-        assert len(mapped(one)) == len(cells), "cells live as long as somebody has them"
+        assert len(mapped(one)) == len(cells), "cells live as long as they are used"
         refused = operator.evict()
         assert (refused.freed, refused.pinned) == (0, len(cells))
         del cells

@@ -60,7 +60,7 @@ def connect(language: str, request: pytest.FixtureRequest) -> Connect:
 
 @pytest.fixture
 def late(connect: Connect, language: str, monkeypatch: pytest.MonkeyPatch) -> Late:
-    """Return what makes a client that attaches only after something was done, the first so many times."""
+    """Return what makes a client that attaches only after something was done, the first ``times`` times."""
 
     @contextmanager
     def make(endpoint: str, act: Callable[[], object], times: float) -> Iterator[Any]:
@@ -255,13 +255,13 @@ def test_metadata_and_what_changed_since(daemon: Factory, divided_map: DividedMa
         divided_map.write_cell("80_80.pcd", (80, 80), random_points(rng, (80, 80), 5))
         divided_map.remove_cell("-60_-60.pcd")
         divided_map.write_metadata()
-        told = client.reload()
-        assert (told.changed, told.added, told.removed) == (1, 1, 1)
+        reloaded = client.reload()
+        assert (reloaded.changed, reloaded.added, reloaded.removed) == (1, 1, 1)
         since = client.metadata(since=listing.map_version)
         assert since.since_known
         assert [Path(cell.id).name for cell in since] == ["0_0.pcd", "80_80.pcd"]
         assert since.removed == (divided_map.id("-60_-60.pcd"),)
-        assert since.map_version == told.map_version != listing.map_version
+        assert since.map_version == reloaded.map_version != listing.map_version
         assert len(client.metadata(since=since.map_version)) == 0
         unknown = client.metadata(since=1)
         assert not unknown.since_known

@@ -116,8 +116,8 @@ def test_a_window_that_stands_still_learns_of_a_reload(daemon: Factory, divided_
     ):
         window.move_to(0, 0, wait=LONG_S)
         divided_map.write_cell("0_0.pcd", (0, 0), random_points(np.random.default_rng(3), (0, 0), 99))
-        told = admin.reload()
-        wait_for(window, lambda: window.map_version == told.map_version and window.complete)
+        reloaded = admin.reload()
+        wait_for(window, lambda: window.map_version == reloaded.map_version and window.complete)
         assert by_name(window.cells)["0_0.pcd"].points == 99
         (changed,) = window.move_to(0, 0).changed
         assert changed.points == 99
@@ -234,7 +234,7 @@ def test_a_jump_is_not_complete_before_it_is_answered(
         assert window.covers(10, 0, 20)
         assert not window.covers(10, 0, 21)
         assert window.points_around(10, 0, 20).covered
-        one.send(signal.SIGSTOP)  # whoever reads now reads what was answered before
+        one.send(signal.SIGSTOP)  # a read now returns what was answered before
         if kind == "background":
             update = window.move_to(45, 0)
             assert not update.complete
@@ -262,10 +262,10 @@ def test_a_vehicle_that_outruns_a_dead_daemon_is_told(daemon: Factory, divided_m
     with shmmap.MapWindow(one.endpoint, 40, update_distance=10) as window:
         window.move_to(0, 0, wait=LONG_S)
         one.kill()
-        told = [
+        reloaded = [
             (window.move_to(x, 0).complete, window.covers(x, 0, 30)) for x in (5.0, 9.9, 10.0, 11.0, 60.0)
         ]
-    assert told == [(True, True), (True, True), (False, True), (False, False), (False, False)]
+    assert reloaded == [(True, True), (True, True), (False, True), (False, False), (False, False)]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -393,12 +393,12 @@ def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
         rng = np.random.default_rng(8)
         for name, corner in list(made.corners.items()):
             made.write_cell(name, corner, random_points(rng, corner, 20_000))
-        told = admin.reload()
+        reloaded = admin.reload()
         if kind == "background":
-            wait_for(window, lambda: window.map_version == told.map_version and window.complete)
+            wait_for(window, lambda: window.map_version == reloaded.map_version and window.complete)
         for turn in range(100):
             window.move_to(1e-3 * turn, 0, wait=LONG_S)
-            if window.complete and window.map_version == told.map_version:
+            if window.complete and window.map_version == reloaded.map_version:
                 break
         assert_window(window, made, *everything)
 
@@ -465,7 +465,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
             pass  # its thread leaves its last function
         assert np.isfinite(view).all()
         del view
-        assert client.release() == 1, "what ends now is unmapped at once, and told"
+        assert client.release() == 1, "what ends now is unmapped at once, and released"
 
 
 def test_a_window_whose_thread_ended(

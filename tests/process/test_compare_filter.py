@@ -200,9 +200,9 @@ def test_a_map_elsewhere_is_no_answer(
     assert [frame["no_map"] for frame in frames] == [True] * 3
     assert summary["no_map_scans"] == 3
     assert summary["kept"] == summary["points"]
-    told = done.stderr.splitlines()
-    assert len(told) == 1, "once"
-    assert told[0] == (
+    printed = done.stderr.splitlines()
+    assert len(printed) == 1, "once"
+    assert printed[0] == (
         "shmmap-compare: no map around scan scan_0: the map spans x -60 .. 60 m, y -60 .. 60 m,"
         " the pose is at (2994.000, 1.000)"
     )

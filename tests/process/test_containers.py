@@ -132,7 +132,7 @@ def test_a_container_that_lacks_the_segments_is_told(
 def test_a_daemon_that_does_not_see_its_clients_pids(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """In a pid namespace of its own: nobody's pid is known, pins are the kernel's word all the same."""
+    """In a pid namespace of its own: no client's pid is known, pins are the kernel's word all the same."""
     one = daemon(divided_map.root, command=namespaces_or_skip("--pid", "--mount", "--mount-proc"))
     client = connect(one)
     (row,) = client.ask("stats")[5]

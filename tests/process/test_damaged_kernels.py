@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever is wrong with compiled kernels, daemon, live maps and programs run, and the kernels come back."""
+"""Compiled kernels: missing ones are made before a client asks; whatever is wrong with some, all runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import shmmap
 from shmmap import kernel_cache
 from shmmap.layers.build import compile_kernels
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import DaemonProcess, until
+from tests.support.daemon_process import DaemonProcess, Deadline, until
 from tests.support.divided_map import DividedMap
 
 
@@ -99,3 +99,49 @@ def test_a_program_that_finds_nothing_but_damage(kernels: Path) -> None:
         )
         assert done.stdout == "begun\n"
         assert done.stderr.count("compiled kernel discarded") == expected
+
+
+# --- where no kernel was compiled yet the daemon compiles those of the layers before a client asks ---
+
+
+def compiled(folder: Path) -> set[str]:
+    """Files of compiled kernels."""
+    return {path.name for path in folder.rglob("*.kernel")}
+
+
+def marks(folder: Path) -> list[Path]:
+    return list(folder.glob("layers-*.compiled"))
+
+
+def test_what_layers_need_is_compiled_once(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    kernels = tmp_path / "kernels"
+    one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
+    waiting = Deadline()
+    while waiting(not marks(kernels)):
+        pass
+    made = compiled(kernels)
+    assert {name.split("-")[0] for name in made if "ndt_kernels" in name or "lattice_kernels" in name}
+    with shmmap.connect(one.endpoint) as client:
+        found = client.around(0, 0, radius=5.0, layers=("ndt(leaf=2.0)", "elevation(0.5)"), wait=60.0)
+        assert found.cells
+        assert not found.failed
+    assert compiled(kernels) == made, "nothing was left to compile"
+    other = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
+    with shmmap.connect(other.endpoint) as client:
+        assert client.around(0, 0, radius=5.0, wait=60.0).cells
+    assert compiled(kernels) == made
+
+
+def test_a_daemon_that_ends_meanwhile_leaves_nothing(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    """The test's end looks for processes that are left."""
+    kernels = tmp_path / "kernels"
+    one = daemon(divided_map.root, environment={"NUMBA_CACHE_DIR": str(kernels)})
+    waiting = Deadline()
+    while waiting(not list(kernels.glob("layers-*.lock"))):
+        pass
+    one.stop()
+    assert not marks(kernels)

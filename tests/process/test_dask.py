@@ -44,8 +44,11 @@ def cluster(tmp_path: Path, shmmap: Verbs) -> Iterator[dict[str, subprocess.Pope
         for name, what in words.items():
             started[name] = subprocess.Popen(
                 [sys.executable, "-m", "dask", *what],
-                env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True,
-            )  # fmt: skip
+                env=environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
             while name == "scheduler" and not file.exists():
                 assert started[name].poll() is None
                 time.sleep(0.01)
@@ -79,8 +82,12 @@ def test_a_dask_worker_that_is_killed_changes_nothing(
     assert address.startswith("tcp://127.0.0.1:")
     example = subprocess.Popen(
         [sys.executable, EXAMPLE, str(tmp_path / "two"), *layer, "--slices", "4", "--scheduler", address],
-        env=shmmap.environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        env=shmmap.environment,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         victim = cluster["first"]
         while not (making := commands_of(victim)):

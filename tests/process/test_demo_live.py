@@ -27,23 +27,23 @@ def test_nothing_is_lost(tmp_path: Path) -> None:
     demo = Demo(tmp_path, "--live", "--json", "--svg", "picture.svg")
     out, err = demo.process.communicate()
     assert (demo.process.returncode, err) == (0, "")
-    told = json.loads(out)
-    assert sorted(told) == [
+    report = json.loads(out)
+    assert sorted(report) == [
         "active", "active_bytes", "budget_bytes", "came_back", "chunks", "daemon_chunks", "daemon_down_s",
         "daemon_killed_at", "differing", "evicted", "file_bytes", "length_m", "mapper_killed_at",
         "mapper_resumed_at", "mapping_s", "max_bytes", "points", "scans", "seconds", "svg", "voxels",
     ]  # fmt: skip
-    assert told["scans"] == 61
-    assert told["differing"] == 0
-    assert 0 < told["active"] < told["voxels"], "a part of the map is on disk alone"
-    assert told["max_bytes"] <= told["budget_bytes"] == 4 << 20
+    assert report["scans"] == 61
+    assert report["differing"] == 0
+    assert 0 < report["active"] < report["voxels"], "a part of the map is on disk alone"
+    assert report["max_bytes"] <= report["budget_bytes"] == 4 << 20
     # it went round, and once more along the first streets
-    assert told["evicted"] >= told["came_back"] > 0
-    assert told["daemon_killed_at"] == 40
-    assert told["daemon_chunks"] > 0, "those that were in memory"
-    assert told["mapper_killed_at"] == 20
-    assert told["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been on their way"
-    picture = ElementTree.parse(told["svg"]).getroot()
+    assert report["evicted"] >= report["came_back"] > 0
+    assert report["daemon_killed_at"] == 40
+    assert report["daemon_chunks"] > 0, "those that were in memory"
+    assert report["mapper_killed_at"] == 20
+    assert report["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been on their way"
+    picture = ElementTree.parse(report["svg"]).getroot()
     text = " ".join(element.text or "" for element in picture.iter(f"{SVG}text"))
     for word in ("61 scans", "height", "on disk only", "sensor's path", "active cells"):
         assert word in text

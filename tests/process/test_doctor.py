@@ -72,7 +72,7 @@ def test_cells_that_cannot_be_loaded_are_named(daemon: DaemonFactory, divided_ma
 
 
 def _until(one: DaemonProcess, about: str, state: str) -> dict[str, Any]:
-    """What is found about something, once the statistics tell it."""
+    """What is found about something, once the statistics show it."""
     waiting = Deadline()
     found: dict[str, Any] = doctor(one)[1][about]
     while waiting(found["state"] != state):

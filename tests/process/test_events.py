@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The event stream: everything that happens is told, in order, and nothing is missed unnoticed."""
+"""The event stream: everything that happens is published, in order, and nothing is missed unnoticed."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_a_stopped_listener_delays_nobody(
 def test_a_client_written_from_the_document(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """Subscribe first, then ask what there was: no event is told twice or missed."""
+    """Subscribe first, then ask what there was: no event comes twice or is missed."""
     one = daemon(divided_map.root)
     client = connect(one)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -219,10 +219,10 @@ def test_a_client_written_from_the_document(
         assert client.ask("recent", 0, 2**62)[5] == []
         assert client.ask("recent", 0, 0, 1)[5] == page[5][:1]
         client.selected(["0_0.pcd"])
-        told: Any = unpack(socket.recv())
-        while told[0] == "beat":
-            told = unpack(socket.recv())
-        assert told[:2] == ["loaded", page[4]]
+        event: Any = unpack(socket.recv())
+        while event[0] == "beat":
+            event = unpack(socket.recv())
+        assert event[:2] == ["loaded", page[4]]
 
 
 def test_permissions_are_those_of_requests(daemon: DaemonFactory, divided_map: DividedMap) -> None:
@@ -237,7 +237,7 @@ def test_permissions_are_those_of_requests(daemon: DaemonFactory, divided_map: D
 def test_only_everything_can_be_subscribed_to(
     daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
-    """Who subscribes to prefixes, each of which would be kept, loses the connection; others hear on."""
+    """Subscriptions to very many prefixes, which would be kept, end the connection; others go on."""
     one = daemon(divided_map.root)
     client, stream = connect(one), listen(one)
     context: zmq.Context[Any] = zmq.Context()

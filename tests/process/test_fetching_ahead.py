@@ -61,10 +61,10 @@ def until(stream: Any, fits: Callable[[Any], bool]) -> Any:
 def until_ahead(shmmap: Shmmap, fits: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Read the counters of prefetching until they fit."""
     waiting = Deadline()
-    told: dict[str, Any] = shmmap.json("status")["ahead"]
-    while waiting(not fits(told)):
-        told = shmmap.json("status")["ahead"]
-    return told
+    ahead_now: dict[str, Any] = shmmap.json("status")["ahead"]
+    while waiting(not fits(ahead_now)):
+        ahead_now = shmmap.json("status")["ahead"]
+    return ahead_now
 
 
 def listed(shmmap: Shmmap, state: str) -> set[str]:
@@ -91,9 +91,16 @@ def test_a_drive_through_a_time_without_the_files(
         fetched, waiting = {f"{x}_{y}.pcd" for x in (-140, -120, -100) for y in (-20, 0)}, Deadline()
         while waiting(not fetched <= listed(shmmap, "ahead")):  # for the ten seconds of --outage-tolerance
             pass
-        told = shmmap.json("status")["ahead"]
-        assert (told["outage_tolerance_s"], told["prefetch_started"] >= len(fetched)) == (10.0, True)
-        assert (told["prefetch_misses"], told["prefetch_used"], told["origin_out"]) == (0, 0, False)
+        ahead_now = shmmap.json("status")["ahead"]
+        assert (ahead_now["outage_tolerance_s"], ahead_now["prefetch_started"] >= len(fetched)) == (
+            10.0,
+            True,
+        )
+        assert (ahead_now["prefetch_misses"], ahead_now["prefetch_used"], ahead_now["origin_out"]) == (
+            0,
+            0,
+            False,
+        )
         finding = prefetching(shmmap)
         assert (finding["state"], finding["fact"]) == (
             "ok",
@@ -108,9 +115,9 @@ def test_a_drive_through_a_time_without_the_files(
         for mark in marks:
             mark.touch()
         assert window.move_to(-100, 0, vx=5.0, route=EAST, wait=TIMEOUT_S).complete
-        told = until_ahead(shmmap, lambda ahead: bool(ahead["origin_out"]))
-        assert told["prefetch_misses"] == 0, "no client has noticed"
-        assert told["prefetch_used"] == 4
+        ahead_now = until_ahead(shmmap, lambda ahead: bool(ahead["origin_out"]))
+        assert ahead_now["prefetch_misses"] == 0, "no client has noticed"
+        assert ahead_now["prefetch_used"] == 4
         shown = {row["id"]: row["ahead"] for row in shmmap.json("ls")["cells"]}
         assert not shown[street.id("-100_0.pcd")]
         assert shown[street.id("-140_0.pcd")], "it was passed by"
@@ -138,11 +145,11 @@ def test_a_drive_through_a_time_without_the_files(
         for mark in marks:
             mark.unlink()
         assert window.wait_until_current(TIMEOUT_S)
-        told = until_ahead(shmmap, lambda ahead: not ahead["origin_out"])
-        assert told["last_outage_s"] > 0.0
-        assert told["over_fetch"] > 1.0
+        ahead_now = until_ahead(shmmap, lambda ahead: not ahead["origin_out"])
+        assert ahead_now["last_outage_s"] > 0.0
+        assert ahead_now["over_fetch"] > 1.0
         top = shmmap.json("top")
-        assert top["ahead"].keys() == told.keys()
+        assert top["ahead"].keys() == ahead_now.keys()
         assert top["latency_s"]["load_points"]["count"] == top["latency_s"]["load"]["count"] > 8
         metrics = shmmap("metrics")
         shown_as = {
@@ -154,7 +161,7 @@ def test_a_drive_through_a_time_without_the_files(
 
 
 def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path) -> None:
-    """What clients have to wait for is told all the same."""
+    """What clients have to wait for is counted all the same."""
     one = daemon(street.root, "--prefetch-share", "0")
     shmmap = Shmmap(one, tmp_path)
     with MapWindow(one.endpoint, 6.0, background=False) as window:
@@ -164,8 +171,8 @@ def test_switched_off(daemon: DaemonFactory, street: DividedMap, tmp_path: Path)
         while waiting((finding := prefetching(shmmap))["advice"] != "raise --prefetch-share"):
             pass
     assert finding["fact"] == "off; moving clients waited for 2 cells in the last 10 min"
-    told = shmmap.json("status")["ahead"]
-    assert (told["prefetch_misses"], told["prefetch_started"]) == (2, 0)
+    ahead_now = shmmap.json("status")["ahead"]
+    assert (ahead_now["prefetch_misses"], ahead_now["prefetch_started"]) == (2, 0)
 
 
 def test_load_times_by_what_was_done(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:

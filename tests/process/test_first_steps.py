@@ -44,8 +44,10 @@ def interpreter(name: str) -> Path | None:
     for candidate in [*on_path, *sorted(versions.glob(f"{name.removeprefix('python')}.*/bin/python3"))]:
         asked = subprocess.run(
             [candidate, "-c", "import ensurepip, sys; print(sys.executable)"],
-            check=False, capture_output=True, text=True,
-        )  # fmt: skip
+            check=False,
+            capture_output=True,
+            text=True,
+        )
         if asked.returncode == 0:  # pyenv puts programs on the path that start nothing
             return Path(asked.stdout.strip())
     return None
@@ -69,7 +71,7 @@ class Newcomer:
     terminal: Terminal
     service: Path
     typed: list[str] = field(default_factory=list)
-    told: str = ""
+    printed: str = ""
 
     @property
     def clone(self) -> Path:
@@ -92,8 +94,11 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     repository = tmp_path_factory.mktemp("published") / "shmmap.git"
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT, check=True, capture_output=True, text=True,
-    ).stdout  # fmt: skip
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (repository / name).parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +137,7 @@ def newcomer(
     one = Newcomer(reader, terminal, service)
     try:
         for command in [*CLONE, *install]:
-            one.told = terminal.run(command.replace(" URL ", f" '{published}' "))
+            one.printed = terminal.run(command.replace(" URL ", f" '{published}' "))
             one.typed.append(command)
         yield one
     finally:
@@ -164,8 +169,8 @@ def under_ten(newcomer: Newcomer, *blocks: list[str]) -> None:
 @pytest.mark.parametrize("newcomer", [one for one in WHERE if one != "installed"], indirect=True)
 def test_from_the_clone_to_the_demonstration(newcomer: Newcomer) -> None:
     under_ten(newcomer, ["shmmap demo"])
-    told = newcomer.told if newcomer.typed[-1] == FULL else newcomer.terminal.run("shmmap demo")
-    assert re.search(r"^8 with shmmap  ", told, re.MULTILINE)
+    printed = newcomer.printed if newcomer.typed[-1] == FULL else newcomer.terminal.run("shmmap demo")
+    assert re.search(r"^8 with shmmap  ", printed, re.MULTILINE)
     assert (newcomer.clone / "shmmap-demo.svg").is_file()
 
 
@@ -174,9 +179,9 @@ def test_the_install_without_open3d_is_small_and_reads_other_clouds(newcomer: Ne
     files = [path for path in newcomer.service.rglob("*") if path.is_file() and not path.is_symlink()]
     assert sum(path.stat().st_blocks * 512 for path in files) < SLIM_BYTES
     another = newcomer.another_terminal()
-    told = another.run("printf '0 0 0\\n' >one.xyz; shmmap inspect one.xyz 2>&1 || echo exit $?")
-    assert "points  1\n" in told
-    assert "exit " not in told
+    printed = another.run("printf '0 0 0\\n' >one.xyz; shmmap inspect one.xyz 2>&1 || echo exit $?")
+    assert "points  1\n" in printed
+    assert "exit " not in printed
 
 
 def test_from_a_las_file_to_a_served_map(newcomer: Newcomer) -> None:
@@ -221,9 +226,9 @@ def test_from_an_autoware_map_to_the_first_query(newcomer: Newcomer) -> None:
         assert "town_89600_42240.pcd" in query
         assert "town_89600_42240.pcd" in ls
         assert "town_89600_42240.pcd" in (newcomer.clone / "map.html").read_text()
-        told = another.python(page.blocks["python"]).splitlines()
-    assert len(told) > 5
-    assert all(re.search(r"pcd \(\d+, 3\) float32 \('xyz', 'intensity'\)$", line) for line in told)
+        printed = another.python(page.blocks["python"]).splitlines()
+    assert len(printed) > 5
+    assert all(re.search(r"pcd \(\d+, 3\) float32 \('xyz', 'intensity'\)$", line) for line in printed)
 
 
 def test_from_nothing_to_the_first_localized_scan(newcomer: Newcomer) -> None:

@@ -170,8 +170,8 @@ def test_who_breaks_the_rules_is_disconnected(served: DaemonProcess, wrong: byte
         one.settimeout(30.0)
         one.connect(served.endpoint)
         one.sendall(documented_bytes("greeting") + wrong)
-        with one.makefile("rb") as heard:
-            assert heard.read()[:64] == documented_bytes("greeting")
+        with one.makefile("rb") as listener:
+            assert listener.read()[:64] == documented_bytes("greeting")
 
 
 def test_a_command_that_is_not_known_is_ignored(served: DaemonProcess, plain: Plain) -> None:
@@ -191,14 +191,14 @@ def test_several_frames_are_refused(served: DaemonProcess, plain: Plain) -> None
 
 def test_events(served: DaemonProcess, plain: Plain) -> None:
     one = plain(served)
-    heard = PlainClient(one.events, ready="ready of a SUB")
-    heard.connection.sendall(documented_bytes("subscribe to all"))
-    kind, number, epoch, _ = heard.message()
+    listener = PlainClient(one.events, ready="ready of a SUB")
+    listener.connection.sendall(documented_bytes("subscribe to all"))
+    kind, number, epoch, _ = listener.message()
     assert (kind, epoch) == ("beat", one.epoch)
     page = one.ask("recent", 0, 0, 0)
     assert (page[3], page[4], page[5]) == (1, number + 1, []), "limit 0: only first and next"
     joined = plain(served)
-    while (event := heard.message())[0] == "beat":  # one a second
+    while (event := listener.message())[0] == "beat":  # one a second
         assert event[1] == number
     assert (event[0], event[1], event[4]) == ("joined", number + 1, joined.session)
     (most,) = said(r"never more than (\d+)\.")
@@ -210,7 +210,7 @@ def test_events(served: DaemonProcess, plain: Plain) -> None:
     while one.ask("recent", 0, 0, 0)[4] <= int(most) + 1:
         one.ask("stats")
     assert len(one.ask("recent", 0, 0, 10_000)[5]) == int(most)
-    heard.close()
+    listener.close()
 
 
 # --- minor versions -------------------------------------------------------------------------------
@@ -354,7 +354,7 @@ def test_a_session_is_taken_over(served: DaemonProcess, plain: Plain) -> None:
     _, mapping = old.attach(handle)
     stopped = served.stop_loaders()
     waits = old.send("selected", ["20_20.pcd"], ["points"], 30.0)
-    old.ask("metadata")  # what came before it has been heard
+    old.ask("metadata")  # what came before it has been read
     new = plain(served, hello=False)
     new.hello(session=old.session)
     assert new.session == old.session
@@ -479,7 +479,7 @@ def test_the_daemon_knows_who_maps(served: DaemonProcess, plain: Plain) -> None:
     with open(path, "rb") as without:
         stats = one.ask("stats")
         assert (stats[5][0][13], stats[6]) == (0, 1)
-        assert one.ask("evict", ["0_0.pcd"])[2:4] == [0, 1], "somebody maps it"
+        assert one.ask("evict", ["0_0.pcd"])[2:4] == [0, 1], "it is mapped"
         assert without.read(8) == b"SHMMAP\0\x01"
         with pytest.raises(Stale):
             one.attach(handle)

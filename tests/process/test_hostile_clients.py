@@ -96,10 +96,32 @@ def test_random_messages(daemon: DaemonFactory, connect: Connect, divided_map: D
     rng = random.Random(6)
     tags = ["area", "differential", "selected", "metadata", "release", "show", "hello", "stats", "x"]
     values: list[Any] = [
-        None, True, -1, 0, 2**63, 2**64 - 1, 0.5, float("nan"), float("inf"), "", "points", "0_0.pcd",
-        b"", bytes(8), bytes(9), [], ["points"], [["0_0.pcd", 5]], [["0_0.pcd", None, ["x"]]],
-        circle(0, 0, 5), ["circle", 1], ["box", 0, 0, 1e308, 1e308], {}, {"a": 1}, [[[[]]]],
-    ]  # fmt: skip
+        None,
+        True,
+        -1,
+        0,
+        2**63,
+        2**64 - 1,
+        0.5,
+        float("nan"),
+        float("inf"),
+        "",
+        "points",
+        "0_0.pcd",
+        b"",
+        bytes(8),
+        bytes(9),
+        [],
+        ["points"],
+        [["0_0.pcd", 5]],
+        [["0_0.pcd", None, ["x"]]],
+        circle(0, 0, 5),
+        ["circle", 1],
+        ["box", 0, 0, 1e308, 1e308],
+        {},
+        {"a": 1},
+        [[[[]]]],
+    ]
     for number in range(1, 1500):
         tag = rng.choice(tags)
         client.send_bytes(pack([tag, number, *(rng.choice(values) for _ in range(rng.randrange(7)))]))
@@ -189,7 +211,7 @@ def test_sessions_come_and_go_without_a_trace(
 
 
 def test_poses_that_are_not_finite(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    """Refused, and nobody's cells are lost in the queue for it."""
+    """Refused, and no client's cells are lost in the queue for it."""
     client = connect(daemon(divided_map.root))
     nan, inf = float("nan"), float("inf")
     for intent in ([nan, 0.0], [0.0, inf], [0.0, 0.0, nan], [0.0, 0.0, 0.0, 0.0, inf, [[0.0, nan]]]):
@@ -400,7 +422,7 @@ def test_a_process_that_asks_too_much_at_once(
     serves(client)
 
 
-# --- a member of the group takes every lock there is on everything it can open: nobody else notices --
+# --- a member of the group takes every lock there is on everything it can open: others do not notice --
 
 
 _LOCKS = """
@@ -441,13 +463,22 @@ def member_with_locks(one: DaemonProcess) -> Iterator[dict[str, Any]]:
     """Run the member; gives what it got."""
     process = subprocess.Popen(
         [
-            "setpriv", f"--reuid={MEMBER}", f"--regid={GROUP}", "--clear-groups", "--inh-caps=-all",
-            python_for_others(), "-I", "-c", _LOCKS, one.shm_dir, one.runtime_dir,
+            "setpriv",
+            f"--reuid={MEMBER}",
+            f"--regid={GROUP}",
+            "--clear-groups",
+            "--inh-caps=-all",
+            python_for_others(),
+            "-I",
+            "-c",
+            _LOCKS,
+            one.shm_dir,
+            one.runtime_dir,
         ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         cwd="/",
-    )  # fmt: skip
+    )
     try:
         assert process.stdout is not None
         yield json.loads(process.stdout.readline())
@@ -469,7 +500,7 @@ def test_locks_hold_nobody_up(daemon: DaemonFactory, connect: Connect, divided_m
         # of the statistics the daemon has a lock itself
         assert found["refused"] == ["lease", "open lock", "read lock of statistics", "write lock"]
         stats = client.ask("stats")
-        assert stats[6] == 36  # mapped by nobody known
+        assert stats[6] == 36  # mapped by unknown processes
         assert client.ask("show", "0_0.pcd")[9][0][6][0][:2] == [0, 0]
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (0, 36)

@@ -61,7 +61,7 @@ class Truth:
         self.current[str(path)] = version
 
     def change(self, name: str, rng: np.random.Generator) -> None:
-        """Write a file anew."""
+        """Rewrite a file."""
         corner = self.made.corners[name]
         points = random_points(rng, corner, int(rng.integers(500, 2500)))
         self.made.write_cell(name, corner, points)
@@ -76,7 +76,7 @@ class Holder:
     expected: dict[str, HeldRow] = field(default_factory=dict)
     stopped: bool = False
     known: bool = False
-    """Whether the present life of the daemon has heard of it."""
+    """Whether the present run of the daemon knows it."""
 
     @property
     def pid(self) -> int:
@@ -186,7 +186,7 @@ class Life:
         self._start()
 
     def restart(self) -> None:
-        """The daemon is told to leave its memory to the next."""
+        """The daemon leaves its memory to the next run."""
         assert self.one.leave() == 0
         self._start()
 
@@ -238,7 +238,7 @@ class Life:
                 assert shown.segment not in believed
                 believed[shown.segment] = {holder.pid for holder in shown.holders}
         for segment, pids in believed.items():
-            # 0 stands for those whom this life of the daemon has not heard of yet
+            # 0 stands for those that this run of the daemon does not know yet
             expected = {holder.pid if holder.known else 0 for holder in mappers.get(segment, ())}
             assert pids == expected, segment
         unseen = mappers.keys() - believed.keys() - self.nameless

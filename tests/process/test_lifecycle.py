@@ -51,7 +51,7 @@ def test_a_signal_while_cells_load_and_clients_wait(
     client.ask("stats")  # the request before it was taken
     assert one.stop() == 0
     assert one.leftovers() == []
-    reply = client.cells_reply(client.wait_for(request))  # whoever waits gets what there is
+    reply = client.cells_reply(client.wait_for(request))  # a waiting client gets what there is
     assert len(reply.cells) + len(reply.pending) == 36
 
 
@@ -240,7 +240,7 @@ def test_nothing_is_open_to_others_without_a_group(
 def test_the_daemon_keeps_no_segment_open(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """An open file of the daemon's own would look like a reader that never lets go."""
+    """An open file of the daemon's own would look like a reader that never ends."""
     one = daemon(divided_map.root)
     client = connect(one)
     client.area(circle(0, 0, 60))

@@ -32,8 +32,8 @@ def cli(one: DaemonProcess | None, *words: str | Path) -> tuple[int, str]:
 
 
 def finding(one: DaemonProcess) -> dict[str, Any]:
-    told = json.loads(cli(one, "doctor", "--json")[1])
-    return next(finding for finding in told["findings"] if finding["name"] == "map")
+    report = json.loads(cli(one, "doctor", "--json")[1])
+    return next(finding for finding in report["findings"] if finding["name"] == "map")
 
 
 def move(made: DividedMap, name: str, by: float) -> None:
@@ -70,8 +70,8 @@ def test_moved_cells_are_named_everywhere(daemon: DaemonFactory, divided_map: Di
         code, said = cli(None, "inspect", divided_map.root)
         assert code == 0
         assert f"{MOVED} has points outside its box x 0 .. 20, y 0 .. 20" in said
-        told = json.loads(cli(None, "inspect", divided_map.root, "--json")[1])
-        assert [Path(one["path"]).name for one in told["map"]["outside_box"]] == [MOVED]
+        report = json.loads(cli(None, "inspect", divided_map.root, "--json")[1])
+        assert [Path(one["path"]).name for one in report["map"]["outside_box"]] == [MOVED]
         divided_map.change(MOVED, seed=5)  # the file is right again
         client.reload()
         client.around(0, 0, 30)

@@ -82,7 +82,7 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     try:
         done = run_verb(words, module=PROGRAM[-1])
         assert done.returncode == 0, done.stderr + done.stdout
-        heard = json.loads(listener.communicate(timeout=60.0)[0])
+        received = json.loads(listener.communicate(timeout=60.0)[0])
     finally:
         listener.kill()
         listener.wait()
@@ -103,10 +103,10 @@ def test_the_program_follows_a_directory(drive: TownDrive, daemon: DaemonFactory
     )
     ElementTree.parse(tmp_path / "out.svg")
     # the listener has every pose, in order
-    assert [pose["name"] for pose in heard] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]
-    assert all(pose["shmmap_pose"] == 1 and pose["trustworthy"] for pose in heard)
-    np.testing.assert_allclose([pose["stamp_s"] for pose in heard], written.stamps_s)
-    poses = np.array([pose["T"] for pose in heard]).reshape(-1, 4, 4)
+    assert [pose["name"] for pose in received] == [path.stem for path in sorted(drive.scans.glob("*.npz"))]
+    assert all(pose["shmmap_pose"] == 1 and pose["trustworthy"] for pose in received)
+    np.testing.assert_allclose([pose["stamp_s"] for pose in received], written.stamps_s)
+    poses = np.array([pose["T"] for pose in received]).reshape(-1, 4, 4)
     np.testing.assert_allclose(poses, written.T_map_sensor, atol=1e-5)
 
 
@@ -152,7 +152,7 @@ def test_a_map_that_cannot_keep_up_is_an_error(drive: TownDrive, daemon: DaemonF
         assert same is first
         assert not waited
         assert maps.too_slow == 0
-        # a jump beyond what the map reaches: waited for, and told
+        # a jump beyond what the map reaches: waited for, and logged
         other, waited = maps.map_at(x + 40.0, y + 40.0)
         assert waited
         assert maps.too_slow == 1

@@ -1,17 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ndt follow`` where the vehicle is not where it should be: kidnapped, badly placed, off the map."""
+"""``shmmap-ndt follow`` of a vehicle that is elsewhere, and of clocks that jump, stand or run back."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from shmmap_clients.ndt_scan_matcher import matrix_from_pose
-from shmmap_clients.scans.trajectory import tum_line
+from numpy.typing import NDArray
+from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
+from shmmap_clients.ndt_scan_matcher.drive.follower import Follower
+from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity
+from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
+from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
+from shmmap_clients.scans.scan_sequence import Scan, ScanSequence
+from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
+import shmmap
+from shmmap.dividing.map_writer import MapWriter
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import DaemonProcess
 from tests.support.forked_programs import run_verb
@@ -103,9 +113,81 @@ def test_without_a_map_every_result_says_so(drive: TownDrive, daemon: DaemonFact
     assert all(frame["no_map"] and frame["failed_limits"] == ["no_map"] for frame in frames)
     assert {frame["state"] for frame in frames} == {"lost"}
     assert (summary["no_map"], summary["trustworthy"]) == (len(KEPT), 0)
-    told = [line for line in said.splitlines() if "no map at scan" in line]
-    assert len(told) == 1, "once"
-    assert "the map spans x " in told[0]
-    assert "the pose is at (5000.000, 7.000)" in told[0]
+    warnings = [line for line in said.splitlines() if "no map at scan" in line]
+    assert len(warnings) == 1, "once"
+    assert "the map spans x " in warnings[0]
+    assert "the pose is at (5000.000, 7.000)" in warnings[0]
     code, _, _ = follow(one, drive, "--init", "5000,7,0,0,0,0", "--allow-empty")
     assert code == 0
+
+
+# --- scans of a real street whose clock jumps, stands or runs back: each is found where it was taken -
+
+BEFORE, SCANS, PERIOD_S = 2, 5, 0.828  # 2.6 m apart
+
+
+def clocks() -> dict[str, NDArray[np.float64]]:
+    at = PERIOD_S * np.arange(SCANS)
+    late = np.arange(SCANS) >= BEFORE
+    return {
+        "set by decades": at + 1.7e9 * late,
+        "begins again": np.where(late, at - at[BEFORE], at + 1000.0),
+        "pause of 30 s": at + 30.0 * late,
+        "zeros": np.zeros(SCANS),
+        "an hour back": at - 3600.0 * late,
+        "runs back": at[::-1],
+    }
+
+
+@pytest.fixture(scope="module")
+def recording(data_dir: Path) -> list[Scan]:
+    """The first scans of a recorded drive, with their true poses."""
+    folder = data_dir / "kitti0005_scans"
+    scans = ScanSequence(folder, read_trajectory(folder / "poses_heldout_tum.txt"))
+    return [scan for scan, _ in zip(scans, range(SCANS), strict=False)]
+
+
+@pytest.fixture(scope="module")
+def street(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map around these scans."""
+    cloud = shmmap.read_cloud(data_dir / "kitti0005_map" / "map_static_v010.pcd").xyz
+    folder = tmp_path_factory.mktemp("street") / "map"
+    with MapWriter(folder, durable=False) as writer:
+        writer.add({"xyz": cloud[(np.abs(cloud[:, :2]) < 80).all(axis=1)]})
+        writer.finish()
+    return folder
+
+
+@pytest.fixture
+def followed(street: Path, daemon: DaemonFactory) -> Iterator[tuple[NdtMatcher, MapUpdater, PoseInitializer]]:
+    one = daemon(street)
+    with (
+        NdtMatcher(Settings()) as matcher,
+        MapUpdater(one.endpoint, prepare=matcher.prepare) as maps,
+        PoseInitializer(one.endpoint, InitializerRules(height=None)) as initializer,
+    ):
+        yield matcher, maps, initializer
+
+
+def test_every_scan_after_a_jump_is_found(
+    followed: tuple[NdtMatcher, MapUpdater, PoseInitializer], recording: list[Scan]
+) -> None:
+    matcher, maps, initializer = followed
+    for name, stamps in clocks().items():
+        start = recording[0].T_map_sensor
+        assert start is not None
+        follower = Follower(
+            matcher, maps, ConstantVelocity(start), relocalize=Relocalizer(lambda: initializer)
+        )
+        jumps = 0
+        for scan, stamp_s in zip(recording, stamps.tolist(), strict=True):
+            frame = follower.follow(Scan(scan.name, stamp_s, scan.columns, scan.T_map_sensor))
+            assert frame.T_truth is not None
+            metres, degrees = pose_errors(frame.result.T_map_base[None], frame.T_truth[None])
+            assert metres[0] < 0.15, (name, scan.name)
+            assert degrees[0] < 1.0, (name, scan.name)
+            assert frame.state == "tracking"
+            guessed = float(np.linalg.norm(frame.T_guess[:3, 3] - frame.T_truth[:3, 3]))
+            assert guessed < 5.0, "no motion that a clock has made up"
+            jumps += frame.clock_jumped
+        assert jumps == (SCANS - 1 if name in ("zeros", "runs back") else 1)

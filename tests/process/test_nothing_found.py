@@ -109,8 +109,8 @@ def test_lists_given_twice_add_up(shmmap: Shmmap, divided_map: DividedMap) -> No
     words = [word for cell in held for word in ("--held", cell)]
     assert [Path(cell["id"]).name for cell in shmmap.json("query", *area, *words)["cells"]] == ["0_20.pcd"]
     layers = ("--layer", "points", "--layer", "voxel(leaf=1.0)", "--wait", "60")
-    told = shmmap.json("query", "--id", "0_0.pcd", *layers)["cells"]
-    assert len({cell["layer"] for cell in told}) == 2
+    cells = shmmap.json("query", "--id", "0_0.pcd", *layers)["cells"]
+    assert len({cell["layer"] for cell in cells}) == 2
 
 
 def test_a_crop_has_the_points_inside_and_their_fields(shmmap: Shmmap, divided_map: DividedMap) -> None:

@@ -38,22 +38,26 @@ SLICES = read_page("shmmap/publishing/SLICES.md")
 TESTED = {  # the named blocks of a page, and how many more blocks of commands or programs it has
     "README.md": ("clone server points window cpp cpp-run", 2),  # the lines that make an environment
     "clients/README.md": (
-        "first-scan-map first-scan ndt pose-init compare elevation elevation-whole", 5,  # of commands
+        "first-scan-map first-scan ndt pose-init compare elevation elevation-whole",
+        5,  # of commands
     ),
     "shmmap/client/live/LIVE_MAPS.md": ("serve map read", 0),
     "shmmap/dividing/OWN_CLOUD.md": ("install serve query", 0),
     "shmmap/origin/AUTOWARE_MAP.md": ("serve query python", 0),
     "shmmap/publishing/GATEWAY.md": ("nginx start serve", -1),  # one is a configuration
     "shmmap/publishing/PUBLISHING.md": (
-        "install credentials publish directory fetch install-sign sign rotate versions", 0,
+        "install credentials publish directory fetch install-sign sign rotate versions",
+        0,
     ),
     "shmmap/publishing/SERVING_FROM_A_BUCKET.md": (
-        "install credentials serve ask settings down trust health status doctor log", -5,  # settings, output
+        "install credentials serve ask settings down trust health status doctor log",
+        -5,  # settings, output
     ),
     "shmmap/publishing/SLICES.md": (
-        "install credentials by-hand parallel slurm kubernetes dask", -2,  # a script and a manifest
+        "install credentials by-hand parallel slurm kubernetes dask",
+        -2,  # a script and a manifest
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TESTED)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whoever maps a segment keeps it, whatever it is and whatever happens; nobody else does."""
+"""A process that maps a segment keeps it, whatever it is and whatever happens; no other does."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unk
         one.kill()
         one.start()
         client.hello()
-        # while a loader compares it with its checksums, who else has it cannot be told
+        # while a loader compares it with its checksums, who else has it is not known
         waiting = Deadline()
         while waiting((stats := client.ask("stats"))[6] == 0):
             pass
@@ -102,7 +102,7 @@ def test_clients_that_die_let_go(daemon: DaemonFactory, connect: Connect, divide
 def test_names_removed_behind_the_daemon_s_back(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, at_once: bool
 ) -> None:
-    """``rm /dev/shm/*``: readers keep what they map, the cells are loaded anew, the books stay right."""
+    """``rm /dev/shm/*``: readers keep what they map, the cells are loaded again, the books stay right."""
     one = daemon(divided_map.root)
     client = connect(one)
     handles = client.area(circle(0, 0, 25)).cells
@@ -143,7 +143,7 @@ def test_where_there_are_no_leases(daemon: DaemonFactory, divided_map: DividedMa
 def test_a_retired_segment_goes_when_its_reader_does_without_a_request(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """Nobody tells the daemon anything: the kernel reports that the mapping is gone."""
+    """No request says so: the kernel reports that the mapping is gone."""
     one = daemon(divided_map.root)
     client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]

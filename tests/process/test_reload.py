@@ -84,7 +84,7 @@ def test_the_signal(daemon: DaemonFactory, connect: Connect, divided_map: Divide
 def test_a_file_rewritten_in_place_with_its_old_times(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """Same size, same mtime: the change time tells."""
+    """Same size, same mtime: the change time shows it."""
     client = connect(daemon(divided_map.root))
     old = client.selected(["0_0.pcd"]).cells[0]
     path = divided_map.pcd_dir / "0_0.pcd"
@@ -109,7 +109,7 @@ def test_a_half_written_file_leaves_the_old_version_in_service(
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     client.ask("reload")
-    reply = client.selected(["0_0.pcd"])  # somebody who has nothing gets the old one, and is told
+    reply = client.selected(["0_0.pcd"])  # a client without it gets the old one, marked stale
     assert [f.code for f in reply.failed] == ["load_failed"]
     assert [(h.segment, h.version, h.stale) for h in reply.cells] == [(old.segment, old.version, True)]
     for rows, packed in (([["0_0.pcd", old.version]], []), ([], [old.version])):

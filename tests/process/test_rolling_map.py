@@ -77,7 +77,7 @@ Words = Callable[..., list[str]]
 
 @pytest.fixture
 def words(tmp_path: Path) -> Words:
-    """The command for a drive of so many scans into a daemon's map."""
+    """The command for a drive of ``scans`` scans into a daemon's map."""
 
     def make(one: DaemonProcess, *more: str, scans: int = 6) -> list[str]:
         directory = tmp_path / f"drive{scans}"
@@ -268,7 +268,7 @@ def test_the_picture_shows_what_is_chosen(live_daemon: LiveDaemon, words: Words,
         assert "sensor's path" in text
         assert all(word in text for word in seen)
         assert not any(word in text for word in unseen)
-    # what nobody waits for is not saved within an hour; the picture may come before it is applied
+    # what is not waited for is not saved within an hour; the picture may come before it is applied
     waiting = Deadline()
     while waiting("dirty: newer than on disk" not in texts(picture)):
         done = run(*words(one, "--picture", str(picture), "--quiet", "--wait", "0", scans=3))

@@ -178,16 +178,16 @@ def test_the_list_of_cells_is_latched_and_follows_the_map(
     listed = peer.latched("/map/pointcloud_map_metadata", MapMetaData)
     assert listed.header.frame_id == "map"
     assert listed.header.stamp.sec > 0
-    told = {one.cell_id: one.metadata for one in listed.metadata_list}
-    assert list(told) == sorted(divided_map.id(name) for name in divided_map.corners)
+    listed_cells = {one.cell_id: one.metadata for one in listed.metadata_list}
+    assert list(listed_cells) == sorted(divided_map.id(name) for name in divided_map.corners)
     for name in divided_map.corners:
-        box = told[divided_map.id(name)]
+        box = listed_cells[divided_map.id(name)]
         assert (box.min_x, box.min_y, box.max_x, box.max_y) == divided_map.box(name)
     divided_map.remove_cell("0_0.pcd")
     divided_map.write_metadata()
     reload(served)
     reader = peer.following("/map/pointcloud_map_metadata", MapMetaData)
-    assert any(len(one.metadata_list) == len(told) - 1 for one in reader)
+    assert any(len(one.metadata_list) == len(listed_cells) - 1 for one in reader)
 
 
 def test_the_whole_map_is_one_cloud_where_it_is_asked_for(
@@ -212,8 +212,8 @@ def test_the_whole_map_is_one_cloud_where_it_is_asked_for(
         env=bridge_environment(),
     )
     assert done.returncode == 2
-    told = float(done.stderr.split("takes about ")[1].split(" GB")[0])
-    assert told == pytest.approx(size / 1e9, rel=0.1)
+    listed_cells = float(done.stderr.split("takes about ")[1].split(" GB")[0])
+    assert listed_cells == pytest.approx(size / 1e9, rel=0.1)
     assert "0.0001 GB is the most" in done.stderr
 
 

@@ -147,7 +147,7 @@ def test_a_flood_of_requests_keeps_nobody_out(bridge: BridgeProcess, peer: RosPe
 
 
 def test_what_is_more_than_the_daemon_takes_at_once(bridge: BridgeProcess, peer: RosPeer) -> None:
-    """Ids in slices, of the known ones: never an empty answer for a full one, and nobody else waits."""
+    """Ids in slices, of the known ones: never an empty answer for a full one, and no other client waits."""
     everything = asked(peer, "partial", area=(0, 0, 1e6))
     known, unknown = everything.ids, [f"/nowhere/{number:080}.pcd" for number in range(60_000)]
     assert sum(map(len, unknown)) > 4 << 20
@@ -168,7 +168,7 @@ def test_what_is_more_than_the_daemon_takes_at_once(bridge: BridgeProcess, peer:
 def test_a_request_whose_cells_do_not_come_holds_up_nobody(
     bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
 ) -> None:
-    """Its loaders stand still: those who ask for what is in memory are answered meanwhile."""
+    """Its loaders stand still: requests for what is in memory are answered meanwhile."""
     warm = asked(peer, "partial", area=(-50, -50, 2))
     assert warm.ids
     loaders = served.stop_loaders()

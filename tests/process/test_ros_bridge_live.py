@@ -97,20 +97,20 @@ def in_cloud(cloud: Any) -> set[Voxel]:
 
 
 def test_clouds_follow_the_map(live_daemon: LiveDaemon, dds: int, peer: RosPeer) -> None:
-    """Who listens hears what is there, and again when it has changed; after a restart of the daemon, too."""
+    """A listener receives what is there, again when it has changed; after a restart of the daemon, too."""
     one = live_daemon()
     with BridgeProcess(one, dds, "--voxels-every", "0.1", "--name", "live=/lidar"):
         for mapper in ("first", "second"):
-            heard = {
+            clouds_by_kind = {
                 kind: peer.following(f"/lidar/{kind}_voxels", PointCloud2, latched=False) for kind in SERVICES
             }
             with mapped(one, 3, mapper=mapper):
-                for kind, clouds in heard.items():
+                for kind, clouds in clouds_by_kind.items():
                     assert any(
                         found and found == of_kind(one, "memory")[kind] for found in map(in_cloud, clouds)
                     )
                 with mapped(one, 5, mapper=f"{mapper} more"):
-                    for kind, clouds in heard.items():
+                    for kind, clouds in clouds_by_kind.items():
                         assert any(found == of_kind(one, "memory")[kind] for found in map(in_cloud, clouds))
             one.kill()
             one.start()

@@ -29,20 +29,20 @@ os.execvp(sys.argv[2], sys.argv[2:])
 
 
 class Manager:
-    """The socket that sd_notify(3) speaks to, and what was heard on it."""
+    """The socket that sd_notify(3) speaks to, and what was received on it."""
 
     def __init__(self, path: Path) -> None:
         self.path = str(path)
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(self.path)
         self._socket.settimeout(60)
-        self.heard: list[list[str]] = []
+        self.received: list[list[str]] = []
 
     def until(self, line: str) -> list[str]:
         """The next message that has a line which starts so."""
         while True:
             message = self._socket.recv(4096).decode().split("\n")
-            self.heard.append(message)
+            self.received.append(message)
             if any(one.startswith(line) for one in message):
                 return message
 
@@ -64,14 +64,14 @@ def test_a_whole_life(
     one: DaemonProcess = daemon(divided_map.root, start=False, environment={"WATCHDOG_USEC": "600000"})
     one.process = one.spawn(notify=manager.path)
     assert manager.until("READY=1")[1:] == ["STATUS=serving 36 cells", f"MAINPID={one.pid}"]
-    assert manager.heard[0][0] == "READY=1"  # nothing before
+    assert manager.received[0][0] == "READY=1"  # nothing before
     for _ in range(3):
         assert manager.until("WATCHDOG=1") == ["WATCHDOG=1"]
     connect(one).area(circle(0, 0, 5))
     waiting = Deadline()
     while waiting("4 of 36 cells" not in manager.until("STATUS=")[0]):
         pass
-    assert "1 client" in manager.heard[-1][0]
+    assert "1 client" in manager.received[-1][0]
 
     one.send(signal.SIGHUP)
     reloading = manager.until("RELOADING=1")
@@ -96,12 +96,12 @@ def test_a_failed_start_says_why(daemon: DaemonFactory, manager: Manager, tmp_pa
     process = one.spawn(notify=manager.path)
     assert "no-map" in manager.until("STATUS=")[0]
     assert process.wait(30) == 66
-    assert len(manager.heard) == 1
+    assert len(manager.received) == 1
 
 
 @pytest.fixture
 def activated(daemon: DaemonFactory, divided_map: DividedMap) -> Iterator[DaemonProcess]:
-    """Return a daemon whose socket somebody else made; it is not started yet."""
+    """Return a daemon whose socket another program made; it is not started yet."""
     one: DaemonProcess = daemon(divided_map.root, start=False)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(one.endpoint)

@@ -131,7 +131,7 @@ def test_a_waiting_request_is_answered_by_the_next_life(
         thread.join(60)
         assert sorted(cell.id.rsplit("/", 1)[1] for cell in found[0]) == divided_map.in_circle(40, 40, 15)
         again = list(client.around(0, 0, 5))
-        assert {id(cell) for cell in again} == {id(cell) for cell in held}  # nothing was mapped anew
+        assert {id(cell) for cell in again} == {id(cell) for cell in held}  # nothing was mapped again
 
 
 def open_to_others(path: str) -> None:
@@ -232,7 +232,7 @@ def test_names_that_are_no_segments_hinder_nobody(
 def test_a_stranger_s_file_under_our_name_is_refused(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """A perfect copy, but of another owner: whoever owns a file can change it under its readers."""
+    """A perfect copy, but of another owner: the owner of a file can change it under its readers."""
     one: DaemonProcess = daemon(divided_map.root)
     client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]
@@ -306,7 +306,7 @@ def test_who_holds_what_is_known_across_a_restart(daemon: DaemonFactory, divided
 def test_a_name_that_somebody_else_took(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """What has to retire does so under another name; its reader and the next life are not disturbed."""
+    """What has to retire does so under another name; its reader and the next run are not disturbed."""
     one = daemon(divided_map.root)
     client = connect(one)
     (handle,) = client.selected(["0_0.pcd"]).cells
@@ -331,7 +331,7 @@ def test_a_name_that_somebody_else_took(
 def test_a_stranger_s_file_takes_no_budget(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, pins: str
 ) -> None:
-    """However much it is in use: whoever has no segment of ours open keeps none of ours."""
+    """However much it is in use: a process that has no segment of ours open keeps none of ours."""
     environment = {"SHMMAP_TEST_PINS": pins} if pins == "locks" else {}
     one = daemon(divided_map.root, start=False, environment=environment)
     strange = Path(f"{one.shm_dir}/shmmap.{one.instance}.0123456789abcdef")

@@ -33,7 +33,7 @@ ASKS: dict[str, Callable[[shmmap.Client], Ask]] = {
 
 @pytest.fixture(autouse=True)
 def errors_are_said() -> Iterator[None]:
-    """A warning that nobody expects is an error."""
+    """An unexpected warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -98,7 +98,7 @@ def test_pending_cells(served: DaemonProcess, client: shmmap.Client) -> None:
     assert len(lines) == 4
     with pytest.raises(LoadTimeout, match=r"still being loaded, and 2 more \(ask again, or wait longer"):
         client.around(1, 1, 5, wait=0.2, strict=True)
-    assert len(client.around(1, 1, 5, wait=None).pending) == 3, "nobody waited for them"
+    assert len(client.around(1, 1, 5, wait=None).pending) == 3, "no request waited for them"
     with pytest.warns(ShmmapWarning, match="and 25 more"):
         client.around(0, 0, 100, wait=0.01)
 

@@ -15,7 +15,7 @@ DAEMON_UID, GROUP, MEMBER, STRANGER, ADMINS = 61001, 61002, 61003, 61004, 61005
 
 
 def as_user(uid: int, gid: int, *command: str) -> subprocess.CompletedProcess[str]:
-    """Run a command as somebody else, without any other group."""
+    """Run a command as another account, without any other group."""
     return subprocess.run(
         ["setpriv", f"--reuid={uid}", f"--regid={gid}", "--clear-groups", "--inh-caps=-all", *command],
         capture_output=True,

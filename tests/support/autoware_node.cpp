@@ -7,7 +7,7 @@
 //   ask X Y RADIUS IDS                with these ids, separated by ";"; what comes is not taken over
 //   const X Y RADIUS                  as `update`, by a function that returns a pointer to const
 //   grids X Y RADIUS                  as `update`, with voxels; `leaves` prints what is held
-//   forget                            the node begins anew, as on a rebuild
+//   forget                            the node begins again, as on a rebuild
 //   refused                           leaves of a cell that has a voxel without an inverse covariance
 //   crooked                           of one whose columns do not belong together
 //
@@ -68,7 +68,7 @@ void make(const std::vector<std::string>& words) {
   options.client.timeout = std::stod(words.at(3));
   options.log = [](const std::string& message) {
     std::cout << "log\t" << message << "\n";
-    throw std::runtime_error("whoever logs may fail");
+    throw std::runtime_error("logging may fail");
   };
   const shmmap::PcdLoader<Service> made(options);
   loader = made;

@@ -38,9 +38,12 @@ class AutowareNode:
 
     def __init__(self, program: Path) -> None:
         self._process = subprocess.Popen(
-            [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            [program],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1"},
-        )  # fmt: skip
+        )
 
     def ask(self, *words: object) -> list[list[str]]:
         """Say something; returns the lines of the answer, each as its words."""
@@ -127,8 +130,10 @@ def generated_messages(folder: Path) -> list[str] | None:
     (folder / "packages.json").write_text(json.dumps(packages))
     done = subprocess.run(
         ["/usr/bin/python3", "-c", _GENERATE, str(folder), str(GENERATORS)],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
+        check=False,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     runtimes = [Path("/usr/include") / name for name in _RUNTIMES]
     return [f"-isystem{path}" for path in [folder / "include", *runtimes]]

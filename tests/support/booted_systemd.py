@@ -153,17 +153,33 @@ class BootedSystemd:
             notify.bind(str(self.shared / "notify"))
             self._process = subprocess.Popen(
                 [
-                    "sh", "-c", enter, "sh", str(self._cgroup),
-                    "unshare", "--mount", "--pid", "--uts", "--ipc", "--net", "--cgroup", "--fork",
-                    "--kill-child", "--propagation", "private",
-                    "sh", str(script), str(self._directory), *needed_directories(),
+                    "sh",
+                    "-c",
+                    enter,
+                    "sh",
+                    str(self._cgroup),
+                    "unshare",
+                    "--mount",
+                    "--pid",
+                    "--uts",
+                    "--ipc",
+                    "--net",
+                    "--cgroup",
+                    "--fork",
+                    "--kill-child",
+                    "--propagation",
+                    "private",
+                    "sh",
+                    str(script),
+                    str(self._directory),
+                    *needed_directories(),
                 ],
                 env={"PATH": os.environ["PATH"], "SYSTEMD": systemd},
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
                 start_new_session=True,
-            )  # fmt: skip
+            )
             pidfd = os.pidfd_open(self._process.pid)
             try:
                 self._wait_until_booted(notify, pidfd)
@@ -194,12 +210,21 @@ class BootedSystemd:
         return (self._directory / "console").read_text(errors="replace")
 
     def spawn(self, *command: str, user: str = "") -> subprocess.Popen[str]:
-        """Start a command inside, as root or as somebody else with all groups of theirs."""
+        """Start a command inside, as root or as another account with all its groups."""
         become = ["setpriv", f"--reuid={user}", f"--regid={user}", "--init-groups"] if user else []
         return subprocess.Popen(
             [
-                "nsenter", f"--target={self._init}", "--mount", "--pid", "--uts", "--ipc", "--net",
-                "--cgroup", "--", *become, *command,
+                "nsenter",
+                f"--target={self._init}",
+                "--mount",
+                "--pid",
+                "--uts",
+                "--ipc",
+                "--net",
+                "--cgroup",
+                "--",
+                *become,
+                *command,
             ],
             env={
                 "PATH": "/usr/sbin:/usr/bin:/sbin:/bin",
@@ -211,7 +236,7 @@ class BootedSystemd:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-        )  # fmt: skip
+        )
 
     def run(self, *command: str, user: str = "", check: bool = True) -> subprocess.CompletedProcess[str]:
         """Run a command inside to its end."""
@@ -230,7 +255,7 @@ class BootedSystemd:
         return self.run("sh", "-euc", script, check=check).stdout
 
     def properties(self, unit: str) -> dict[str, str]:
-        """What ``systemctl show`` tells about a unit."""
+        """What ``systemctl show`` prints about a unit."""
         lines = self.run("systemctl", "show", unit).stdout.splitlines()
         return dict(line.split("=", 1) for line in lines if "=" in line)
 

@@ -87,12 +87,12 @@ class BridgeProcess:
 
     @property
     def status(self) -> dict[str, Any]:
-        """What it tells doctor."""
-        told: dict[str, Any] = json.loads(self._status.read_text())
-        return told
+        """What it writes for doctor."""
+        status: dict[str, Any] = json.loads(self._status.read_text())
+        return status
 
     def wait_status(self, within_s: float = WITHIN_S, **wanted: Any) -> None:
-        """Wait until it tells this."""
+        """Wait until it writes this."""
         until_s = time.monotonic() + within_s
         while any(self.status[name] != value for name, value in wanted.items()):
             assert time.monotonic() < until_s, self.status
@@ -131,7 +131,7 @@ class BridgeProcess:
 # A DDS domain for one test: no other test of this machine is in it, and nothing leaves the machine
 
 
-_DOMAINS: Final = range(1, 100)  # the ports of higher ones are given to whoever asks for any port
+_DOMAINS: Final = range(1, 100)  # the ports of higher ones are given out for any port
 _LOCKS: Final = Path("/tmp")
 
 FIRST_PORT: Final = 7400

@@ -36,7 +36,7 @@ class ChunkMemory:
         return self.chunks[key]
 
     def grown(self, key: ChunkKey, bricks: int) -> ChunkView:
-        """The same chunk with room for so many bricks."""
+        """The same chunk with room for ``bricks`` bricks."""
         old = self.chunks[key].data
         data = bytearray(chunk_bytes(bricks))
         data[: len(old)] = old
@@ -49,9 +49,16 @@ class ChunkMemory:
         for number, (key, hits) in enumerate(zip(marks.chunks, marks.hits.tolist(), strict=True)):
             part = slice(starts[number], starts[number + 1])
             self.writer.apply(
-                self.chunk(key), marks.words[part], marks.bits[part], hits, mapper=mapper, scan=scan,
-                now_ns=scan, grow=lambda bricks, key=key: self.grown(key, bricks), known_mappers=known,  # type: ignore[misc]
-            )  # fmt: skip
+                self.chunk(key),
+                marks.words[part],
+                marks.bits[part],
+                hits,
+                mapper=mapper,
+                scan=scan,
+                now_ns=scan,
+                grow=lambda bricks, key=key: self.grown(key, bricks),
+                known_mappers=known,  # type: ignore[misc]
+            )
 
     def voxels(self) -> dict[tuple[int, int, int], int]:
         """All known voxels; every chunk is consistent."""

@@ -178,15 +178,40 @@ def lzf_decode(data: bytes) -> bytes:
 
 
 TYPES = {
-    "char": "b", "int8": "b", "uchar": "B", "uint8": "B", "short": "h", "int16": "h", "ushort": "H",
-    "uint16": "H", "int": "i", "int32": "i", "uint": "I", "uint32": "I", "float": "f", "float32": "f",
-    "double": "d", "float64": "d",
-}  # fmt: skip
+    "char": "b",
+    "int8": "b",
+    "uchar": "B",
+    "uint8": "B",
+    "short": "h",
+    "int16": "h",
+    "ushort": "H",
+    "uint16": "H",
+    "int": "i",
+    "int32": "i",
+    "uint": "I",
+    "uint32": "I",
+    "float": "f",
+    "float32": "f",
+    "double": "d",
+    "float64": "d",
+}
 COUNTERS = ("uchar", "uint8", "ushort", "int", "uint", "char", "short")
 NAMES = (
-    "nx", "ny", "nz", "red", "green", "blue", "alpha", "intensity", "ring", "gps_time", "confidence",
-    "scalar_Intensity", "f_dc_0", "label",
-)  # fmt: skip
+    "nx",
+    "ny",
+    "nz",
+    "red",
+    "green",
+    "blue",
+    "alpha",
+    "intensity",
+    "ring",
+    "gps_time",
+    "confidence",
+    "scalar_Intensity",
+    "f_dc_0",
+    "label",
+)
 COMMENTS = ("comment made by hand", "comment", "comment end_header is not here")
 
 Property = tuple[str, str, str]  # name, type, type of a list's counter or ""

@@ -43,38 +43,31 @@ class Shmmap:
         return json.loads(self(*words, "--json", code=code))
 
 
-# `shmmap doctor` for one daemon
+def _address(one: DaemonProcess) -> list[str]:
+    return ["--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir]
 
 
 def doctor(one: DaemonProcess, *words: str) -> tuple[int, dict[str, Any]]:
     """Exit code, and the findings by name."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("SHMMAP_")}
-    address = ["--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir]
-    done = run_verb(["doctor", "--json", *address, *words], {**environment, "PYTHONPATH": str(ROOT)})
+    done = run_verb(["doctor", "--json", *_address(one), *words], {**environment, "PYTHONPATH": str(ROOT)})
     assert done.stdout, done.stderr
-    told = json.loads(done.stdout)
-    found = {finding["name"]: finding for finding in told["findings"]}
-    states = [finding["state"] for finding in told["findings"]]
-    assert told["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
+    report = json.loads(done.stdout)
+    found = {finding["name"]: finding for finding in report["findings"]}
+    states = [finding["state"] for finding in report["findings"]]
+    assert report["worst"] == next(state for state in ("fail", "warn", "ok") if state in states)
     return done.returncode, found
-
-
-# Verbs that read the statistics of one daemon
 
 
 def verb(one: DaemonProcess, *words: str, env: dict[str, str] | None = None) -> tuple[int, str]:
     """Exit code of a verb, and what it prints; ``env`` is added to the environment."""
-    address = ["--instance", one.instance, "--runtime-dir", one.runtime_dir, "--shm-dir", one.shm_dir]
-    done = run_verb([*words, *address], {**os.environ, "PYTHONPATH": str(ROOT), **(env or {})})
+    done = run_verb([*words, *_address(one)], {**os.environ, "PYTHONPATH": str(ROOT), **(env or {})})
     return done.returncode, done.stdout
 
 
 def health(one: DaemonProcess, env: dict[str, str] | None = None) -> tuple[int, str]:
     """Exit code of ``shmmap health --strict``, and what it prints."""
     return verb(one, "health", "--strict", env=env)
-
-
-# Publishes maps for tests, by the command line
 
 
 def publish(source: Path, url: str | Path, *words: str, environment: Mapping[str, str] | None = None) -> str:
@@ -98,11 +91,8 @@ def make_older(store: Path, days: float, *versions: int) -> None:
         os.utime(path, (then, then))
 
 
-# The verbs that publish and fetch maps, as a user runs them without a daemon
-
-
 class Verbs:
-    """Runs the command line, with a home and a cache of its own."""
+    """Runs the command line without a daemon, with a home and a cache of its own."""
 
     def __init__(self, home: Path) -> None:
         hidden = ("SHMMAP_", "AWS_", "GOOGLE_", "AZURE_")

@@ -259,16 +259,18 @@ class ControlLoop:
         endpoint: str,
         radius: float,
         *,
-        patience: float = 5.0,
+        wait: float = 5.0,
         wrapper: Sequence[str] = (),
     ) -> None:
         self._process = subprocess.Popen(
-            [*wrapper, program, endpoint, str(radius), str(patience)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [*wrapper, program, endpoint, str(radius), str(wait)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
 
     def begin(self, steps: int, *, wait: float = 0.02, period: float = 0.01) -> None:
-        """Have it do so many rounds."""
+        """Have it begin ``rounds`` rounds."""
         self._say(f"go {steps} {wait} {period}")
 
     def rounds(self) -> Rounds:
@@ -282,7 +284,7 @@ class ControlLoop:
         )
 
     def go(self, steps: int, *, wait: float = 0.02, period: float = 0.01) -> Rounds:
-        """Do so many rounds."""
+        """Do ``rounds`` rounds."""
         self.begin(steps, wait=wait, period=period)
         return self.rounds()
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A client in C++ that does what it is told, a line at a time; words are separated by tabs, what is within a word
-// by spaces or semicolons.  `tests/support/cpp_client.py` says what there is to be told, and reads the answers.
+// A client in C++ that does what lines say, one at a time; words are separated by tabs, what is within a word
+// by spaces or semicolons.  `tests/support/cpp_client.py` says which lines there are, and reads the answers.
 //
 // The answer ends with a line "end"; errors are "error CODE MESSAGE".  Cells are numbered, and kept until `drop`.
 

@@ -40,11 +40,19 @@ def compiled(folder: Path, *, compiler: str = "g++", standard: str = "c++17", op
     program = folder / f"cpp_client.{compiler}.{standard}"
     subprocess.run(
         [
-            compiler, f"-std={standard}", optimize, "-g1", "-fsanitize=address,undefined",
-            "-fno-sanitize-recover=all", *FLAGS, str(SOURCE), "-o", str(program),
+            compiler,
+            f"-std={standard}",
+            optimize,
+            "-g1",
+            "-fsanitize=address,undefined",
+            "-fno-sanitize-recover=all",
+            *FLAGS,
+            str(SOURCE),
+            "-o",
+            str(program),
         ],
         check=True,
-    )  # fmt: skip
+    )
     return program
 
 
@@ -56,17 +64,20 @@ def _kinds(root: type[shmmap.ShmmapError]) -> dict[str, type[shmmap.ShmmapError]
 
 
 class CppProgram:
-    """One such process, told and asked by lines of words."""
+    """One such process, driven by lines of words."""
 
     def __init__(self, program: Path, environment: Mapping[str, str] = MappingProxyType({})) -> None:
         self.process = subprocess.Popen(
-            [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            [program],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1", **environment},
-        )  # fmt: skip
+        )
         self._dropped: list[int] = []
         self._cells: weakref.WeakValueDictionary[int, CppCell] = weakref.WeakValueDictionary()
 
-    def tell(self, *words: object) -> None:
+    def send(self, *words: object) -> None:
         """Say something; `answer` is to be called for it."""
         assert self.process.stdin is not None
         if self._dropped:
@@ -93,10 +104,10 @@ class CppProgram:
 
     def ask(self, *words: object) -> list[list[str]]:
         """Say something, and return what it answers."""
-        self.tell(*words)
+        self.send(*words)
         return self.answer()
 
-    def told(self, *words: object) -> list[list[str]]:
+    def call(self, *words: object) -> list[list[str]]:
         """Say something; an error is raised as the client in Python does."""
         answer = self.ask(*words)
         if answer and answer[0][0] == "error":
@@ -105,7 +116,7 @@ class CppProgram:
         return answer
 
     def cell(self, words: Sequence[str]) -> CppCell:
-        """Return the cell of such a line: the same one as long as somebody has it."""
+        """Return the cell of such a line: the same one as long as it is used."""
         number = int(words[1])
         cell = self._cells.get(number)
         if cell is None:
@@ -156,7 +167,7 @@ class CppCell:
         self.version, self.points, self.stale = int(version), int(points), stale == "1"
 
     def _column(self, name: str) -> tuple[np.ndarray, int]:
-        ((dtype, shape, data, checksum),) = self._program.told("bytes", self.number, name)
+        ((dtype, shape, data, checksum),) = self._program.call("bytes", self.number, name)
         sides = tuple(map(int, shape.split()))
         return np.frombuffer(bytes.fromhex(data), dtype).reshape(sides), int(checksum)
 
@@ -288,13 +299,18 @@ class CppClient:
     """
 
     def __init__(
-        self, program: Path, endpoint: str, *, name: str = "cpp", timeout: float = 5.0,
+        self,
+        program: Path,
+        endpoint: str,
+        *,
+        name: str = "cpp",
+        timeout: float = 5.0,
         connect_timeout: float = 1.0,  # noqa: ARG002  it has one of its own
         environment: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.program = CppProgram(program, environment)
         try:
-            ((_, session, epoch),) = self.program.told("connect", endpoint, name, timeout)
+            ((_, session, epoch),) = self.program.call("connect", endpoint, name, timeout)
         except shmmap.ShmmapError:
             self.program.close()
             raise
@@ -311,7 +327,7 @@ class CppClient:
         assert self.program.close() == 0
 
     def _cells(self, *words: object) -> CppCells:
-        found = CppCells(self.program, self.program.told(*words))
+        found = CppCells(self.program, self.program.call(*words))
         self.epoch, self.map_version = found.epoch, found.map_version
         return found
 
@@ -333,10 +349,14 @@ class CppClient:
         return self.area(circle, layers, wait)
 
     def differential(
-        self, area: Any, held: Iterable[CppCell | str | tuple[str, int]], layers: Any = "points",
-        wait: float | None = 5.0, by_name: bool = False,
-    ) -> CppCells:  # fmt: skip
-        """As `shmmap.Client.differential`; what is held by cells are all that somebody here has."""
+        self,
+        area: Any,
+        held: Iterable[CppCell | str | tuple[str, int]],
+        layers: Any = "points",
+        wait: float | None = 5.0,
+        by_name: bool = False,
+    ) -> CppCells:
+        """As `shmmap.Client.differential`; what is held by cells are all that are used here."""
         some: Collection[CppCell | str | tuple[str, int]] = list(held)
         named = []
         for one in some:
@@ -360,11 +380,11 @@ class CppClient:
 
     def release(self) -> None:
         """As `shmmap.Client.release`."""
-        self.program.told("release")
+        self.program.call("release")
 
     def columns(self) -> list[list[str]]:
-        """Return every column of every cell that somebody here has, with a CRC-32 of its bytes."""
-        return self.program.told("columns")
+        """Return every column of every cell that is used here, with a CRC-32 of its bytes."""
+        return self.program.call("columns")
 
 
 class CppNear(_Answer):
@@ -389,18 +409,35 @@ class CppWindow:
     """As `shmmap.MapWindow` without a thread."""
 
     def __init__(
-        self, program: Path, endpoint: str, radius: float = 150.0, *, layers: Any = "points",
-        shape: str = "circle", update_distance: float = 20.0, refresh_interval: float = 1.0,
-        retention: shmmap.Retention | None = None, z: tuple[float, float] | None = None, timeout: float = 5.0,
+        self,
+        program: Path,
+        endpoint: str,
+        radius: float = 150.0,
+        *,
+        layers: Any = "points",
+        shape: str = "circle",
+        update_distance: float = 20.0,
+        refresh_interval: float = 1.0,
+        retention: shmmap.Retention | None = None,
+        z: tuple[float, float] | None = None,
+        timeout: float = 5.0,
         name: str = "window",
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.client = CppClient(program, endpoint, name=name, timeout=timeout)
         self._program = self.client.program
         keep = retention if retention is not None else shmmap.Retention()
-        self._program.told(
-            "window", radius, _texts(layers), shape, update_distance, refresh_interval,
-            keep.distance, keep.max_bytes, keep.max_age, *(z or ()),
-        )  # fmt: skip
+        self._program.call(
+            "window",
+            radius,
+            _texts(layers),
+            shape,
+            update_distance,
+            refresh_interval,
+            keep.distance,
+            keep.max_bytes,
+            keep.max_age,
+            *(z or ()),
+        )
 
     def __enter__(self) -> CppWindow:
         return self
@@ -413,15 +450,22 @@ class CppWindow:
         self.client.close()
 
     def move_to(
-        self, x: float, y: float, *, vx: float = 0.0, vy: float = 0.0, heading: float | None = None,
-        route: Iterable[tuple[float, float]] = (), wait: float | None = None,
-    ) -> CppUpdate:  # fmt: skip
+        self,
+        x: float,
+        y: float,
+        *,
+        vx: float = 0.0,
+        vy: float = 0.0,
+        heading: float | None = None,
+        route: Iterable[tuple[float, float]] = (),
+        wait: float | None = None,
+    ) -> CppUpdate:
         """As `shmmap.MapWindow.move_to`."""
         path = [f"{route_x} {route_y}" for route_x, route_y in route]
-        return CppUpdate(self._program, self._program.told("move", x, y, vx, vy, heading, wait, *path))
+        return CppUpdate(self._program, self._program.call("move", x, y, vx, vy, heading, wait, *path))
 
     def _state(self) -> tuple[list[str], tuple[CppCell, ...]]:
-        lines = self._program.told("state")
+        lines = self._program.call("state")
         return lines[0][1:], tuple(self._program.cell(line) for line in lines[1:])
 
     @property
@@ -456,11 +500,11 @@ class CppWindow:
 
     def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
         """As `shmmap.MapWindow.covers`."""
-        return self._program.told("covers", x, y, radius) == [["covers", "1"]]
+        return self._program.call("covers", x, y, radius) == [["covers", "1"]]
 
     def points_around(self, x: float, y: float, radius: float, *, layer: str = "") -> CppNear:
         """As `shmmap.MapWindow.points_around`."""
-        return CppNear(self._program, self._program.told("around", x, y, radius, layer, "count"))
+        return CppNear(self._program, self._program.call("around", x, y, radius, layer, "count"))
 
 
 class CppEventStream:
@@ -475,7 +519,7 @@ class CppEventStream:
         timeout: float = 5.0,  # noqa: ARG002
     ) -> None:
         self._program = CppProgram(program)
-        self._program.told("events", endpoint, since)
+        self._program.call("events", endpoint, since)
 
     def close(self) -> None:
         """End it; nothing in it may have leaked or gone wrong."""
@@ -484,11 +528,11 @@ class CppEventStream:
     @property
     def epoch(self) -> int:
         """The daemon's present life."""
-        return int(self._program.told("epoch")[0][1])
+        return int(self._program.call("epoch")[0][1])
 
     def next(self, timeout: float | None = None) -> events.Event | shmmap.events.MissedEvents | None:
         """As `shmmap.events.EventStream.next`."""
-        lines = self._program.told("next", 1e6 if timeout is None else timeout)
+        lines = self._program.call("next", 1e6 if timeout is None else timeout)
         if not lines:
             return None
         what, *words = lines[0]
@@ -513,11 +557,11 @@ class CppFollower:
         """Send a pose."""
         if self._mode == "window":
             if not self._has_window:
-                self._program.told("window", radius, "points", "circle", 0.0, 1.0, 0.0, np.inf, np.inf)
+                self._program.call("window", radius, "points", "circle", 0.0, 1.0, 0.0, np.inf, np.inf)
                 self._has_window = True
-            self._program.tell("move", x, y, 0.0, 0.0, None, 60.0)
+            self._program.send("move", x, y, 0.0, 0.0, None, 60.0)
         else:
-            self._program.tell("differential", _words("circle", x, y, radius), "points", 60.0)
+            self._program.send("differential", _words("circle", x, y, radius), "points", 60.0)
 
     def answer(self) -> dict[str, Any]:
         """Return what it saw there."""
@@ -546,7 +590,7 @@ class CppFollower:
     def _contents(self, cells: Collection[CppCell]) -> list[list[Any]]:
         if not cells:
             return []
-        lines = self._program.told("columns", *(cell.number for cell in cells))
+        lines = self._program.call("columns", *(cell.number for cell in cells))
         crc = {(line[0], line[2]): int(line[6]) for line in lines}
         return [[cell.id, cell.points, crc[cell.id, "xyz"], crc[cell.id, "intensity"]] for cell in cells]
 

@@ -142,7 +142,7 @@ class Deadline:
         return not_yet
 
 
-# Waiting for what a daemon does by itself: by what it tells, not for a time
+# Waiting for what a daemon does by itself: by its events and statistics, not for a time
 
 
 TIMEOUT_S = 60.0
@@ -165,6 +165,6 @@ def next_reload(stream: EventStream) -> e.Reloaded:
     """Wait until the map has been read again."""
     while True:
         happening = stream.next(60.0)
-        assert happening is not None, "no reload was told of"
+        assert happening is not None, "there was no event of a reload"
         if isinstance(happening, e.Reloaded):
             return happening

@@ -24,7 +24,7 @@ class _File:
 
 @dataclass
 class CutDisk:
-    """Files of one directory (`shmmap.daemon.live.disk.folder.Files`); it fails after so many ``operations``.
+    """Files of one directory (`shmmap.daemon.live.disk.folder.Files`); it fails after ``operations`` operations.
 
     What is written is safe after `sync`, a name after `sync_names`.  After a cut, `after` gives the disk as
     it may be found: of the names that were changed since the last `sync_names` any are as before, and of a
@@ -116,7 +116,7 @@ class CutDisk:
         keeps
             Whether one change of a name was kept.
         part
-            How much of so many bytes is there; a negative number: zeros follow.
+            How many of that many bytes are there; a negative number: zeros follow.
         """
         found = dict(self._safe)
         for change in self._changes:
@@ -161,15 +161,17 @@ class HangingDirectory:
         self._path = os.fsencode(path)
         self._fd = os.open("/dev/fuse", os.O_RDWR | os.O_CLOEXEC)
         options = b"fd=%d,rootmode=40000,user_id=%d,group_id=%d,allow_other" % (
-            self._fd, os.geteuid(), os.getegid(),
-        )  # fmt: skip
+            self._fd,
+            os.geteuid(),
+            os.getegid(),
+        )
         if _libc.mount(b"hangs", self._path, b"fuse", 0, options):
             number = ctypes.get_errno()
             os.close(self._fd)
             raise OSError(number, os.strerror(number))
 
     def end(self) -> None:
-        """Unmount it: whoever waits gets an error."""
+        """Unmount it: waiting processes get an error."""
         if self._fd >= 0:
             _libc.umount2(self._path, _DETACH)
             os.close(self._fd)

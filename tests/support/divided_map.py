@@ -42,7 +42,7 @@ class DividedMap:
         return read_pcd(self.pcd_dir / name)
 
     def write_cell(self, name: str, corner: tuple[int, int], columns: dict[str, NDArray[Any]]) -> None:
-        """Write one cell by rename, so that nobody sees half of it."""
+        """Write one cell by rename, so that no reader sees half of it."""
         self.corners[name] = corner
         interim = self.root / f"{name}.writing"
         write_pcd(interim, columns)

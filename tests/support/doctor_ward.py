@@ -15,10 +15,20 @@ from shmmap.statistics.snapshot import Snapshot
 
 USER = 61005
 IDENTITY = DaemonIdentity(
-    pid=4242, start_time_ticks=1, pid_namespace=1, epoch=1, instance="default",
-    endpoint="/run/shmmap/default.sock", map_path="/maps/town", map_version=1, shm_dir="/dev/shm",
-    id_prefix="", library_version=shmmap.__version__, started_unix_ns=1, frame_id="map",
-)  # fmt: skip
+    pid=4242,
+    start_time_ticks=1,
+    pid_namespace=1,
+    epoch=1,
+    instance="default",
+    endpoint="/run/shmmap/default.sock",
+    map_path="/maps/town",
+    map_version=1,
+    shm_dir="/dev/shm",
+    id_prefix="",
+    library_version=shmmap.__version__,
+    started_unix_ns=1,
+    frame_id="map",
+)
 
 
 class _Made(Snapshot):

@@ -174,19 +174,19 @@ def check_zmtp(data: bytes) -> str:
     outcomes = []
     for piece, at_once in ((len(data) or 1, 10_000), (7, 10_000), (64, 3)):
         incoming = Incoming(b"ROUTER", b"DEALER", 4096)
-        heard: list[tuple[bytes, bool]] = []
+        messages: list[tuple[bytes, bool]] = []
         outcome = "silence"
         try:
             for at in range(0, len(data), piece):
                 incoming.add(data[at : at + piece])
-                heard += incoming.messages(at_once, lambda _said: None)
+                messages += incoming.messages(at_once, lambda _said: None)
                 while incoming.more:
-                    heard += incoming.messages(at_once, lambda _said: None)
-            outcome = "messages" if heard else outcome
+                    messages += incoming.messages(at_once, lambda _said: None)
+            outcome = "messages" if messages else outcome
         except (ProtocolMismatch, BadRequest) as error:
             outcome = type(error).__name__
         outcomes.append(outcome)
-        if sum(len(body) for body, _ in heard) + len(incoming) > len(data):
+        if sum(len(body) for body, _ in messages) + len(incoming) > len(data):
             raise AssertionError("more is kept than came")
     if len(set(outcomes)) > 1:
         raise AssertionError(f"it depends on the pieces: {outcomes}")

@@ -119,7 +119,7 @@ def normal_of(
     return (normal if normal[2] >= 0 else -normal), float(clear)
 
 
-# A package that offers layer kinds by entry point, made on the spot, as somebody else would install it
+# A package that offers layer kinds by entry point, made on the spot, as users would install it
 
 
 MODULE = '''

@@ -58,7 +58,7 @@ def percentiles(seconds: list[float]) -> str:
 
 
 class Beside:
-    """A process that does something again and again until it is told to stop.
+    """A process that does something again and again until it is stopped.
 
     Parameters
     ----------

@@ -27,9 +27,12 @@ Scan = tuple[NDArray[np.float64], NDArray[np.float64]]
 def reference(scans: Iterable[Scan], scan_filter: shmmap.live.ScanFilter = FILTER) -> dict[Voxel, int]:
     """Log-odds of all known voxels after these scans."""
     slow = SlowOccupancy(
-        RESOLUTION, min_range=scan_filter.min_range, max_range=scan_filter.max_range,
-        min_z=scan_filter.min_z, max_z=scan_filter.max_z,
-    )  # fmt: skip
+        RESOLUTION,
+        min_range=scan_filter.min_range,
+        max_range=scan_filter.max_range,
+        min_z=scan_filter.min_z,
+        max_z=scan_filter.max_z,
+    )
     for points, pose in scans:
         slow.insert(points.tolist(), pose[:3].tolist())
     return {voxel: value for voxel, value in slow.voxels.items() if value}

@@ -120,8 +120,11 @@ def bucket_server(folder: Path) -> Iterator[BucketServer]:
     log.touch()
     process = subprocess.Popen(
         [sys.executable, "-W", "ignore", "-m", "tests.support.map_stores", str(log)],
-        cwd=ROOT, stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stdin=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert process.stdout is not None
         server = BucketServer(int(process.stdout.readline()), log)
@@ -237,8 +240,11 @@ class CephServer(BucketServer):
         """Run one of Ceph's programs for this cluster; returns what it prints."""
         return subprocess.run(
             [words[0], "-c", str(self._folder / "ceph.conf"), *words[1:]],
-            check=True, capture_output=True, text=True, timeout=300,
-        ).stdout  # fmt: skip
+            check=True,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        ).stdout
 
     def start(self, name: str) -> None:
         """Start a daemon: ``mon.a``, ``mgr.x``, ``osd.0`` to ``osd.2``, or the gateway ``client.rgw``."""
@@ -251,8 +257,10 @@ class CephServer(BucketServer):
         with open(self._folder / f"{name}.out", "ab") as out:
             self._daemons[name] = subprocess.Popen(
                 [*words, "-c", str(self._folder / "ceph.conf"), "-f"],
-                stdin=subprocess.DEVNULL, stdout=out, stderr=out,
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+            )
 
     def kill(self, name: str) -> None:
         """End a daemon by SIGKILL."""
@@ -309,13 +317,15 @@ def _make(server: CephServer, folder: Path, *, v1: int, v2: int) -> None:
         create = [] if (folder / "keyring").exists() else ["--create-keyring"]
         subprocess.run(
             ["ceph-authtool", *create, keyring, "--gen-key", "-n", name, *words],
-            check=True, capture_output=True,
-        )  # fmt: skip
+            check=True,
+            capture_output=True,
+        )
     address = f"[v2:127.0.0.1:{v2},v1:127.0.0.1:{v1}]"
     subprocess.run(
         ["monmaptool", "--create", "--fsid", fsid, "--addv", "a", address, monmap],
-        check=True, capture_output=True,
-    )  # fmt: skip
+        check=True,
+        capture_output=True,
+    )
     for place in ("mon", "mgr"):
         (folder / place).mkdir()
     server.run("ceph-mon", "--mkfs", "-i", "a", "--monmap", monmap, "--keyring", keyring)
@@ -332,15 +342,29 @@ def _make(server: CephServer, folder: Path, *, v1: int, v2: int) -> None:
     server.start("client.rgw")
     server.wait_for_gateway()
     server.run(
-        "radosgw-admin", "-n", "client.rgw", "user", "create", "--uid", "tests", "--display-name", "tests",
-        "--access-key", KEYS["AWS_ACCESS_KEY_ID"], "--secret-key", KEYS["AWS_SECRET_ACCESS_KEY"],
-    )  # fmt: skip
+        "radosgw-admin",
+        "-n",
+        "client.rgw",
+        "user",
+        "create",
+        "--uid",
+        "tests",
+        "--display-name",
+        "tests",
+        "--access-key",
+        KEYS["AWS_ACCESS_KEY_ID"],
+        "--secret-key",
+        KEYS["AWS_SECRET_ACCESS_KEY"],
+    )
     import boto3
 
     boto3.client(
-        "s3", endpoint_url=server.endpoint, region_name=KEYS["AWS_REGION"],
-        aws_access_key_id=KEYS["AWS_ACCESS_KEY_ID"], aws_secret_access_key=KEYS["AWS_SECRET_ACCESS_KEY"],
-    ).create_bucket(Bucket=BUCKET)  # fmt: skip
+        "s3",
+        endpoint_url=server.endpoint,
+        region_name=KEYS["AWS_REGION"],
+        aws_access_key_id=KEYS["AWS_ACCESS_KEY_ID"],
+        aws_secret_access_key=KEYS["AWS_SECRET_ACCESS_KEY"],
+    ).create_bucket(Bucket=BUCKET)
 
 
 def _free_ports(count: int) -> list[int]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that maps segments the plain way, and tells the checksums of what it maps.
+"""A process that maps segments the plain way, and prints the checksums of what it maps.
 
 As a program: ``python mapping_process.py PATH...`` maps each file, closes its descriptors, prints
 ``mapped``; for every line it reads it prints the CRC-32 of each mapping.
@@ -21,8 +21,13 @@ def _map(path: str) -> memoryview:
     libc = ctypes.CDLL(None, use_errno=True)
     libc.mmap.restype = ctypes.c_void_p
     libc.mmap.argtypes = (
-        ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long,
-    )  # fmt: skip
+        ctypes.c_void_p,
+        ctypes.c_size_t,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_long,
+    )
     fd = os.open(path, os.O_RDONLY)
     size = os.fstat(fd).st_size
     address = libc.mmap(None, size, 1, 1, fd, 0)

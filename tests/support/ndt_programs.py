@@ -114,7 +114,7 @@ def send_odometry(address: str, pose_address: str, poses: NDArray[np.float64]) -
     answers.connect(pose_address)
     socket = context.socket(zmq.XPUB)
     socket.bind(address)
-    wait(socket, "nobody wants odometry")
+    wait(socket, "no listener for odometry")
     for number, T in enumerate(poses):
         entry = {"shmmap_pose": 1, "stamp_s": PERIOD_S * number, "T": (_ELSEWHERE @ T).ravel().tolist()}
         socket.send(msgspec.msgpack.encode(entry))
@@ -138,7 +138,7 @@ def send(directory: str, truth: str, scan_address: str, odometry_address: str, p
     poses = read_trajectory(truth).T_map_sensor[order]
     with ScanPublisher(scan_address) as publisher:
         if not publisher.wait_for_subscriber(_TIMEOUT_S):
-            raise SystemExit("nobody wants scans")
+            raise SystemExit("no listener for scans")
         for number, index in enumerate(order):
             columns = {"xyz": read_scan(files[index])}
             publisher.send(Scan(files[index].stem, PERIOD_S * number, columns))

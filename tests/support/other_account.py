@@ -32,9 +32,15 @@ SCANS = 3
 def as_client(uid: int, groups: Sequence[int], endpoint: str, action: str) -> object:
     """Run this as a program, in these groups and no others; returns what it says."""
     command = [
-        sys.executable, "-m", "tests.support.other_account", str(uid), str(groups[0]),
-        ",".join(map(str, groups)), endpoint, action,
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "tests.support.other_account",
+        str(uid),
+        str(groups[0]),
+        ",".join(map(str, groups)),
+        endpoint,
+        action,
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     found: object = json.loads(done.stdout)
@@ -57,7 +63,7 @@ def _read(live: LiveMap) -> list[int]:
 
 
 def main() -> None:
-    """Become somebody else, and try."""
+    """Become that account, and try."""
     uid, gid, groups, endpoint, action = sys.argv[1:6]
     with shmmap.connect(endpoint) as client:
         live = client.live("lidar")

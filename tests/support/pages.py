@@ -84,6 +84,12 @@ def all_pages() -> list[str]:
 _SERVE_S = 180.0  # a cloud is divided and kernels are compiled before a first daemon is ready
 
 
+def listens(port: int) -> bool:
+    """Whether a server of this machine takes connections at a port."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
 class Terminal:
     """A shell of a reader, which keeps directory and environment from one command to the next."""
 
@@ -124,14 +130,16 @@ class Terminal:
         """Run a web server from when it listens until the end of the block."""
         server = subprocess.Popen(
             ["bash", "-c", self._script(command).replace(command, f"exec {command}")],
-            cwd=self._cwd, env=self._environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            cwd=self._cwd,
+            env=self._environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         try:
             waiting = Deadline()
-            with socket.socket() as probe:
-                while waiting(probe.connect_ex(("127.0.0.1", port)) != 0):
-                    assert server.poll() is None, command
-                    time.sleep(0.01)
+            while waiting(not listens(port)):
+                assert server.poll() is None, command
+                time.sleep(0.01)
             yield
         finally:
             server.kill()

@@ -65,7 +65,7 @@ def socket_paths(environ: Mapping[str, str]) -> list[str]:
 
 
 def connect_first(paths: list[str]) -> socket.socket:
-    """Connect to the first path at which somebody listens."""
+    """Connect to the first path at which a daemon listens."""
     for path in paths:
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:

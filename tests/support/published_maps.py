@@ -84,8 +84,9 @@ class PublishedMapReader:
             assert list(shard["layers"]) == sorted(root["layers"])
             for i, (name, box, heights, rows) in enumerate(zip(names, boxes, z, points, strict=True)):
                 assert (math.floor(box[1] / root["shard_m"]), math.floor(box[0] / root["shard_m"])) == (
-                    row, column,
-                )  # fmt: skip
+                    row,
+                    column,
+                )
                 cell_id = root["id_prefix"] + name.decode()
                 self.cells[cell_id] = self._cell(cell_id, shard, i, box, heights, rows, at + i)
             at += len(names)

@@ -174,10 +174,26 @@ class RawClient:
         welcome = self.ask("hello", 2, 0, self.name)
         assert welcome[0] == "welcome"
         (
-            _, _, self.major, self.minor, self.daemon, self.instance, self.epoch, self.session,
-            self.map_version, self.map_path, self.frame_id, self.shm_dir, self.id_prefix,
-            self.segment_prefix, self.cells, self.bounds, self.layers, self.budget_bytes, self.pid,
-        ) = welcome[:19]  # fmt: skip
+            _,
+            _,
+            self.major,
+            self.minor,
+            self.daemon,
+            self.instance,
+            self.epoch,
+            self.session,
+            self.map_version,
+            self.map_path,
+            self.frame_id,
+            self.shm_dir,
+            self.id_prefix,
+            self.segment_prefix,
+            self.cells,
+            self.bounds,
+            self.layers,
+            self.budget_bytes,
+            self.pid,
+        ) = welcome[:19]
         return welcome
 
     def cells_reply(self, reply: list[Any]) -> RawCells:
@@ -186,16 +202,29 @@ class RawClient:
         _, _, epoch, map_version, cells, removed, removed_packed, pending, failed = reply[:9]
         handles = [
             RawHandle(
-                self.id_prefix + h[0], h[1], h[2], self.segment_prefix + h[3], h[4], h[5], h[6],
-                (h[7], h[8], h[9], h[10]), h[11],
+                self.id_prefix + h[0],
+                h[1],
+                h[2],
+                self.segment_prefix + h[3],
+                h[4],
+                h[5],
+                h[6],
+                (h[7], h[8], h[9], h[10]),
+                h[11],
             )
             for h in cells
-        ]  # fmt: skip
+        ]
         failures = [RawFailure(f[0], f[1], f[2], f[3], [tuple(h) for h in f[4]]) for f in failed]
         return RawCells(
-            epoch, map_version, handles, list(removed), unpack_versions(removed_packed),
-            [(self.id_prefix + p[0], p[1]) for p in pending], failures, self.last_bytes,
-        )  # fmt: skip
+            epoch,
+            map_version,
+            handles,
+            list(removed),
+            unpack_versions(removed_packed),
+            [(self.id_prefix + p[0], p[1]) for p in pending],
+            failures,
+            self.last_bytes,
+        )
 
     def area(self, area: list[Any], *, wait: float | None = 30.0, intent: Any = None) -> RawCells:
         """Ask for an area."""

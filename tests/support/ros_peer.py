@@ -233,12 +233,18 @@ def from_message(message: Any) -> Reply:
                 cell.cell_id,
                 (box.min_x, box.min_y, box.max_x, box.max_y),
                 _header(cloud.header),
-                (cloud.height, cloud.width, int(cloud.is_bigendian), cloud.point_step, cloud.row_step,
-                 int(cloud.is_dense)),
+                (
+                    cloud.height,
+                    cloud.width,
+                    int(cloud.is_bigendian),
+                    cloud.point_step,
+                    cloud.row_step,
+                    int(cloud.is_dense),
+                ),
                 tuple((one.name, one.offset, one.datatype, one.count) for one in cloud.fields),
                 bytes(cloud.data),
             )
-        )  # fmt: skip
+        )
     return Reply(_header(message.header), cells, list(getattr(message, "ids_to_remove", [])))
 
 

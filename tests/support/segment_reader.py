@@ -73,12 +73,21 @@ def parse(data: bytes | mmap.mmap) -> SegmentBytes:
         assert struct.unpack_from("<I", data, publish + 56)[0] == zlib.crc32(data[publish : publish + 56])
         epoch, version = struct.unpack_from("<QQ", data, publish + 8)
     fields = {
-        "header_bytes": header_bytes, "total_bytes": total_bytes, "rows": rows,
-        "source_points": source_points, "dropped_points": dropped,
-        "source": (size, mtime_ns, ctime_ns), "digest": digest,
-        "box": (min_x, min_y, max_x, max_y), "z": (z_min, z_max), "origin": (ox, oy, oz),
-        "builder_version": builder, "cell_id": texts[0], "layer": texts[1], "frame_id": texts[2],
-    }  # fmt: skip
+        "header_bytes": header_bytes,
+        "total_bytes": total_bytes,
+        "rows": rows,
+        "source_points": source_points,
+        "dropped_points": dropped,
+        "source": (size, mtime_ns, ctime_ns),
+        "digest": digest,
+        "box": (min_x, min_y, max_x, max_y),
+        "z": (z_min, z_max),
+        "origin": (ox, oy, oz),
+        "builder_version": builder,
+        "cell_id": texts[0],
+        "layer": texts[1],
+        "frame_id": texts[2],
+    }
     return SegmentBytes(fields, columns, units, checksums, epoch, version)
 
 

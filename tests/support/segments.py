@@ -28,7 +28,7 @@ def write_segment(
     cell_id: str = "/map/a.pcd",
     layer: str = "points",
     box: Box = (0.0, 0.0, 20.0, 20.0),
-    **told: Any,
+    **source_facts: Any,
 ) -> SegmentHeader:
     """Write a segment into an empty file; ``told`` replaces what its header says of the source."""
     rows = len(next(iter(columns.values())))
@@ -49,7 +49,7 @@ def write_segment(
         "dropped_points": 0,
         "builder_version": 1,
     }
-    return writer.finish(**{**facts, **told})
+    return writer.finish(**{**facts, **source_facts})
 
 
 def publish_segment(

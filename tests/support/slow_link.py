@@ -237,8 +237,11 @@ def line_process(module: str, *words: str) -> Iterator[LineProcess]:
     """Run ``python -m module words...`` until the end of the block."""
     process = subprocess.Popen(
         [sys.executable, "-m", module, *words],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     try:
         yield LineProcess(process)
     finally:

@@ -51,12 +51,12 @@ def _play(
 ) -> None:
     die_with(parent)
     if not is_bystander:
-        os.setsid()  # the scheduler shares processors between sessions: it is nobody's that is measured
+        os.setsid()  # the scheduler shares processors between sessions: not those of what is measured
     try:
         last = "returned", function(Orders(pipe), *arguments)
     except Exception:
         last = "raised", traceback.format_exc()
-    with contextlib.suppress(OSError):  # nobody wants to know any more
+    with contextlib.suppress(OSError):  # the scene has ended
         pipe.send(last)
 
 
@@ -155,7 +155,7 @@ class Seen:
 
 
 def paced(orders: Orders, socket: zmq.Socket[bytes], request: bytes, expected: int) -> Seen:
-    """Ask once a period until told to end."""
+    """Ask once a period until the scene ends."""
     seen = Seen()
     next_s = time.perf_counter()
     while orders.go_on(max(0.0, next_s - time.perf_counter())):
@@ -216,12 +216,12 @@ def newcomers(orders: Orders, endpoint: str, radius_m: float) -> tuple[list[floa
     list of float
         Seconds of those that got what they wanted.
     Counter of str
-        What the others were told.
+        Errors of the others.
     """
     import shmmap
 
     times: list[float] = []
-    told: Counter[str] = Counter()
+    refusals: Counter[str] = Counter()
     orders.say("up")
     while orders.go_on(NEWCOMER_S):
         begin_s = time.perf_counter()
@@ -233,10 +233,10 @@ def newcomers(orders: Orders, endpoint: str, radius_m: float) -> tuple[list[floa
                 assert read == read
                 del cells
         except Exception as error:
-            told[f"{type(error).__name__}: {error}".split("\n")[0][:150]] += 1
+            refusals[f"{type(error).__name__}: {error}".split("\n")[0][:150]] += 1
         else:
             times.append(time.perf_counter() - begin_s)
-    return times, told
+    return times, refusals
 
 
 def works(orders: Orders) -> tuple[float, float]:
@@ -277,7 +277,7 @@ def walks_cold(
     y_m: tuple[float, float],
     once: bool = False,
 ) -> tuple[int, float]:
-    """Walk over a rectangle, ask for 36 cells at each step, and let go of them.
+    """Walk over a rectangle, ask for 36 cells at each step, and release them.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ def walks_cold(
     int
         Cells that were loaded meanwhile: what is still in memory from the last time does not count.
     float
-        Seconds it took, less than ``seconds`` if it is told to end.
+        Seconds it took, less than ``seconds`` if the scene ends it.
     """
     with RawClient(endpoint, name="walks", timeout=WALK_TIMEOUT_S) as client:
         before = client.ask("stats")[4]["loads_finished"]
@@ -305,7 +305,7 @@ def walks_cold(
 
 
 def fills(orders: Orders, endpoint: str, side: int, most: int) -> int:
-    """Have the cells of a map of ``side`` x ``side`` loaded, row by row, until so many came."""
+    """Have the cells of a map of ``side`` x ``side`` loaded, row by row, until ``most`` came."""
     came = 0
     with RawClient(endpoint, name="fills", timeout=WALK_TIMEOUT_S) as client:
         for row in range(side):

@@ -64,13 +64,13 @@ class Beside:
 
     def __init__(
         self,
-        told: Report,
+        report: Report,
         one: DaemonProcess,
         *,
         newcomers_too: bool = True,
         over_idle_mib: float = OVER_IDLE_MIB,
     ) -> None:
-        self._told = told
+        self._report = report
         self._one = one
         self._newcomers_too = newcomers_too
         self._over_idle_mib = over_idle_mib
@@ -120,7 +120,7 @@ class Beside:
                 self._looks.append(Look.at(self._one.pid))
 
     def _loop_in(self, begin_s: float, end_s: float) -> str:
-        """Say what the loop did in some time, as far as the looks tell."""
+        """Say what the loop did in some time, as far as the looks show."""
         times = [look.now_s for look in self._looks]
         first = self._looks[max(0, bisect.bisect_right(times, begin_s) - 1)]
         last = self._looks[min(len(times) - 1, bisect.bisect_left(times, end_s))]
@@ -131,39 +131,41 @@ class Beside:
         )
 
     def _judge(self) -> None:
-        told, one = self._told, self._one
+        report, one = self._report, self._one
         alive = one.process is not None and one.process.poll() is None
-        told.must("the daemon lives", alive)
+        report.must("the daemon lives", alive)
         if not alive:
             return
         probe, echo = self._probe.end(), self._echo.end()
         self._ended.set()
-        told.tell(f"all of it: {self._loop_in(self._looks[0].now_s, self._looks[-1].now_s)}")
-        told.tell(f"turns of the loop, processor time: {self.turns.said()}")
-        told.tell(f"probe {_figures(probe.times_ms)}")
-        told.tell(f"in its longest: {self._loop_in(*probe.longest_s)}")
-        told.tell(f"echo  {_figures(echo.times_ms)}")
+        report.note(f"all of it: {self._loop_in(self._looks[0].now_s, self._looks[-1].now_s)}")
+        report.note(f"turns of the loop, processor time: {self.turns.said()}")
+        report.note(f"probe {_figures(probe.times_ms)}")
+        report.note(f"in its longest: {self._loop_in(*probe.longest_s)}")
+        report.note(f"echo  {_figures(echo.times_ms)}")
         longest, longest_echo = max(probe.times_ms), max(echo.times_ms)
-        told.limit("longest of the probe, over the echo's", longest - longest_echo, OVER_ECHO_MS, "ms")
+        report.limit("longest of the probe, over the echo's", longest - longest_echo, OVER_ECHO_MS, "ms")
         if probe.odd:
-            told.must("every answer to the probe has its cells", False, f"{probe.odd} have not")
+            report.must("every answer to the probe has its cells", False, f"{probe.odd} have not")
         mib = 1 << 20
         grown = (self._peak - self._idle) / mib
-        told.tell(f"daemon's private memory: idle {self._idle / mib:.1f} MiB, peak {self._peak / mib:.1f}")
-        told.limit("over idle", grown, self._over_idle_mib, "MiB")
-        told.figures.update(
-            p99=f"{np.percentile(probe.times_ms, 99):.1f}", probe=f"{longest:.0f}",
-            echo=f"{longest_echo:.0f}", memory=f"{grown:+.0f}",
-        )  # fmt: skip
+        report.note(f"daemon's private memory: idle {self._idle / mib:.1f} MiB, peak {self._peak / mib:.1f}")
+        report.limit("over idle", grown, self._over_idle_mib, "MiB")
+        report.figures.update(
+            p99=f"{np.percentile(probe.times_ms, 99):.1f}",
+            probe=f"{longest:.0f}",
+            echo=f"{longest_echo:.0f}",
+            memory=f"{grown:+.0f}",
+        )
         if self._newcomers_too:
             times, failures = self._newcomers.end()
             count = len(times) + failures.total()
-            told.must("newcomers get in", not failures, f"{len(times)} of {count}")
+            report.must("newcomers get in", not failures, f"{len(times)} of {count}")
             if times:
-                told.tell(f"the slowest of them took {max(times) * 1e3:.0f} ms")
+                report.note(f"the slowest of them took {max(times) * 1e3:.0f} ms")
             for words, number in failures.most_common(3):
-                told.tell(f"{number} were told: {words}")
-            told.figures["newcomers"] = f"{len(times)}/{count}"
+                report.note(f"{number} got: {words}")
+            report.figures["newcomers"] = f"{len(times)}/{count}"
 
 
 def warm_and_pinned(one: DaemonProcess) -> None:
@@ -211,7 +213,7 @@ class Turns:
         found = histogram.since(self._before)
         last = max((bucket for bucket, count in enumerate(found.counts) if count), default=0)
         grown = max((ms for kind, ms in longest.items() if ms > self._longest_before[kind]), default=0.0)
-        if grown * 1e6 < lower_bound_ns(last):  # a kind that once had a longer one: only the bucket tells
+        if grown * 1e6 < lower_bound_ns(last):  # a kind that once had a longer one: only the bucket shows it
             grown = lower_bound_ns(last + 1) / 1e6
         return (found.quantile_s(share) or 0.0) * 1e3, grown
 

@@ -51,7 +51,7 @@ def asks_for_what_hangs(orders: Orders, endpoint: str, names: list[str]) -> int:
 
 
 @scene("A13", "A file system that hangs stops no request for what is in memory")
-def hung_files(told: Report, stage: Stage) -> None:
+def hung_files(report: Report, stage: Stage) -> None:
     """Cells that failed, and cells that were never loaded, lie on a mount that hangs; for 15 s."""
     made = stage.new_map()
     names = [name for name, (x, _) in made.corners.items() if x in (-60, 40)]
@@ -60,13 +60,15 @@ def hung_files(told: Report, stage: Stage) -> None:
     with stage.served(made.root) as one, hung_mount(made.root / "hung") as hung:
         with RawClient(one.endpoint) as client:
             failed = client.selected(names[::2]).failed
-        told.tell(f"{len(failed)} cells have failed, {len(names[1::2])} were never asked for; now they hang")
+        report.note(
+            f"{len(failed)} cells have failed, {len(names[1::2])} were never asked for; now they hang"
+        )
         for name in names:
             (made.pcd_dir / name).unlink()
             (made.pcd_dir / name).symlink_to(hung / name)
-        with Beside(told, one), Actor(asks_for_what_hangs, one.endpoint, names) as attacker:
+        with Beside(report, one), Actor(asks_for_what_hangs, one.endpoint, names) as attacker:
             time.sleep(15.0)
-            told.tell(f"asked for them {attacker.end()} times")
+            report.note(f"asked for them {attacker.end()} times")
 
 
 def columns_of(client: RawClient, layer: str) -> dict[str, dict[str, NDArray[Any]]]:
@@ -85,7 +87,7 @@ def differing(one: dict[str, dict[str, NDArray[Any]]], other: dict[str, dict[str
 
 
 @scene("A16", "An entry of the disk cache that belongs to another cell is not served")
-def swapped_entries(told: Report, stage: Stage) -> None:
+def swapped_entries(report: Report, stage: Stage) -> None:
     """Every entry of one layer is replaced by its neighbour's."""
     layer = "voxel(leaf=0.5)"
     one = DaemonProcess(stage.new_map().root)
@@ -102,8 +104,8 @@ def swapped_entries(told: Report, stage: Stage) -> None:
             one.start()
             client.hello()
             found = columns_of(client, layer)
-            told.must("there were entries to swap", len(entries) >= 36, str(len(entries)))
-            told.limit(f"of {len(found)} cells have another's bytes", differing(right, found), 0)
+            report.must("there were entries to swap", len(entries) >= 36, str(len(entries)))
+            report.limit(f"of {len(found)} cells have another's bytes", differing(right, found), 0)
             one.stop()
     finally:
         one.dispose()
@@ -115,7 +117,7 @@ def says(client: RawClient, tag: str, *elements: Any) -> list[Any]:
 
 
 @scene("A17", "Metadata with endless numbers and names is refused in a few words")
-def long_metadata(told: Report, stage: Stage) -> None:
+def long_metadata(report: Report, stage: Stage) -> None:
     """A corner of ten million digits, a name of ten million letters, and their like; all reloaded."""
     made = stage.new_map()
     metadata = made.root / "pointcloud_map_metadata.yaml"
@@ -130,16 +132,20 @@ def long_metadata(told: Report, stage: Stage) -> None:
         "a million anchors": "".join(f"a{i}: &a{i} [1, 2]\n" for i in range(1_000_000)),
         "aliases": "a: &a [1, 2]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(500_000)),
     }
-    with stage.served(made.root) as one, Beside(told, one), RawClient(one.endpoint, timeout=120.0) as client:
+    with (
+        stage.served(made.root) as one,
+        Beside(report, one),
+        RawClient(one.endpoint, timeout=120.0) as client,
+    ):
         for what, line in bad.items():
             metadata.write_text(good + line)
             logged = len(one.log)
             reply = says(client, "reload")
-            told.tell(f"{what}: {reply[0]} {str(reply[2:])[:120]}")
-            told.must("it is no defect of ours", reply[0] != "error" or reply[2] != "internal")
-            told.limit("reply", client.last_bytes, 4096, "bytes")
-            told.limit("log", len(one.log) - logged, 8192, "bytes")
-        told.limit("defects", client.ask("stats")[4].get("defects", 0), 0)
+            report.note(f"{what}: {reply[0]} {str(reply[2:])[:120]}")
+            report.must("it is no defect of ours", reply[0] != "error" or reply[2] != "internal")
+            report.limit("reply", client.last_bytes, 4096, "bytes")
+            report.limit("log", len(one.log) - logged, 8192, "bytes")
+        report.limit("defects", client.ask("stats")[4].get("defects", 0), 0)
 
 
 def reloads(orders: Orders, endpoint: str) -> tuple[float, str]:

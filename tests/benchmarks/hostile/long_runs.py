@@ -24,7 +24,7 @@ SEGMENTS: Final = 7430
 
 
 @scene("worst-five", "The worst of them all at once, for minutes, are as if they were not there")
-def worst_five(told: Report, stage: Stage) -> None:
+def worst_five(report: Report, stage: Stage) -> None:
     """A1, A2, A3, A4 and A6 together under a full budget of 7430 segments and 1024 descriptors."""
     span = (0.0, SIDE * 20.0)
     flags = ["--budget", budget_for(SEGMENTS), "--cache-size", "0"]
@@ -36,7 +36,7 @@ def worst_five(told: Report, stage: Stage) -> None:
             events_path = client.hello()[19]
         idlers = stack.enter_context(Actor(idles_with_routes, one.endpoint, 300, span[1]))
         idlers.said(900.0)
-        stack.enter_context(Beside(told, one))
+        stack.enter_context(Beside(report, one))
         attackers = [
             stack.enter_context(attacker)
             for attacker in (
@@ -49,7 +49,7 @@ def worst_five(told: Report, stage: Stage) -> None:
         ]
         time.sleep(stage.minutes * 60.0)
         for attacker in attackers:
-            told.tell(f"{attacker.name}: {last_words(attacker)}")
+            report.note(f"{attacker.name}: {last_words(attacker)}")
 
 
 def last_words(attacker: Actor) -> str:
@@ -102,7 +102,7 @@ def drives(orders: Orders, endpoint: str, vehicles: int, span_m: float, seed: in
 
 
 @scene("churn", "Very many cells, vehicles, evictions and a reload for minutes: no turn of the loop is long")
-def churn(told: Report, stage: Stage) -> None:
+def churn(report: Report, stage: Stage) -> None:
     """A million cells, 100 000 of them in memory, 200 sessions with routes that drive, one reload."""
     side, segments = 1000, 100_000
     path = stage.many_cells(side)
@@ -110,8 +110,8 @@ def churn(told: Report, stage: Stage) -> None:
         one = stack.enter_context(stage.served(path, "--budget", budget_for(segments)))
         begin_s = time.monotonic()
         with Actor(fills, one.endpoint, side, segments) as filler:
-            told.tell(f"{filler.said(1800.0)} cells were loaded in {time.monotonic() - begin_s:.0f} s")
-        beside = stack.enter_context(Beside(told, one))
+            report.note(f"{filler.said(1800.0)} cells were loaded in {time.monotonic() - begin_s:.0f} s")
+        beside = stack.enter_context(Beside(report, one))
         share = VEHICLES // PROCESSES
         drivers = [
             stack.enter_context(Actor(drives, one.endpoint, share, side * 20.0, seed))
@@ -125,18 +125,20 @@ def churn(told: Report, stage: Stage) -> None:
         touch_the_last(path, side)
         with Actor(reloads, one.endpoint) as operator:
             took_s, failure = operator.said(900.0)
-        told.must(f"the reload, {took_s:.1f} s, was answered", not failure, failure)
+        report.must(f"the reload, {took_s:.1f} s, was answered", not failure, failure)
         time.sleep(stage.minutes * 30.0)
         after = counters_of(one)
         asked = sum(driver.end() for driver in drivers)
         for name in ("requests", "loads_finished", "evictions", "reloads"):
-            told.tell(f"{name}: {after[name] - before[name]}")
-        told.tell(f"{VEHICLES} vehicles asked {asked} times; {len(one.segments())} segments at the end")
+            report.note(f"{name}: {after[name] - before[name]}")
+        report.note(f"{VEHICLES} vehicles asked {asked} times; {len(one.segments())} segments at the end")
         p999, longest = beside.turns.quantile_and_longest_ms(0.999)
-        told.limit("99.9 % of the loop's turns take", p999, TURN_P999_MS, "ms")
-        told.limit("the longest takes", longest, LONGEST_TURN_MS, "ms")
+        report.limit("99.9 % of the loop's turns take", p999, TURN_P999_MS, "ms")
+        report.limit("the longest takes", longest, LONGEST_TURN_MS, "ms")
         same_p999, same_longest = worker.end()
-        told.tell(f"the same 0.4 ms of work beside it: p99.9 {same_p999:.2f}  longest {same_longest:.1f} ms")
+        report.note(
+            f"the same 0.4 ms of work beside it: p99.9 {same_p999:.2f}  longest {same_longest:.1f} ms"
+        )
 
 
 def counters_of(one: DaemonProcess) -> dict[str, int]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A client beside three hostile clients, and beside three unrelated processes as busy as they.
 
-In turns: nobody; three processes that only compute; three clients that do all they can to the daemon: one
+In turns: nothing; three processes that only compute; three clients that do all they can to the daemon: one
 floods it with requests and reads no reply, one sends garbage of all sizes up to frames that are too large,
 one connects and disconnects, asks for the whole map and for statistics without end.  All of them run all the
 time and are stopped (SIGSTOP) while it is not their turn.
@@ -147,7 +147,7 @@ def paced(client: RawClient, request: bytes, seconds: float) -> list[float]:
 
 
 def beside_hostile_and_busy(rounds: int, seconds: float) -> None:
-    """Measure and print: so many rounds of three times so many seconds."""
+    """Measure and print: ``rounds`` rounds of three times ``seconds`` seconds."""
     with tempfile.TemporaryDirectory() as directory:
         made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
         one = DaemonProcess(made.root, "--budget", "1G").start()
@@ -156,7 +156,7 @@ def beside_hostile_and_busy(rounds: int, seconds: float) -> None:
         held = pack_versions([handle.version for handle in everything[:60]])
         request = pack(["differential", 1, ["box", -99.0, -99.0, 99.0, 99.0], ["points"], [], held, 10.0])
         groups = {
-            "nobody": [],
+            "nothing": [],
             "busy processes": [start(_BUSY) for _ in range(MEDDLERS)],
             "hostile clients": [start(_PRELUDE + program, one.endpoint) for program in _HOSTILE],
         }

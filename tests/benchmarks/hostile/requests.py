@@ -45,13 +45,13 @@ def waits_with_many_requests(
 
 
 @scene("A2", "A process's waiting requests are not answered all in one turn")
-def waiting_requests(told: Report, stage: Stage) -> None:
+def waiting_requests(report: Report, stage: Stage) -> None:
     """One session with 64 requests for 20 000 cells each, then four sessions with 229."""
-    with stage.served(stage.many_cells(SIDE), "--budget", "1G") as one, Beside(told, one):
+    with stage.served(stage.many_cells(SIDE), "--budget", "1G") as one, Beside(report, one):
         for counts in ([64], [58, 57, 57, 57]):
             with Actor(waits_with_many_requests, one.endpoint, counts, 3.0) as attacker:
                 found = attacker.said(600.0)
-            told.tell(f"{len(counts)} sessions, {sum(counts)} waiting requests of {SIDE**2} cells: {found}")
+            report.note(f"{len(counts)} sessions, {sum(counts)} waiting requests of {SIDE**2} cells: {found}")
 
 
 def asks_for_normals(orders: Orders, endpoint: str) -> dict[str, Any]:
@@ -72,15 +72,15 @@ def asks_for_normals(orders: Orders, endpoint: str) -> dict[str, Any]:
 
 
 @scene("A6", "Layers that look at neighbours cost nothing before the limits are checked, and little after")
-def halo_layers(told: Report, stage: Stage) -> None:
+def halo_layers(report: Report, stage: Stage) -> None:
     """Differentials with normals(radius=50) over 20 000 cells, for 20 s."""
     with (
         stage.served(stage.many_cells(SIDE), "--budget", "1G", "--cache-size", "0") as one,
-        Beside(told, one),
+        Beside(report, one),
         Actor(asks_for_normals, one.endpoint) as attacker,
     ):
         time.sleep(20.0)
-        told.tell(
+        report.note(
             f"normals(radius=50) of {SIDE**2} cells, every other request also of radius 49: {attacker.end()}"
         )
 
@@ -136,24 +136,26 @@ def cold_cell_s(client: RawClient, names: list[str]) -> list[float]:
     return times
 
 
-@scene("A7", "Layers that take long do not hold up somebody else's cold cell")
-def slow_layers(told: Report, stage: Stage) -> None:
-    """About 35 layers of 5 s each are wanted; a cold cell of somebody else, five times."""
+@scene("A7", "Layers that take long do not hold up another client's cold cell")
+def slow_layers(report: Report, stage: Stage) -> None:
+    """About 35 layers of 5 s each are wanted; a cold cell of another client, five times."""
     made = stage.new_map(columns=20, rows=20, points=2000)
     path = f"{ROOT}{os.pathsep}{install_slow_kind(stage.scratch / 'slow_kind')}"
     with (
         stage.served(made.root, "--cache-size", "0", environment={"PYTHONPATH": path}) as one,
         RawClient(one.endpoint, timeout=300.0) as client,
-        Beside(told, one),
+        Beside(report, one),
     ):
         (_,) = client.ask("area", circle(150, 150, 0.1), ["slow(seconds=0)"], 60.0, None)[4]
         alone = max(cold_cell_s(client, [f"100_{y}.pcd" for y in range(-200, -100, 20)]))
         with Actor(asks_for_slow_layers, one.endpoint) as attacker:
             attacker.said()
             beside = cold_cell_s(client, [f"120_{y}.pcd" for y in range(-200, -100, 20)])
-        told.tell(f"a cold cell took at most {alone:.3f} s alone; beside slow layers "
-                  + ", ".join(f"{took:.2f}" for took in beside))  # fmt: skip
-        told.limit("longest, over that alone", max(beside) - alone, 1.0, "s")
+        report.note(
+            f"a cold cell took at most {alone:.3f} s alone; beside slow layers "
+            + ", ".join(f"{took:.2f}" for took in beside)
+        )
+        report.limit("longest, over that alone", max(beside) - alone, 1.0, "s")
 
 
 LAYERS: Final = 1491
@@ -172,17 +174,19 @@ def uses_up_layers(orders: Orders, endpoint: str) -> dict[str, int]:
 
 
 @scene("A8", "The number of different layers cannot be used up for good")
-def layers_used_up(told: Report, stage: Stage) -> None:
-    """One cell in 1491 different layers and more; then somebody else wants another one."""
-    with stage.served(stage.many_cells(150), "--cache-size", "0") as one, Beside(told, one):
+def layers_used_up(report: Report, stage: Stage) -> None:
+    """One cell in 1491 different layers and more; then another client wants another one."""
+    with stage.served(stage.many_cells(150), "--cache-size", "0") as one, Beside(report, one):
         with Actor(uses_up_layers, one.endpoint) as attacker:
-            told.tell(f"one client, one cell: {attacker.said(600.0)}")
+            report.note(f"one client, one cell: {attacker.said(600.0)}")
         with RawClient(one.endpoint) as client:
             for layer in ("voxel(leaf=3.3)", "ndt(leaf=2.5)"):
                 reply = client.wait_for_any(
                     client.send("area", circle(410.0, 410.0, 0.1), [layer], 60.0, None)
                 )
-                told.must(f"somebody else gets {layer}", reply[0] == "cells" and len(reply[4]) == 1, reply[3])
+                report.must(
+                    f"another client gets {layer}", reply[0] == "cells" and len(reply[4]) == 1, reply[3]
+                )
 
 
 BOMB_BYTES: Final = 34 << 20
@@ -206,14 +210,14 @@ def write_bomb(path: Path) -> int:
 
 
 @scene("A9", "A compressed file that grows to gigabytes takes neither the loader nor its neighbours with it")
-def bomb(told: Report, stage: Stage) -> None:
+def bomb(report: Report, stage: Stage) -> None:
     """34 MiB that become 3 GiB, wanted as a computed layer, and a neighbour's normals."""
     made = stage.new_map()
     nbytes = write_bomb(made.pcd_dir / "40_40.pcd")
-    told.tell(f"{BOMB_BYTES / 1e6:.0f} MB of LZF become {nbytes / 1e9:.2f} GB")
+    report.note(f"{BOMB_BYTES / 1e6:.0f} MB of LZF become {nbytes / 1e9:.2f} GB")
     with (
         stage.served(made.root, "--budget", "256M", "--cache-size", "0") as one,
-        Beside(told, one),
+        Beside(report, one),
         RawClient(one.endpoint, timeout=300.0) as client,
     ):
         for x, layer in ((50.0, "voxel(leaf=1.0)"), (30.0, "normals(radius=5)")):
@@ -224,7 +228,7 @@ def bomb(told: Report, stage: Stage) -> None:
                 time.sleep(0.02)
             reply = client.receive()
             failed = [(failure[2], failure[3][:100]) for failure in reply[8]]
-            told.tell(
+            report.note(
                 f"{layer} at x = {x:g}: {time.monotonic() - begin_s:.1f} s, {len(reply[4])} cells, {failed}"
             )
-            told.limit("private memory of a loader", peak / (1 << 20), LOADER_MIB, "MiB")
+            report.limit("private memory of a loader", peak / (1 << 20), LOADER_MIB, "MiB")

@@ -21,12 +21,12 @@ ROUTE_VERTICES: Final = 64
 
 
 def budget_for(segments: int) -> str:
-    """A budget that so many segments fill, the statistics segment included."""
+    """A budget that ``segments`` segments fill, the statistics segment included."""
     return str(segments * (SEGMENT_BYTES + 100) + (1 << 20))
 
 
 def idles_with_routes(orders: Orders, endpoint: str, count: int, span_m: float) -> int:
-    """Some sessions tell each where they are and a long route, and say nothing more."""
+    """Sessions that each send a position and a long route, and nothing more."""
     rng = random.Random(count)
     sessions = []
     for _ in range(count):
@@ -42,7 +42,7 @@ def idles_with_routes(orders: Orders, endpoint: str, count: int, span_m: float) 
 
 
 @scene("A4", "Idle sessions with routes cost the loads of others nothing")
-def routes(told: Report, stage: Stage) -> None:
+def routes(report: Report, stage: Stage) -> None:
     """A full budget of 7430 segments; 40, then 300 idle sessions with routes of 64 vertices; cold cells."""
     side, segments = 141, 7430
     span_m = side * 20.0
@@ -51,7 +51,7 @@ def routes(told: Report, stage: Stage) -> None:
         one = stack.enter_context(stage.served(stage.many_cells(side), "--budget", budget_for(segments)))
         with Actor(fills, one.endpoint, side, segments) as filler:
             filler.said(900.0)
-        stack.enter_context(Beside(told, one))
+        stack.enter_context(Beside(report, one))
         alone = 0.0
         for count in (0, 40, 300):
             idlers = stack.enter_context(Actor(idles_with_routes, one.endpoint, count, span_m))
@@ -60,14 +60,14 @@ def routes(told: Report, stage: Stage) -> None:
                 came, took_s = walker.said(900.0)
             rate = came / took_s
             alone = alone or rate
-            told.tell(
+            report.note(
                 f"{count} sessions with routes, {len(one.segments())} segments: {rate:.1f} cold cells/s"
             )
-            told.limit("without them, over with them", alone / max(rate, 1e-3), 1.5)
+            report.limit("without them, over with them", alone / max(rate, 1e-3), 1.5)
 
 
 @scene("A5", "Cold cells under a full budget come as quickly with 100 000 segments as with 1000")
-def many_segments(told: Report, stage: Stage) -> None:
+def many_segments(report: Report, stage: Stage) -> None:
     """Budgets full with 1000, 1974, 7438 and 100 000 segments; the same cold walks on each, in turns."""
     side = 330
     span_m = side * 20.0
@@ -83,7 +83,7 @@ def many_segments(told: Report, stage: Stage) -> None:
                 filler.said(1200.0)
 
         def walk(one: DaemonProcess, part: int) -> float:
-            x_m = (span_m / 4.0 * part, span_m / 4.0 * (part + 1))  # nobody was there before
+            x_m = (span_m / 4.0 * part, span_m / 4.0 * (part + 1))  # not visited before
             with Actor(walks_cold, one.endpoint, 5.0, x_m, (span_m - 540.0, span_m), True) as walker:
                 came, took_s = walker.said(900.0)
             return float(came / took_s)
@@ -91,17 +91,17 @@ def many_segments(told: Report, stage: Stage) -> None:
         for part in range(3):
             for size, one in daemons.items():
                 rates[size].append(walk(one, part))
-        with Beside(told, daemons[sizes[-1]]):  # not before: that daemon alone would serve others, too
+        with Beside(report, daemons[sizes[-1]]):  # not before: that daemon alone would serve others, too
             walk(daemons[sizes[-1]], 3)
         for size, one in daemons.items():
             shown = ", ".join(f"{rate:.1f}" for rate in rates[size])
-            told.tell(f"{len(one.segments())} segments: {shown} cold cells/s")
+            report.note(f"{len(one.segments())} segments: {shown} cold cells/s")
     ratio = max(rates[sizes[0]]) / max(max(rates[sizes[-1]]), 1e-3)
-    told.limit("cold cells/s with 1000, over those with 100 000 segments", ratio, 1 / 0.8)
+    report.limit("cold cells/s with 1000, over those with 100 000 segments", ratio, 1 / 0.8)
 
 
 def loads_and_evicts(orders: Orders, endpoint: str, metres: float, rounds: int) -> tuple[int, int]:
-    """Load what lies in a square, let go of it, and have it evicted; returns bytes of a round, and rounds."""
+    """Load what lies in a square, release it, and have it evicted; returns bytes of a round, and rounds."""
     nbytes = 0
     with RawClient(endpoint, name="evicts", timeout=300.0) as client:
         for _ in range(rounds):
@@ -115,15 +115,15 @@ def loads_and_evicts(orders: Orders, endpoint: str, metres: float, rounds: int) 
     return nbytes, rounds
 
 
-@scene("A11", "Freeing memory stops nobody")
-def freeing(told: Report, stage: Stage) -> None:
+@scene("A11", "Freeing memory delays no client")
+def freeing(report: Report, stage: Stage) -> None:
     """64 cells of 1 MB evicted at once, ten times; then 625 of them, three times."""
-    with stage.served(stage.many_cells(28, 65_000), "--budget", "2G") as one, Beside(told, one):
+    with stage.served(stage.many_cells(28, 65_000), "--budget", "2G") as one, Beside(report, one):
         for cells_wide, rounds in ((8, 10), (25, 3)):
             metres = 61.0 + 20.0 * cells_wide - 2.0
             with Actor(loads_and_evicts, one.endpoint, metres, rounds) as attacker:
                 nbytes, times = attacker.said(600.0)
-            told.tell(f"{nbytes / 1e6:.0f} MB were freed at once, {times} times")
+            report.note(f"{nbytes / 1e6:.0f} MB were freed at once, {times} times")
 
 
 def holds_and_asks_for_more(orders: Orders, endpoint: str, held_m: float) -> dict[str, int]:
@@ -147,7 +147,7 @@ def holds_and_asks_for_more(orders: Orders, endpoint: str, held_m: float) -> dic
 
 
 @scene("A12", "A client near its quota, with very much mapped, costs the others nothing")
-def near_the_quota(told: Report, stage: Stage) -> None:
+def near_the_quota(report: Report, stage: Stage) -> None:
     """5929 cells held, and requests for 400 more that the quota does not allow, for 15 s."""
     held = 77
     quota = str(held**2 * SEGMENT_BYTES + (64 << 10))
@@ -156,9 +156,9 @@ def near_the_quota(told: Report, stage: Stage) -> None:
         stage.served(stage.many_cells(141), *flags) as one,
         Actor(holds_and_asks_for_more, one.endpoint, held * 20.0 - 1.0) as attacker,
     ):
-        told.tell(f"{attacker.said(600.0)['held']} cells are held and mapped")
-        with Beside(told, one):
+        report.note(f"{attacker.said(600.0)['held']} cells are held and mapped")
+        with Beside(report, one):
             time.sleep(15.0)
         found = attacker.end()
-        told.tell(f"beside {found}")
-        told.must("the quota refused something", found["refused"] > 0)
+        report.note(f"beside {found}")
+        report.must("the quota refused something", found["refused"] > 0)

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from pathlib import Path
 from typing import Final
 
 import zmq
@@ -66,16 +67,18 @@ def subscribes(orders: Orders, path: str) -> dict[str, int]:
     return found
 
 
-@scene("A1", "Subscriptions to many prefixes take no memory, and their end stops nobody")
-def subscriptions(told: Report, stage: Stage) -> None:
+@scene("A1", "Subscriptions to many prefixes take no memory, and their end delays no one")
+def subscriptions(report: Report, stage: Stage) -> None:
     """One subscriber that asks for another prefix without end, for 30 s; then it is killed."""
-    with stage.served(stage.new_map().root) as one, Beside(told, one):
+    with stage.served(stage.new_map().root) as one, Beside(report, one):
         with RawClient(one.endpoint, hello=False) as client:
             events_path = client.hello()[19]
         with Actor(subscribes, events_path) as attacker:
             time.sleep(30.0)
             found = attacker.end()
-            told.tell(f"sent in 30 s: {found['prefixes']} subscriptions; connections ended: {found['ended']}")
+            report.note(
+                f"sent in 30 s: {found['prefixes']} subscriptions; connections ended: {found['ended']}"
+            )
         time.sleep(2.0)
 
 
@@ -155,18 +158,20 @@ def opens_sessions(orders: Orders, endpoint: str) -> int:
     return count
 
 
-@scene("A22", "More connections than descriptors keep nobody out, with nothing but what the kernel promises")
-def crowds(told: Report, stage: Stage) -> None:
+@scene(
+    "A22", "More connections than descriptors keep no client out, with nothing but what the kernel promises"
+)
+def crowds(report: Report, stage: Stage) -> None:
     """2000 silent connections, then 2000 sessions, under a limit of 1024 descriptors."""
-    with stage.served(stage.new_map().root, descriptors=DESCRIPTORS) as one, Beside(told, one):
+    with stage.served(stage.new_map().root, descriptors=DESCRIPTORS) as one, Beside(report, one):
         for crowd in (says_nothing, opens_sessions):
             with Actor(crowd, one.endpoint) as attacker:
                 time.sleep(15.0)
-                told.limit("descriptors of the daemon", descriptors(one.pid), DESCRIPTORS - 1)
-                told.tell(f"{attacker.name}: {attacker.end()} came, of one process")
+                report.limit("descriptors of the daemon", descriptors(one.pid), DESCRIPTORS - 1)
+                report.note(f"{attacker.name}: {attacker.end()} came, of one process")
         log = one.log
-    told.tell(f"'connections ended' lines in the log: {log.count('connections ended')}")
-    told.must("the daemon reads no private state of the kernel's", not reads_fdinfo())
+    report.note(f"'connections ended' lines in the log: {log.count('connections ended')}")
+    report.must("the daemon reads no private state of the kernel's", not reads_fdinfo())
 
 
 def reads_fdinfo() -> bool:
@@ -176,49 +181,51 @@ def reads_fdinfo() -> bool:
     )
 
 
-@scene("A3", "Clients that are dropped without a goodbye keep no descriptor, no place and nobody out")
-def dropped_clients(told: Report, stage: Stage) -> None:
+@scene(
+    "A3", "Clients that are dropped without a goodbye keep no descriptor, no place and no other client out"
+)
+def dropped_clients(report: Report, stage: Stage) -> None:
     """932, then 1500 clients of one process under a limit of 1024 descriptors; 100 cells stay mapped."""
     side = 60
     span_m = (-side * 10.0, side * 10.0)
     made = stage.new_map(columns=side, rows=side, points=400)
     with (
         stage.served(made.root, "--budget", "12M", descriptors=DESCRIPTORS) as one,
-        Beside(told, one),
+        Beside(report, one),
         RawClient(one.endpoint) as operator,
     ):
         with Actor(walks_cold, one.endpoint, 6.0, span_m, span_m) as walker:
             walker.said()  # the budget is full from now on
         with Actor(walks_cold, one.endpoint, 8.0, span_m, span_m) as walker:
             before, took_s = walker.said()
-        told.tell(f"cold cells in 8 s before: {before / took_s * 8:.0f}")
+        report.note(f"cold cells in 8 s before: {before / took_s * 8:.0f}")
         stops = [932, 1500]
         with Actor(leaves_without_a_word, one.endpoint, span_m, stops) as attacker:
             for stop in stops:
                 count, failures = attacker.said()
-                told.limit(f"of {stop} clients that were dropped were refused", stop - count, 0)
+                report.limit(f"of {stop} clients that were dropped were refused", stop - count, 0)
                 if failures:
-                    told.tell(f"one was told: {failures[0]}")
-                told.limit("descriptors of the daemon", descriptors(one.pid), DESCRIPTORS - 1)
+                    report.note(f"one got: {failures[0]}")
+                report.limit("descriptors of the daemon", descriptors(one.pid), DESCRIPTORS - 1)
                 time.sleep(1.0)
                 rows = operator.ask("stats")[5]
                 placed = sum(row[10] is not None for row in rows if row[4].startswith("silent"))
-                told.limit("of them the daemon still heeds the places of", placed, 0)
+                report.limit("of them the daemon still heeds the places of", placed, 0)
             time.sleep(REST_S)
             with Actor(walks_cold, one.endpoint, 8.0, span_m, span_m) as walker:
                 after, took_s = walker.said()
-            told.tell(f"cold cells in 8 s beside them: {after / took_s * 8:.0f}")
-            told.limit("those before over these", before / max(1, after), 1.5)
+            report.note(f"cold cells in 8 s beside them: {after / took_s * 8:.0f}")
+            report.limit("those before over these", before / max(1, after), 1.5)
 
 
 def leases(orders: Orders, paths: list[str]) -> int:
     """Take and give back a lease of each file again and again, as the daemon does to see who uses it."""
-    signal.signal(signal.SIGIO, signal.SIG_IGN)  # somebody opens what is leased
+    signal.signal(signal.SIGIO, signal.SIG_IGN)  # another process opens what is leased
     count = 0
     while orders.go_on():
         for path in paths:
             fd = os.open(path, os.O_RDONLY)
-            with contextlib.suppress(OSError):  # somebody has it open
+            with contextlib.suppress(OSError):  # another process has it open
                 fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
                 fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_UNLCK)
                 count += 1
@@ -227,7 +234,7 @@ def leases(orders: Orders, paths: list[str]) -> int:
 
 
 def opens(orders: Orders, endpoint: str, shm_dir: str, seconds: float) -> tuple[int, Counter[str]]:
-    """Ask for cells, map them and let go, for some seconds; how often, and what failed."""
+    """Ask for cells, map and release them, for some seconds; how often, and what failed."""
     count, failures = 0, Counter[str]()
     with shmmap.connect(endpoint, name="opens", shm_dir=shm_dir) as client:
         end_s = time.monotonic() + seconds
@@ -243,7 +250,7 @@ def opens(orders: Orders, endpoint: str, shm_dir: str, seconds: float) -> tuple[
 
 
 @scene("A21", "Opening a segment that is just being looked at, or was swapped for a pipe, harms no request")
-def lease_probes(told: Report, stage: Stage) -> None:
+def lease_probes(report: Report, stage: Stage) -> None:
     """Another process takes leases of the segments all the time; then one of them is a named pipe."""
     with stage.served(stage.new_map().root) as one, RawClient(one.endpoint) as client:
         paths = [client.path(cell) for cell in client.area(circle(0, 0, 50)).cells]
@@ -251,20 +258,20 @@ def lease_probes(told: Report, stage: Stage) -> None:
         for what, shm_dir in (("the usual directory", ""), ("another path to it", other_way)):
             with Actor(leases, paths) as prober, Actor(opens, one.endpoint, shm_dir, 10.0) as opener:
                 count, failures = opener.said()
-                told.tell(f"{what}: {count} requests beside {prober.end()} leases; failed {dict(failures)}")
-            told.limit("of them failed", failures.total(), 0)
+                report.note(f"{what}: {count} requests beside {prober.end()} leases; failed {dict(failures)}")
+            report.limit("of them failed", failures.total(), 0)
         os.unlink(paths[0])
         os.mkfifo(paths[0])
         with Actor(opens, one.endpoint, "", 1.0) as opener:
             begin_s = time.monotonic()
             try:
                 count, failures = opener.said(60.0)
-                told.tell(f"beside a pipe: {count} requests, {dict(failures)}")
+                report.note(f"beside a pipe: {count} requests, {dict(failures)}")
             finally:
-                told.limit(
+                report.limit(
                     "with a pipe in the place of a segment it took", time.monotonic() - begin_s, 10.0, "s"
                 )
-        os.unlink(paths[0])
+        Path(paths[0]).unlink(missing_ok=True)  # the daemon may have removed the pipe
 
 
 PROGRAMS: Final = 60
@@ -277,26 +284,31 @@ with shmmap.connect(sys.argv[1]) as client:
 
 
 @scene("B3", "60 programs that are started together all connect, as at a robot's boot")
-def boot(told: Report, stage: Stage) -> None:
+def boot(report: Report, stage: Stage) -> None:
     """60 processes are started at once, on this machine's processors; three times."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with stage.served(stage.new_map().root) as one, Beside(told, one, newcomers_too=False):
+    with stage.served(stage.new_map().root) as one, Beside(report, one, newcomers_too=False):
         for number in range(3):
             begin_s = time.monotonic()
             started = [
                 subprocess.Popen(
                     [sys.executable, "-c", _PROGRAM, one.endpoint],
-                    env=environment, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+                    env=environment,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                    cwd=ROOT,
                 )
                 for _ in range(PROGRAMS)
-            ]  # fmt: skip
+            ]
             said = [process.communicate()[1] for process in started]
             failed = [words for process, words in zip(started, said, strict=True) if process.returncode]
             took_s = time.monotonic() - begin_s
             processors = len(os.sched_getaffinity(0))
-            told.limit(
+            report.limit(
                 f"start {number + 1}: of {PROGRAMS} programs on {processors} processors, {took_s:.1f} s,"
-                " could not connect", len(failed), 0,
-            )  # fmt: skip
+                " could not connect",
+                len(failed),
+                0,
+            )
             if failed:
-                told.tell(f"one was told: {failed[0].strip().splitlines()[-1][:160]}")
+                report.note(f"one got: {failed[0].strip().splitlines()[-1][:160]}")

@@ -39,7 +39,7 @@ class Report:
         """Print the heading."""
         print(f"\n{self.row}  {self.sentence}", flush=True)
 
-    def tell(self, text: str) -> None:
+    def note(self, text: str) -> None:
         """Print a line of figures."""
         print(f"    {text}", flush=True)
 
@@ -47,14 +47,14 @@ class Report:
         """Check a figure."""
         unit = unit and f" {unit}"
         held = value <= most
-        self.tell(f"{what}: {value:.6g}{unit}, at most {most:.6g}{unit}" + ("" if held else "  <-- OVER"))
+        self.note(f"{what}: {value:.6g}{unit}, at most {most:.6g}{unit}" + ("" if held else "  <-- OVER"))
         if not held:
             self.over.append(f"{what} {value:.6g}{unit} (limit {most:.6g})")
 
     def must(self, what: str, held: bool, instead: str = "") -> None:
         """Check something that is so or not; ``instead`` says what was seen."""
         seen = f": {instead}" if instead else ""
-        self.tell(f"{what}{' yes' if held else ' NO'}{seen}" + ("" if held else "  <-- OVER"))
+        self.note(f"{what}{' yes' if held else ' NO'}{seen}" + ("" if held else "  <-- OVER"))
         if not held:
             self.over.append(f"{what}: no{f' ({instead})' if instead else ''}")
 
@@ -66,7 +66,7 @@ class Report:
 
     def end(self) -> None:
         """Print the verdict."""
-        self.tell(f"=> {self.verdict()}")
+        self.note(f"=> {self.verdict()}")
 
 
 @dataclass
@@ -113,7 +113,7 @@ class Stage:
     def served(
         self, path: Path, *flags: str, descriptors: int = 0, **options: Any
     ) -> Iterator[DaemonProcess]:
-        """Serve a map while the block runs, with at most so many descriptors."""
+        """Serve a map while the block runs, with at most ``descriptors`` of them."""
         limits = ["prlimit", f"--data={MOST_BYTES}"]
         limits += [f"--nofile={descriptors}:{descriptors}"] if descriptors else []
         one = DaemonProcess(path, *flags, command=limits, **options)

@@ -18,8 +18,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, cast
 
-from tests.support.patience import Patience
-
 import shmmap.daemon
 from shmmap.chunks.marks import encode_marks
 from shmmap.daemon.config_live import LiveSettings
@@ -29,6 +27,7 @@ from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol import live as messages
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import decode_reply, encode, pack_versions
+from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_drive import RESOLUTION, marked
 from tests.unit.daemon.whole_daemon import WholeDaemon
@@ -149,7 +148,7 @@ def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
 
         def answer(message: messages.LiveRequest) -> Any:
             ours.send(live.encode(live.Ask(message.request, 1, os.geteuid(), True, encode(message))))
-            body, waiting = b"", Patience()
+            body, waiting = b"", Deadline()
             while waiting(not body):
                 worker.run_turn()
                 with contextlib.suppress(BlockingIOError):
@@ -164,7 +163,7 @@ def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
             at = (0.0, 0.0, 0.0)
             return messages.LiveScan(number, "lidar", opened.mapper, number, f"1.{number}", len(data), at)
 
-        waiting = Patience()
+        waiting = Deadline()
         while waiting(not worker._maps):
             worker.run_turn()
         opened = answer(messages.LiveOpen(1, "lidar", "front"))
