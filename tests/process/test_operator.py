@@ -23,7 +23,7 @@ import pytest
 
 import shmmap as client_library
 from shmmap.cli.entry import main
-from shmmap.cli.verbs import map_view
+from shmmap.cli.verbs.look import map_view
 from shmmap.client.map_listing import MapListing
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory

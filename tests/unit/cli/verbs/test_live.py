@@ -134,7 +134,7 @@ def test_exports_of_a_damaged_map(directory: Path, capsys: Captured, tmp_path: P
     assert main([*words, "--json"]) == 0
     said = capsys.readouterr()
     assert f'"{path.name}.damaged.1"' in said.out
-    assert "1 damaged file put aside before" in said.err
+    assert "1 damaged file in quarantine" in said.err
 
 
 def test_nothing_to_export(tmp_path: Path, capsys: Captured) -> None:
