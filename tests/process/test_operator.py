@@ -217,7 +217,7 @@ def test_a_picture_of_too_many_cells(
         return real(client, *args, **options)
 
     monkeypatch.setattr(client_library.Client, "metadata", noted)
-    monkeypatch.setattr(map_view, "MOST_ON_DISK", 10)
+    monkeypatch.setattr(map_view, "MAX_ON_DISK", 10)
     assert main(["map"]) == 0
     assert not asked
     drawn, said = capsys.readouterr().out.split("its area")

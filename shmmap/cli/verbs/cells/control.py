@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Annotated, Final
-
-import msgspec
+from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import (
     add_cells_argument,
@@ -15,7 +13,6 @@ from shmmap.cli.areas import (
     no_cell_there,
     print_near_cells,
 )
-from shmmap.cli.json_output import Hex, hexed
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import counted, print_json, print_line
@@ -32,31 +29,6 @@ Exit code: 0; 1 when this user may not do it, 65 bad map: the map before stays, 
 daemon answers."""
 
 
-class Reload(msgspec.Struct):
-    """What is different in the map."""
-
-    map_version: Hex
-    changed: Annotated[int, msgspec.Meta(description="cells whose file changed")]
-    added: int
-    removed: int
-    problems: list[str]
-
-
-class Eviction(msgspec.Struct):
-    """Numbers of segments."""
-
-    freed: int
-    still_mapped: Annotated[int, msgspec.Meta(description="retired, freed when no client maps them")]
-    kept: Annotated[int, msgspec.Meta(description="in service, because an operator pinned them")]
-    unknown: Annotated[list[str], msgspec.Meta(description="ids that the map does not have")]
-
-
-class Stop(msgspec.Struct):
-    """The daemon that ends."""
-
-    stopping: Annotated[int, msgspec.Meta(description="its pid")]
-
-
 def add_reload(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -66,7 +38,7 @@ def add_reload(subparsers: Subparsers) -> None:
         help="read the map again: changed, new and deleted files",
         description="Have the daemon read the map's list of cells again, as SIGHUP does.  Clients get what "
         "changed with their next request; cells they have mapped stay readable.",
-        output="cells.control.Reload",
+        output="cells.outputs.Reload",
         epilog=_RELOAD_EXIT,
     )
     add_daemon_options(parser)
@@ -79,9 +51,15 @@ def run_reload(args: argparse.Namespace) -> int:
     with connect(args) as client:
         answer = client.reload()
     if args.json:
+        from shmmap.cli.verbs.cells import outputs
+
         print_json(
-            Reload(
-                hexed(answer.map_version), answer.changed, answer.added, answer.removed, list(answer.problems)
+            outputs.Reload(
+                f"{answer.map_version:016x}",
+                answer.changed,
+                answer.added,
+                answer.removed,
+                list(answer.problems),
             )
         )
         return 0
@@ -110,7 +88,7 @@ def add_evict(subparsers: Subparsers) -> None:
         help="evict cells from memory",
         description="Retire cells from shared memory: no client gets them any more, and their memory is "
         "freed as soon as no process maps it.  The next request loads them again.",
-        output="cells.control.Eviction",
+        output="cells.outputs.Eviction",
         epilog=_EVICT_EXIT,
     )
     add_cells_argument(parser)
@@ -128,13 +106,17 @@ def run_evict(args: argparse.Namespace) -> int:
         cells = None if args.all else cells_meant(args, client, area)
         if area is not None and not cells:
             if args.json:
-                print_json(Eviction(0, 0, 0, []))
+                from shmmap.cli.verbs.cells import outputs
+
+                print_json(outputs.Eviction(0, 0, 0, []))
             return no_cell_there(args, client, area)
         answer = client.evict(cells)
         hint = near_cells_hint(client, answer.unknown)
         kept = _kept(client, cells) if answer.kept and not args.json else []
     if args.json:
-        print_json(Eviction(answer.freed, answer.pinned, answer.kept, list(answer.unknown)))
+        from shmmap.cli.verbs.cells import outputs
+
+        print_json(outputs.Eviction(answer.freed, answer.pinned, answer.kept, list(answer.unknown)))
     else:
         print_line(f"{counted(answer.freed, 'segment')} freed")
         if answer.pinned:
@@ -176,7 +158,7 @@ def add_stop(subparsers: Subparsers) -> None:
         description="End the daemon, as SIGTERM does: a cell's memory is freed as soon as no "
         "process maps it.  The daemon's user, root and members of its --admin-group may do this; unlike "
         "a signal it works for other users than the daemon's.",
-        output="cells.control.Stop",
+        output="cells.outputs.Stop",
         epilog=_STOP_EXIT,
     )
     add_daemon_options(parser)
@@ -190,7 +172,9 @@ def run_stop(args: argparse.Namespace) -> int:
         pid = client.welcome.pid
         client.shutdown()
     if args.json:
-        print_json(Stop(pid))
+        from shmmap.cli.verbs.cells import outputs
+
+        print_json(outputs.Stop(pid))
     else:
         print_line(f"daemon {pid} is stopping")
     return 0

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from shmmap.cli.verbs.cells import outputs
     from shmmap.client.cell import Cell
     from shmmap.client.cell_set import CellSet
     from shmmap.geometry import Area
@@ -34,20 +33,6 @@ Exit code: 0; 1 when a cell could not be had, or there is no cell or no point (t
 73 a file cannot be written."""
 
 
-class File(msgspec.Struct):
-    """A file, and the ids of the cells in it."""
-
-    path: str
-    points: int
-    cells: list[str]
-
-
-class Exported(msgspec.Struct):
-    """What was written."""
-
-    files: list[File]
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -57,7 +42,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="write cells to PCD or NPZ files",
         description="Write cells, as the daemon serves them, to one merged file or to one file per cell.  "
         "Whole cells are written, unless --crop is given.",
-        output="cells.export.Exported",
+        output="cells.outputs.Exported",
         epilog=_EXIT,
     )
     add_area_or_ids(parser)
@@ -99,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
             _complain_of(found, args.wait)
             print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
             return 1
-        written: list[File] = []
+        written: list[outputs.File] = []
         if found.cells:
             plan = _plan(args, found.cells, kind)
             for path, _ in plan:
@@ -110,9 +95,13 @@ def run(args: argparse.Namespace) -> int:
                 if len(columns["xyz"]):
                     _write(path, columns, kind, args)
                     ids = [cell.id for cell in cells]
-                    written.append(File(str(path), len(columns["xyz"]), ids))
+                    from shmmap.cli.verbs.cells import outputs
+
+                    written.append(outputs.File(str(path), len(columns["xyz"]), ids))
         if args.json:
-            print_json(Exported(written))
+            from shmmap.cli.verbs.cells import outputs
+
+            print_json(outputs.Exported(written))
         else:
             for file in written:
                 cells_text = counted(len(file.cells), "cell")

@@ -4,14 +4,10 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from shmmap.cli.json_output import Box, Point
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import (
@@ -27,6 +23,7 @@ from shmmap.cli.screens.output import (
 from shmmap.errors import MapDataError, MapMissing
 
 if TYPE_CHECKING:
+    from shmmap.cli.verbs.cells import outputs
     from shmmap.formats.cloud import CloudDescription
     from shmmap.formats.coordinate_system import CoordinateSystem
 
@@ -51,121 +48,6 @@ _FILES = (
 )
 
 
-class Field(msgspec.Struct):
-    """A field; ``xyz`` is x, y and z."""
-
-    name: str
-    dtype: Annotated[str, msgspec.Meta(description="as numpy writes it")]
-    count: Annotated[int, msgspec.Meta(description="values per point")]
-    unit: str
-
-
-class Bounds(msgspec.Struct):
-    """Bounds of finite points."""
-
-    min: list[float]
-    max: list[float]
-
-
-class Crs(msgspec.Struct):
-    """What a file says of its coordinates."""
-
-    name: str
-    epsg: Annotated[int, msgspec.Meta(description="0: not said")]
-    geographic: Annotated[bool, msgspec.Meta(description="x and y are degrees")]
-    unit_m: Annotated[list[float], msgspec.Meta(description="metres per unit of x and y, of z")]
-    units: list[str]
-
-
-class CloudFile(msgspec.Struct):
-    """A file of points."""
-
-    path: str
-    format: str
-    encoding: Annotated[str, msgspec.Meta(description="of a PCD file")]
-    version: str
-    file_bytes: int
-    points: Annotated[int, msgspec.Meta(description="in the file")]
-    dropped: Annotated[int, msgspec.Meta(description="those of them that are not finite")]
-    width: int
-    height: int
-    fields: list[Field]
-    bounds: Bounds | None
-    viewpoint: Annotated[list[float], msgspec.Meta(description="x, y, z, qw, qx, qy, qz")]
-    warnings: list[str]
-    crs: Crs | None
-
-    @classmethod
-    def of(cls, found: CloudDescription) -> CloudFile:
-        """Return all that a file holds."""
-        crs = found.crs
-        return cls(
-            found.path,
-            found.format,
-            found.encoding,
-            found.version,
-            found.file_bytes,
-            found.points,
-            found.dropped,
-            found.width,
-            found.height,
-            [Field(spec.name, spec.dtype.str, spec.components, spec.unit) for spec in found.columns],
-            _bounds(found),
-            list(found.viewpoint),
-            list(found.warnings),
-            None
-            if crs is None
-            else Crs(
-                crs.name,
-                crs.epsg,
-                crs.geographic,
-                [unit.metres for unit in crs.units],
-                [unit.name for unit in crs.units],
-            ),
-        )
-
-
-class UnreadFile(msgspec.Struct):
-    """A file that cannot be read, and why."""
-
-    path: str
-    message: str
-
-
-class Outside(msgspec.Struct):
-    """A cell with points outside its box."""
-
-    path: str
-    box: Box
-
-
-class ServedMap(msgspec.Struct):
-    """A directory as a divided map."""
-
-    cells: int
-    outside_box: list[Outside]
-    far: Annotated[list[str], msgspec.Meta(description="on cells far from all others")]
-    origin: Annotated[
-        Point, msgspec.Meta(description="to add for the coordinates of the clouds it was divided from")
-    ] = (0.0, 0.0, 0.0)
-    crs: str = ""
-    unit_m: tuple[float, float] = (1.0, 1.0)
-    problems: list[str] = []
-
-
-class Directory(msgspec.Struct):
-    """A directory of files: sums and bounds of all."""
-
-    path: str
-    files: list[CloudFile]
-    failed: list[UnreadFile]
-    points: int
-    dropped: int
-    file_bytes: int
-    bounds: Bounds | None
-    map: Annotated[ServedMap | None, msgspec.Meta(description="null where it is no divided map")]
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -176,7 +58,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Read a point-cloud file to its end and show its fields, points, bounds and whatever "
         "is odd about it.  Of a directory (a map, or a folder of clouds): one line for each file, and "
         "totals.",
-        output="cells.inspect.CloudFile cells.inspect.Directory",
+        output="cells.outputs.CloudFile cells.outputs.Directory",
         epilog=_EXIT,
     )
     parser.add_argument(
@@ -190,11 +72,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what is there."""
+    from shmmap.cli.verbs.cells import outputs
+
     if os.path.isdir(args.path):
         return _directory(args)
     found = _described(args.path)
     if args.json:
-        print_json(CloudFile.of(found))
+        print_json(outputs.CloudFile.of(found))
     else:
         print_pairs(_lines(found))
         print_line()
@@ -205,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
                 for spec in found.columns
             ],
         )
-    if _bounds(found) is None:
+    if outputs.Bounds.of(found) is None:
         what = f"none of its {found.points:,} points is finite" if found.points else "it has no points"
         return nothing_found(args, f"{args.path}: {what}")
     return 0
@@ -227,6 +111,7 @@ def _described(path: str) -> CloudDescription:
 
 def _directory(args: argparse.Namespace) -> int:
     from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.cli.verbs.cells import outputs
     from shmmap.dividing.inputs import find_inputs
 
     files = [file.path for file in find_inputs([args.path])]
@@ -246,9 +131,16 @@ def _directory(args: argparse.Namespace) -> int:
     bounds = _all_bounds(found)
     served = _as_map(args.path, found)
     if args.json:
-        failures = [UnreadFile(path, message) for path, message in failed]
-        whole = Directory(
-            args.path, list(map(CloudFile.of, found)), failures, points, dropped, nbytes, bounds, served
+        failures = [outputs.UnreadFile(path, message) for path, message in failed]
+        whole = outputs.Directory(
+            args.path,
+            list(map(outputs.CloudFile.of, found)),
+            failures,
+            points,
+            dropped,
+            nbytes,
+            bounds,
+            served,
         )
         print_json(whole)
     else:
@@ -273,10 +165,11 @@ def _directory(args: argparse.Namespace) -> int:
     return 0
 
 
-def _as_map(path: str, found: list[CloudDescription]) -> ServedMap | None:
+def _as_map(path: str, found: list[CloudDescription]) -> outputs.ServedMap | None:
     """What the metadata says of files as cells of a map, and where it is wrong; None where there is none."""
     import numpy as np
 
+    from shmmap.cli.verbs.cells import outputs
     from shmmap.layers.points import OutsideBox
     from shmmap.origin.far_cells import far_cells_notes
     from shmmap.origin.map_directory import open_map
@@ -287,7 +180,7 @@ def _as_map(path: str, found: list[CloudDescription]) -> ServedMap | None:
             return None
         catalogue = open_map(path).load(fresh=True)
     except (MapDataError, MapMissing) as error:
-        return ServedMap(0, [], [], problems=[error.message])
+        return outputs.ServedMap(0, [], [], problems=[error.message])
     cells: list[tuple[CloudDescription, tuple[float, float, float, float]]] = []
     for one in found:
         index = catalogue.find(os.path.abspath(one.path))
@@ -299,14 +192,14 @@ def _as_map(path: str, found: list[CloudDescription]) -> ServedMap | None:
         checked = OutsideBox(box)
         checked.add(corners, *corners.tolist())
         if checked.count:
-            outside.append(Outside(one.path, box))
+            outside.append(outputs.Outside(one.path, box))
     far = far_cells_notes(
         np.array([box[:2] for _, box in cells]).reshape(-1, 2),
         max(catalogue.mean_size),
         [os.path.basename(one.path) for one, _ in cells],
         [one.points for one, _ in cells],
     )
-    return ServedMap(
+    return outputs.ServedMap(
         len(catalogue),
         outside,
         far,
@@ -317,7 +210,7 @@ def _as_map(path: str, found: list[CloudDescription]) -> ServedMap | None:
     )
 
 
-def _map_lines(served: ServedMap | None) -> list[tuple[str, str]]:
+def _map_lines(served: outputs.ServedMap | None) -> list[tuple[str, str]]:
     if served is None:
         return []
     lines = [("map", counted(served.cells, "cell"))] if served.cells else []
@@ -338,7 +231,9 @@ def _map_lines(served: ServedMap | None) -> list[tuple[str, str]]:
 
 
 def _row(found: CloudDescription, directory: str) -> list[str]:
-    bounds = _bounds(found)
+    from shmmap.cli.verbs.cells import outputs
+
+    bounds = outputs.Bounds.of(found)
     spans = ["-"] * 3
     if bounds is not None:
         low, high = ([format_metres(round(v, 1)) for v in side] for side in (bounds.min, bounds.max))
@@ -358,11 +253,13 @@ def _field_name(name: str) -> str:
     return "x y z" if name == "xyz" else name
 
 
-def _all_bounds(found: list[CloudDescription]) -> Bounds | None:
-    each = [bounds for one in found if (bounds := _bounds(one)) is not None]
+def _all_bounds(found: list[CloudDescription]) -> outputs.Bounds | None:
+    from shmmap.cli.verbs.cells import outputs
+
+    each = [bounds for one in found if (bounds := outputs.Bounds.of(one)) is not None]
     if not each:
         return None
-    return Bounds(
+    return outputs.Bounds(
         [min(values) for values in zip(*(one.min for one in each), strict=True)],
         [max(values) for values in zip(*(one.max for one in each), strict=True)],
     )
@@ -383,11 +280,6 @@ def _grouped_warnings(found: list[CloudDescription]) -> list[tuple[str, str]]:
 # --- one file -----------------------------------------------------------------------------------------
 
 
-def _bounds(found: CloudDescription) -> Bounds | None:
-    lowest, highest = (bound.tolist() for bound in found.bounds)
-    return Bounds(lowest, highest) if all(map(math.isfinite, lowest)) else None
-
-
 def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
     """Name and units of a file's system; of its warnings nothing is said twice."""
     if crs is None:
@@ -404,7 +296,7 @@ def _in_metres(crs: CoordinateSystem | None) -> bool:
     return crs is None or not (crs.geographic or any(unit.metres != 1.0 for unit in crs.units))
 
 
-def _bounds_lines(bounds: Bounds | None, metric: bool = True) -> list[tuple[str, str]]:
+def _bounds_lines(bounds: outputs.Bounds | None, metric: bool = True) -> list[tuple[str, str]]:
     if bounds is None:
         return [("bounds", "none: no finite point")]
     unit = " m" if metric else ""
@@ -415,6 +307,8 @@ def _bounds_lines(bounds: Bounds | None, metric: bool = True) -> list[tuple[str,
 
 
 def _lines(found: CloudDescription) -> list[tuple[str, str]]:
+    from shmmap.cli.verbs.cells import outputs
+
     kind = " ".join(part for part in (found.format.upper(), found.version, found.encoding) if part)
     lines = [
         ("file", f"{found.path} ({format_bytes(found.file_bytes)}, {kind})"),
@@ -422,7 +316,7 @@ def _lines(found: CloudDescription) -> list[tuple[str, str]]:
     ]
     if found.height > 1:
         lines.append(("organised", f"{found.width} x {found.height}"))
-    lines += _bounds_lines(_bounds(found), _in_metres(found.crs))
+    lines += _bounds_lines(outputs.Bounds.of(found), _in_metres(found.crs))
     lines += _crs_lines(found.crs)
     if tuple(found.viewpoint) != (0, 0, 0, 1, 0, 0, 0):
         lines.append(("viewpoint", " ".join(f"{value:g}" for value in found.viewpoint)))

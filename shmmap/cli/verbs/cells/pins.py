@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Annotated
-
-import msgspec
+from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import (
     add_cells_argument,
@@ -32,24 +30,6 @@ Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may
 _COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("MEMORY", "right"))
 
 
-class Pin(msgspec.Struct):
-    """A layer of a cell that is kept."""
-
-    id: str
-    layer: str
-    state: Annotated[
-        str, msgspec.Meta(description="resident, stale, loading, absent, or the code of its failure")
-    ]
-    bytes: int
-
-
-class Pins(msgspec.Struct):
-    """What is pinned."""
-
-    cells: list[Pin]
-    unknown: Annotated[list[str], msgspec.Meta(description="ids that the map does not have")]
-
-
 def add_pin(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -59,7 +39,7 @@ def add_pin(subparsers: Subparsers) -> None:
         help="keep cells in memory",
         description="Load cells and keep them in shared memory until `shmmap unpin` or until the daemon "
         "ends, whatever else needs memory.  Without cells: list what is pinned.",
-        output="cells.pins.Pins",
+        output="cells.outputs.Pins",
         epilog=_EXIT,
     )
     add_cells_argument(parser)
@@ -77,7 +57,9 @@ def run_pin(args: argparse.Namespace) -> int:
         cells = cells_meant(args, client, area)
         if area is not None and not cells:
             if args.json:
-                print_json(Pins([], []))
+                from shmmap.cli.verbs.cells import outputs
+
+                print_json(outputs.Pins([], []))
             return no_cell_there(args, client, area)
         answer = client.pin(cells, layers_from(args))
         hint = near_cells_hint(client, answer.unknown)
@@ -87,8 +69,10 @@ def run_pin(args: argparse.Namespace) -> int:
 def _print_pins(answer: Pinned, hint: str, *, as_json: bool) -> int:
     """Print what is pinned, and a hint about unknown ids; returns the exit code."""
     if as_json:
-        rows = [Pin(cell.id, cell.layer, cell.state, cell.bytes) for cell in answer.cells]
-        print_json(Pins(rows, list(answer.unknown)))
+        from shmmap.cli.verbs.cells import outputs
+
+        rows = [outputs.Pin(cell.id, cell.layer, cell.state, cell.bytes) for cell in answer.cells]
+        print_json(outputs.Pins(rows, list(answer.unknown)))
     else:
         if answer.cells:
             table = [[cell.id, cell.layer, cell.state, format_bytes(cell.bytes)] for cell in answer.cells]
@@ -110,7 +94,7 @@ def add_unpin(subparsers: Subparsers) -> None:
         help="undo pin",
         description="Pinned cells become ordinary ones: they stay in memory until it is needed for others.  "
         "Prints what stays pinned.",
-        output="cells.pins.Pins",
+        output="cells.outputs.Pins",
         epilog=_EXIT,
     )
     add_cells_argument(parser)
@@ -128,7 +112,9 @@ def run_unpin(args: argparse.Namespace) -> int:
         cells = None if args.all else cells_meant(args, client, area)
         if area is not None and not cells:
             if args.json:
-                print_json(Pins([], []))
+                from shmmap.cli.verbs.cells import outputs
+
+                print_json(outputs.Pins([], []))
             return no_cell_there(args, client, area)
         answer = client.unpin(cells)
         hint = near_cells_hint(client, answer.unknown)

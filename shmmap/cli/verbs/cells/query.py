@@ -5,12 +5,9 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import TYPE_CHECKING, Annotated
-
-import msgspec
+from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
-from shmmap.cli.json_output import Box, Hex, Holder, hexed
 from shmmap.cli.options import (
     Subparsers,
     add_daemon_options,
@@ -60,80 +57,6 @@ _COLUMNS = (
 )
 
 
-class FoundCell(msgspec.Struct):
-    """Where a layer of a cell lies in shared memory."""
-
-    id: str
-    version: Hex
-    layer: str
-    segment: str
-    offset: int
-    bytes: int
-    points: int
-    stale: bool
-    box: Box
-
-
-class Pending(msgspec.Struct):
-    """A layer of a cell that is being loaded."""
-
-    id: str
-    layer: str
-
-
-class Failed(msgspec.Struct):
-    """A layer of a cell that could not be had; ``holders`` map memory of the full budget."""
-
-    id: str
-    layer: str
-    code: str
-    message: str
-    holders: list[Holder]
-
-
-class Found(msgspec.Struct):
-    """What a client would get."""
-
-    epoch: Hex
-    map_version: Hex
-    frame_id: str
-    cells: list[FoundCell]
-    removed: Annotated[list[str], msgspec.Meta(description="held ids that the client should drop")]
-    pending: list[Pending]
-    failed: list[Failed]
-
-    @classmethod
-    def of(cls, found: CellSet, frame_id: str) -> Found:
-        """Return all of an answer."""
-        return cls(
-            hexed(found.epoch),
-            hexed(found.map_version),
-            frame_id,
-            [
-                FoundCell(
-                    cell.id,
-                    cell.version_hex,
-                    cell.layer,
-                    cell.segment,
-                    cell.offset,
-                    cell.nbytes,
-                    cell.points,
-                    cell.stale,
-                    cell.box,
-                )
-                for cell in found.cells
-            ],
-            list(found.removed),
-            [Pending(cell.id, cell.layer) for cell in found.pending],
-            [
-                Failed(
-                    error.cell_id, error.layer, error.code, error.message, list(map(Holder.of, error.holders))
-                )
-                for error in found.failed
-            ],
-        )
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -145,7 +68,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "memory.  Prints "
         "where each of them lies in shared memory.\n"
         "ROWS: points, or what a layer has instead, such as voxels.",
-        output="cells.query.Found",
+        output="cells.outputs.Found",
         epilog=_EXIT,
     )
     add_area_or_ids(parser)
@@ -189,7 +112,9 @@ def run(args: argparse.Namespace) -> int:
             found = client.area(area, layers, wait=args.wait, strict=None)
         welcome = client.welcome
         if args.json:
-            print_json(Found.of(found, welcome.frame_id))
+            from shmmap.cli.verbs.cells import outputs
+
+            print_json(outputs.Found.of(found, welcome.frame_id))
         else:
             _print_text(found, welcome.id_prefix, summed=bool(found.cells) or held_given)
         if not found.complete:

@@ -7,11 +7,8 @@ import argparse
 import contextlib
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from shmmap.cli.json_output import more_of, with_more
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.program import add_allow_empty, complain, nothing_found
 from shmmap.cli.screens.output import (
@@ -73,33 +70,6 @@ _MANIFEST = {
 }
 
 
-_TOTALS: Final = ("bytes", "active", "occupied", "free")
-
-
-def checked_kind() -> object:
-    """Return what ``fsck --json`` prints: totals are those of good chunks."""
-    from shmmap.daemon.live.disk.checking import CheckedMap
-
-    kind = more_of(CheckedMap, good=bool, chunks=int, **dict.fromkeys(_TOTALS, int))
-    return msgspec.defstruct(
-        "CheckedMap", [(f.name, f.type) for f in msgspec.structs.fields(kind) if f.name != "rows"]
-    )
-
-
-def exported_kind() -> object:
-    """Return what ``export --json`` prints."""
-    from shmmap.daemon.live.disk.exporting import ExportedVoxels
-
-    return more_of(ExportedVoxels, seconds=float)
-
-
-def reset_kind() -> object:
-    """Return what ``reset --json`` prints."""
-    from shmmap.daemon.live.disk.resetting import ResetMap
-
-    return ResetMap
-
-
 def add_fsck(subparsers: Subparsers) -> None:
     """Describe the action."""
     parser = add_verb(
@@ -109,7 +79,7 @@ def add_fsck(subparsers: Subparsers) -> None:
         help="check the files of a live map",
         description="Read each chunk of a live map whole, and check it against its checksums and counters.\n"
         "Nothing is changed without --repair, and nothing is ever deleted.",
-        output="live.files.checked_kind",
+        output="live.outputs.checked_kind",
         epilog=_FSCK_EXIT,
     )
     _add_directory(parser)
@@ -152,9 +122,13 @@ def run_fsck(args: argparse.Namespace) -> int:
 
 
 def _fsck_as_json(found: CheckedMap) -> dict[str, object]:
+    import msgspec
+
+    from shmmap.cli.verbs.live.outputs import TOTALS
+
     shown: dict[str, object] = msgspec.to_builtins({**msgspec.structs.asdict(found), "rows": {}})
     del shown["rows"]
-    totals = {what: found.total(what) for what in _TOTALS}
+    totals = {what: found.total(what) for what in TOTALS}
     return {**shown, "good": found.good, "chunks": len(found.rows), **totals}
 
 
@@ -211,7 +185,7 @@ def add_export(subparsers: Subparsers) -> None:
         help="write voxels to a cloud, or a map to serve",
         description="Write the voxels of a live map to a PLY or PCD file, or as a divided map that `shmmap "
         "serve` and Autoware read.",
-        output="live.files.exported_kind",
+        output="live.outputs.exported_kind",
         epilog=_EXPORT_EPILOG,
     )
     _add_directory(parser)
@@ -269,6 +243,8 @@ def _run_export(args: argparse.Namespace) -> int:
         )
     seconds = time.monotonic() - began_s
     if args.json:
+        from shmmap.cli.json_output import with_more
+
         print_json(with_more(made, seconds=seconds))
     else:
         print_pairs([*_export_lines(made), ("time", format_duration(seconds))])
@@ -313,7 +289,7 @@ def add_reset(subparsers: Subparsers) -> None:
         help="begin a new map in place of a live map",
         description="Move all files of a live map aside, into DIR/reset.1 or the next number that is free; "
         "the daemon's next start begins a new map in DIR.  What was moved is a live map as before.",
-        output="live.files.reset_kind",
+        output="live.outputs.reset_kind",
         epilog=_RESET_EXIT,
     )
     _add_directory(parser)

@@ -5,11 +5,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from shmmap.cli.json_output import LiveMap
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.output import (
     Column,
@@ -47,59 +44,6 @@ _MAP_COLUMNS = (
 )
 
 
-class LiveMaps(msgspec.Struct):
-    """The live maps of a daemon."""
-
-    maps: list[LiveMap]
-
-
-class Chunk(msgspec.Struct):
-    """A chunk of a live map."""
-
-    key: tuple[int, int, int]
-    state: str
-    active: int
-    occupied: int
-    free: int
-    bytes: int
-    version: int
-    generation: int
-    box: Annotated[
-        tuple[float, float, float, float, float, float],
-        msgspec.Meta(description="min x, y, z, max x, y, z: metres"),
-    ]
-
-    @classmethod
-    def of(cls, chunk: ChunkInfo, resolution: float) -> Chunk:
-        """Return what is known of a chunk."""
-        return cls(
-            (chunk.key.x, chunk.key.y, chunk.key.z),
-            chunk.state,
-            chunk.active,
-            chunk.occupied,
-            chunk.free,
-            chunk.bytes,
-            chunk.version,
-            chunk.generation,
-            chunk.key.box(resolution),
-        )
-
-
-class Shown(msgspec.Struct):
-    """A live map and its chunks."""
-
-    map: LiveMap
-    chunks: list[Chunk]
-
-
-class Saved(msgspec.Struct):
-    """A live map that was saved."""
-
-    map: str
-    files: Annotated[int, msgspec.Meta(description="chunks on disk")]
-    seconds: float
-
-
 def add_ls(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -111,7 +55,7 @@ def add_ls(subparsers: Subparsers) -> None:
         "VOXEL: edge, metres.  CHUNKS: in memory; UNSAVED: of these changed since they were saved.\n"
         "KNOWN: voxels that are occupied or free.  MEMORY OF: what the chunks take of what they may.\n"
         "FILES, ON DISK: chunks that are saved.  SCANS: applied since the daemon's start.",
-        output="live.served.LiveMaps",
+        output="live.outputs.LiveMaps",
         epilog=_LS_EXIT,
     )
     add_daemon_options(parser)
@@ -124,7 +68,10 @@ def _run_ls(args: argparse.Namespace) -> int:
     with connect(args) as client:
         maps = client.live_maps()
     if args.json:
-        print_json(LiveMaps(list(map(LiveMap.of, maps))))
+        from shmmap.cli.json_output import LiveMap
+        from shmmap.cli.verbs.live import outputs
+
+        print_json(outputs.LiveMaps(list(map(LiveMap.of, maps))))
         return 0
     if not maps:
         print_line("this daemon keeps no live maps: start it with --live NAME")
@@ -194,7 +141,7 @@ def add_show(subparsers: Subparsers) -> None:
         "STATE: loading; clean; dirty when it was changed since it was saved; saving; saved when it is on "
         "the disk alone.\n"
         "X, Y, Z: lower corner, metres, map frame.  CHANGES: how many scans changed it.",
-        output="live.served.Shown",
+        output="live.outputs.ShownMap",
         epilog=_SHOW_EXIT,
     )
     parser.add_argument("name", metavar="NAME", help="the live map")
@@ -210,7 +157,12 @@ def _run_show(args: argparse.Namespace) -> int:
         live = client.live(args.name)
         row, chunks = live.status(), live.chunks(saved=args.saved)
     if args.json:
-        print_json(Shown(LiveMap.of(row), [Chunk.of(one, row.resolution) for one in chunks]))
+        from shmmap.cli.json_output import LiveMap
+        from shmmap.cli.verbs.live import outputs
+
+        print_json(
+            outputs.ShownMap(LiveMap.of(row), [outputs.Chunk.of(one, row.resolution) for one in chunks])
+        )
         return 0
     print_pairs(_pairs(row))
     if chunks:
@@ -263,7 +215,7 @@ def add_save(subparsers: Subparsers) -> None:
         help="write a live map to the disk now",
         description="Have all changed chunks of a live map written to the disk; ends when everything that "
         "was applied before is there.",
-        output="live.served.Saved",
+        output="live.outputs.Saved",
         epilog=_SAVE_EXIT,
     )
     parser.add_argument("name", metavar="NAME", help="the live map")
@@ -279,7 +231,9 @@ def _run_save(args: argparse.Namespace) -> int:
         files = client.live(args.name).save()
     took_s = time.monotonic() - begin_s
     if args.json:
-        print_json(Saved(args.name, files, round(took_s, 3)))
+        from shmmap.cli.verbs.live import outputs
+
+        print_json(outputs.Saved(args.name, files, round(took_s, 3)))
     else:
         print_line(f"{args.name}: saved, {files:,} chunks on the disk ({format_duration(took_s)})")
     return 0

@@ -5,12 +5,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import Annotated
-
-import msgspec
+from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import add_area_options, area_from, around, those_in
-from shmmap.cli.json_output import Box, Hex, Holder, Segment, hexed
 from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
 from shmmap.cli.program import add_allow_empty, nothing_found
 from shmmap.cli.screens.output import (
@@ -27,9 +24,10 @@ from shmmap.cli.screens.output import (
 )
 from shmmap.errors import DaemonUnreachable, UnknownCell
 from shmmap.lacking import area_text, extent_text, near_cells_hint
-from shmmap.protocol.messages import ShownCell
-from shmmap.protocol.rows import CellRow
-from shmmap.protocol.rows import Holder as HolderRow
+
+if TYPE_CHECKING:
+    from shmmap.protocol.messages import ShownCell
+    from shmmap.protocol.rows import CellRow, Holder
 
 __all__ = ["add_ls", "add_show", "run_ls", "run_show"]
 
@@ -53,50 +51,6 @@ _COLUMNS = (
 )
 
 
-class Listed(msgspec.Struct):
-    """The segments of a daemon, in its statistics' state."""
-
-    state: str
-    epoch: Hex
-    not_listed: Annotated[int, msgspec.Meta(description="segments that the statistics have no room for")]
-    cells: list[Segment]
-
-
-class Shown(msgspec.Struct):
-    """One cell."""
-
-    id: str
-    version: Hex
-    box: Box
-    z: Annotated[
-        tuple[float, float] | None, msgspec.Meta(description="min and max; null before the first load")
-    ]
-    source_bytes: int
-    loading: Annotated[list[str], msgspec.Meta(description="layers")]
-    pinned: Annotated[list[str], msgspec.Meta(description="layers that an operator keeps")]
-    failure: Annotated[str, msgspec.Meta(description="the last one that still stands")]
-    segments: list[Segment]
-
-    @classmethod
-    def of(cls, cell: ShownCell) -> Shown:
-        """Return all that a daemon knows of a cell."""
-        segments, now_ns = [], time.monotonic_ns()
-        for row in cell.segments:
-            segments.append(Segment.whole(row, now_ns))
-            segments[-1].holders = [Holder.of(holder) for holder in row.holders]
-        return cls(
-            cell.id,
-            hexed(cell.version),
-            (cell.min_x, cell.min_y, cell.max_x, cell.max_y),
-            None if cell.z_min is None or cell.z_max is None else (cell.z_min, cell.z_max),
-            cell.source_bytes,
-            list(cell.loading),
-            list(cell.pinned),
-            cell.failure,
-            segments,
-        )
-
-
 _STATES = ("resident", "ahead", "stale", "retired")
 """States as they are shown; JSON has ``zombie`` for the last, and ``ahead`` apart."""
 
@@ -118,7 +72,7 @@ def add_ls(subparsers: Subparsers) -> None:
         "ROWS: points, or what a layer has instead, such as voxels.\n"
         "HITS, LAST USED: how often it was given to clients, and how long ago the last time.\n"
         "LOAD: how long loading took.",
-        output="look.cells.Listed",
+        output="look.outputs.Listed",
         epilog=_LS_EXIT,
     )
     parser.add_argument(
@@ -161,10 +115,13 @@ def _list(args: argparse.Namespace) -> int:
         rows.sort(key=lambda row: int(getattr(row, name)), reverse=True)
     now_ns = time.monotonic_ns()
     if args.json:
+        from shmmap.cli.json_output import Segment
+        from shmmap.cli.verbs.look import outputs
+
         segments = [
             Segment.of(row, now_ns, id_prefix=identity.id_prefix, instance=identity.instance) for row in rows
         ]
-        print_json(Listed(found.state, hexed(identity.epoch), found.rows_missing, segments))
+        print_json(outputs.Listed(found.state, f"{identity.epoch:016x}", found.rows_missing, segments))
     else:
         if rows:
             print_table(_COLUMNS, [_ls_row(row, now_ns) for row in rows])
@@ -222,7 +179,7 @@ def add_show(subparsers: Subparsers) -> None:
         help="one cell: versions, memory, which processes use it",
         description="Show everything the daemon knows about one cell: its box, its segments in shared "
         "memory, which processes map them, its last failure.",
-        output="look.cells.Shown",
+        output="look.outputs.Shown",
         epilog=_SHOW_EXIT,
     )
     parser.add_argument("cell", metavar="CELL", help="its id, or the file's name where that is unique")
@@ -240,7 +197,9 @@ def run_show(args: argparse.Namespace) -> int:
             error.hint = near_cells_hint(client, [args.cell])
             raise
     if args.json:
-        print_json(Shown.of(cell))
+        from shmmap.cli.verbs.look import outputs
+
+        print_json(outputs.Shown.of(cell))
     else:
         print_pairs(_show_lines(cell))
     return 0
@@ -276,7 +235,7 @@ def _segment_line(segment: CellRow) -> str:
     )
 
 
-def _holder_line(holder: HolderRow) -> str:
+def _holder_line(holder: Holder) -> str:
     if not holder.session:
         return "an unidentified process (not through the client library)"
     command = f" ({holder.command})" if holder.command not in ("", holder.client) else ""

@@ -6,11 +6,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from typing import Annotated
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from shmmap.cli.json_output import Client
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.screens.output import (
     Column,
@@ -22,7 +19,9 @@ from shmmap.cli.screens.output import (
     print_table,
     user_name,
 )
-from shmmap.protocol.rows import ClientRow
+
+if TYPE_CHECKING:
+    from shmmap.protocol.rows import ClientRow
 
 __all__ = ["add_parser", "run"]
 
@@ -51,14 +50,6 @@ OUTDATED: the part of MAPPED that is stale (a newer version exists) or retired (
 the last client releases it)"""
 
 
-class Clients(msgspec.Struct):
-    """The clients of a daemon, this program among them."""
-
-    clients: list[Client]
-    unknown_holders: Annotated[int, msgspec.Meta(description="segments mapped by unidentified processes")]
-    unknown_bytes: int
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -68,7 +59,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="connected clients, and the memory each uses",
         description="List connected clients, and memory mapped by unidentified processes.\n" + _LEGEND + "\n"
         "IDLE: time since its last request.  AT: where it said it is, metres, map frame.",
-        output="look.clients.Clients",
+        output="look.outputs.Clients",
         epilog=_EXIT,
     )
     add_daemon_options(parser)
@@ -81,8 +72,11 @@ def run(args: argparse.Namespace) -> int:
     with connect(args) as client:
         stats = client.stats()
     if args.json:
+        from shmmap.cli.json_output import Client
+        from shmmap.cli.verbs.look import outputs
+
         rows = [Client.of(row, time.monotonic_ns(), mapped=True) for row in stats.sessions]
-        print_json(Clients(rows, stats.unknown_holders, stats.unknown_bytes))
+        print_json(outputs.Clients(rows, stats.unknown_holders, stats.unknown_bytes))
         return 0
     print_table(_COLUMNS, [_as_text(row) for row in stats.sessions])
     if stats.unknown_holders:

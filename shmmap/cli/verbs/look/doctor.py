@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from typing import Literal
-
-import msgspec
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import print_hanging, print_json
@@ -20,13 +17,6 @@ _EXIT = """\
 Exit code: 0 no finding is `fail`, 1 one is, 78 the configuration has a mistake."""
 
 
-class Diagnosis(msgspec.Struct):
-    """Everything that was looked at."""
-
-    worst: Literal["ok", "warn", "fail"]
-    findings: list[Finding]
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -37,7 +27,7 @@ def add_parser(subparsers: Subparsers) -> None:
         description="Check the daemon, its socket and group, the map, shared memory and its limits, live "
         "maps, where a published map comes from, the bridge to ROS, and what was left behind.  Changes "
         "nothing.  Run it as the user whose program has a problem.",
-        output="look.doctor.Diagnosis",
+        output="look.outputs.Diagnosis",
         epilog=_EXIT,
     )
     parser.add_argument(
@@ -65,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
             flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
-        print_json(Diagnosis(worst(findings), findings))
+        from shmmap.cli.verbs.look import outputs
+
+        print_json(outputs.Diagnosis(worst(findings), findings))
     else:
         _print(findings)
     return 1 if worst(findings) == "fail" else 0

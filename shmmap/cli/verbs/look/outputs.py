@@ -5,19 +5,33 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Annotated, TypeAlias
+from typing import Annotated, Literal, TypeAlias, Union, get_args
 
 import msgspec
 
-from shmmap.cli.json_output import Client, Hex, LiveMap, hexed
+from shmmap.cli.json_output import Box, Client, Hex, Holder, LiveMap, Segment, hexed
 from shmmap.cli.screens.status_parts import over_fetch
 from shmmap.cli.screens.top_screen import budget_parts
+from shmmap.cli.verbs.look.tail import HEX_FIELDS
+from shmmap.doctor.finding import Finding
 from shmmap.doctor.verdicts import cache_verdict
+from shmmap.protocol.messages import ShownCell
 from shmmap.statistics.counters import SPANS
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["Health", "Prefetching", "Published", "Status", "Top"]
+__all__ = [
+    "Clients",
+    "Diagnosis",
+    "Health",
+    "Listed",
+    "Prefetching",
+    "Published",
+    "Shown",
+    "Status",
+    "Top",
+    "json_events",
+]
 
 State: TypeAlias = Annotated[
     str,
@@ -236,3 +250,80 @@ class Health(msgspec.Struct):
     instance: str
     defects: Annotated[int, msgspec.Meta(description="exceptions that it survived; its log has them")]
     troubles: Annotated[list[str], msgspec.Meta(description="what --strict counts")]
+
+
+class Listed(msgspec.Struct):
+    """The segments of a daemon, in its statistics' state."""
+
+    state: str
+    epoch: Hex
+    not_listed: Annotated[int, msgspec.Meta(description="segments that the statistics have no room for")]
+    cells: list[Segment]
+
+
+class Shown(msgspec.Struct):
+    """One cell."""
+
+    id: str
+    version: Hex
+    box: Box
+    z: Annotated[
+        tuple[float, float] | None, msgspec.Meta(description="min and max; null before the first load")
+    ]
+    source_bytes: int
+    loading: Annotated[list[str], msgspec.Meta(description="layers")]
+    pinned: Annotated[list[str], msgspec.Meta(description="layers that an operator keeps")]
+    failure: Annotated[str, msgspec.Meta(description="the last one that still stands")]
+    segments: list[Segment]
+
+    @classmethod
+    def of(cls, cell: ShownCell) -> Shown:
+        """Return all that a daemon knows of a cell."""
+        segments, now_ns = [], time.monotonic_ns()
+        for row in cell.segments:
+            segments.append(Segment.whole(row, now_ns))
+            segments[-1].holders = [Holder.of(holder) for holder in row.holders]
+        return cls(
+            cell.id,
+            hexed(cell.version),
+            (cell.min_x, cell.min_y, cell.max_x, cell.max_y),
+            None if cell.z_min is None or cell.z_max is None else (cell.z_min, cell.z_max),
+            cell.source_bytes,
+            list(cell.loading),
+            list(cell.pinned),
+            cell.failure,
+            segments,
+        )
+
+
+class Clients(msgspec.Struct):
+    """The clients of a daemon, this program among them."""
+
+    clients: list[Client]
+    unknown_holders: Annotated[int, msgspec.Meta(description="segments mapped by unidentified processes")]
+    unknown_bytes: int
+
+
+class Diagnosis(msgspec.Struct):
+    """Everything that was looked at."""
+
+    worst: Literal["ok", "warn", "fail"]
+    findings: list[Finding]
+
+
+def json_events() -> object:
+    """Return the kinds of lines that ``--json`` prints: the protocol's events, and lost ones."""
+    from shmmap.client.event_stream import Missed
+    from shmmap.protocol.events import Event
+
+    kinds = []
+    for kind in (*get_args(Event), Missed):
+        fields = [
+            ("time", float)
+            if field.name == "unix_ns"
+            else (field.name, Hex if field.name in HEX_FIELDS else field.type)
+            for field in msgspec.structs.fields(kind)
+        ]
+        tag = kind.__struct_config__.tag or "missed"
+        kinds.append(msgspec.defstruct(kind.__name__, fields, tag_field="event", tag=tag))
+    return Union[tuple(kinds)]  # noqa: UP007

@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, Union, get_args
+from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb, seconds
 from shmmap.cli.program import complain
@@ -33,7 +33,7 @@ With --json, one object a line.  Live on a terminal or with --follow; else it en
 the daemon has kept.
 Exit code: 0, or 69 when no daemon answers."""
 
-_HEX: Final = ("epoch", "version", "map_version", "replaces", "session")
+HEX_FIELDS: Final = ("epoch", "version", "map_version", "replaces", "session")
 DEFAULT_SINCE_S: Final = 60.0
 SILENT_S: Final = 5.0
 
@@ -50,7 +50,7 @@ def add_parser(subparsers: Subparsers) -> None:
         "to wait for; reloads; turns of the daemon's loop that took long; clients that connect and leave; "
         "the daemon's start and end; what is wrong with live maps.  Changes of "
         "live maps, up to two a second, are printed with --json only.",
-        output="look.tail.json_events",
+        output="look.outputs.json_events",
         epilog=_EXIT,
     )
     parser.add_argument(
@@ -117,32 +117,11 @@ def _fields(happening: Happening) -> dict[str, Any]:
     return {"event": kind, **fields}
 
 
-def json_events() -> object:
-    """Return the kinds of lines that ``--json`` prints: the protocol's events, and lost ones."""
-    import msgspec
-
-    from shmmap.cli.json_output import Hex
-    from shmmap.client.event_stream import Missed
-    from shmmap.protocol.events import Event
-
-    kinds = []
-    for kind in (*get_args(Event), Missed):
-        fields = [
-            ("time", float)
-            if field.name == "unix_ns"
-            else (field.name, Hex if field.name in _HEX else field.type)
-            for field in msgspec.structs.fields(kind)
-        ]
-        tag = kind.__struct_config__.tag or "missed"
-        kinds.append(msgspec.defstruct(kind.__name__, fields, tag_field="event", tag=tag))
-    return Union[tuple(kinds)]  # noqa: UP007
-
-
 def _print_json(happening: Happening | None) -> None:
     if happening is None or _is_me(happening):
         return
     fields = _fields(happening)
-    for name in _HEX:
+    for name in HEX_FIELDS:
         if name in fields:
             fields[name] = f"{fields[name]:016x}"
     if "unix_ns" in fields:

@@ -27,14 +27,6 @@ Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no
 73 OUT cannot be written, 75 another run is making OUT."""
 
 
-def divided_kind() -> object:
-    """Return what ``--json`` prints."""
-    from shmmap.cli.json_output import more_of
-    from shmmap.dividing.report import DividedMap
-
-    return more_of(DividedMap, seconds=float, peak_memory_bytes=int)
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -43,7 +35,7 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="divide clouds into a map of square cells",
         description="Divide clouds of any size into a map of square cells that `serve` and Autoware read.",
-        output="maps.divide.divided_kind",
+        output="maps.outputs.divided_kind",
         epilog=_EPILOG,
     )
     parser.add_argument("inputs", metavar="IN", nargs="+", help="clouds, or directories of clouds")

@@ -5,9 +5,6 @@ from __future__ import annotations
 
 import argparse
 
-import msgspec
-
-from shmmap.cli.json_output import Hex, hexed
 from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, print_json, print_pairs
 from shmmap.cli.verbs.maps.map_options import (
@@ -28,20 +25,6 @@ version, or an object is gone, 69 a package is missing, 73 DIR cannot be written
 answer or refuses, or another run is making DIR, 78 unusable credentials."""
 
 
-class Fetched(msgspec.Struct):
-    """What was written, and what of it had to be fetched."""
-
-    url: str
-    path: str
-    version: int
-    map_version: Hex
-    cells: int
-    points: int
-    fetched_cells: int
-    fetched_bytes: int
-    seconds: float
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -50,7 +33,7 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="write a published map as a divided map",
         description="Write a published map as a divided map, which `serve` and Autoware read.",
-        output="maps.fetch.Fetched",
+        output="maps.outputs.Fetched",
         epilog=_EPILOG,
     )
     parser.add_argument("url", metavar="URL", help=URL_HELP)
@@ -94,12 +77,14 @@ def run(args: argparse.Namespace) -> int:
     )
     seconds = time.monotonic() - began_s
     if args.json:
+        from shmmap.cli.verbs.maps import outputs
+
         print_json(
-            Fetched(
+            outputs.Fetched(
                 store.url,
                 made.path,
                 made.version,
-                hexed(made.map_version),
+                f"{made.map_version:016x}",
                 made.cells,
                 made.points,
                 made.fetched_cells,

@@ -7,11 +7,11 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli import json_output
 from shmmap.cli.options import add_unit_options, at_least
 from shmmap.cli.screens.output import print_line
 
 if TYPE_CHECKING:
+    from shmmap.cli import json_output
     from shmmap.origin.map_origin import MapOrigin
     from shmmap.origin.remote.store import Store
     from shmmap.origin.remote.verify_apart import Verified
@@ -86,6 +86,8 @@ def worker_count(args: argparse.Namespace) -> int:
 
 def failure_rows(failures: Sequence[Failure]) -> list[json_output.Failure]:
     """Return layers that could not be made, for JSON."""
+    from shmmap.cli import json_output
+
     return [json_output.Failure(one.cell_id, one.layer, one.message) for one in failures]
 
 

@@ -22,14 +22,6 @@ Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no point in the inputs
 73 OUT cannot be written."""
 
 
-def merged_kind() -> object:
-    """Return what ``--json`` prints."""
-    from shmmap.cli.json_output import more_of
-    from shmmap.dividing.merge import MergedCloud
-
-    return more_of(MergedCloud, seconds=float, peak_memory_bytes=int)
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -38,7 +30,7 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="merge a divided map, or clouds, into one PCD file",
         description="Merge divided maps and clouds of any size into one PCD file: the inverse of `divide`.",
-        output="maps.merge.merged_kind",
+        output="maps.outputs.merged_kind",
         epilog=_EPILOG,
     )
     parser.add_argument("inputs", metavar="IN", nargs="+", help="divided maps, directories, clouds")

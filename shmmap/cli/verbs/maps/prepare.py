@@ -8,11 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from typing import Annotated
 
-import msgspec
-
-from shmmap.cli.json_output import Failure
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
@@ -56,43 +52,6 @@ Exit code: 0, 1 if a layer of some cell could not be computed (the slice is then
 does not answer or refuses, 78 unusable credentials."""
 
 
-class Prepared(msgspec.Struct):
-    """What is kept of a map's layers."""
-
-    map: str
-    cells: int
-    layers: list[str]
-    kept: int
-    recognised: Annotated[int, msgspec.Meta(description="by contents")]
-    built: Annotated[int, msgspec.Meta(description="layers of cells")]
-    bytes: int
-    cache_dir: str
-    cache_bytes: Annotated[int, msgspec.Meta(description="disk space of the whole cache")]
-    seconds: float
-    failed: list[Failure]
-
-
-class Slice(msgspec.Struct):
-    """A slice that was made with --shards."""
-
-    url: str
-    version: Annotated[int, msgspec.Meta(description="the current one")]
-    run: str
-    slice: int
-    slices: int
-    shards: int
-    cells: Annotated[int, msgspec.Meta(description="of the slice")]
-    layers: list[str]
-    there: Annotated[bool, msgspec.Meta(description="it had been made before")]
-    kept: Annotated[int, msgspec.Meta(description="layers of cells that the version has")]
-    made: int
-    bytes: Annotated[int, msgspec.Meta(description="of their objects")]
-    sent_objects: int
-    sent_bytes: int
-    seconds: float
-    failed: list[Failure]
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -102,7 +61,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="compute layers of a map ahead of time",
         description="Compute layers of every cell of a map and keep them in the disk cache, using all cores."
         "\nWith --shards, compute those of a slice of a published map, and send them there.",
-        output="maps.prepare.Prepared maps.prepare.Slice",
+        output="maps.outputs.Prepared maps.outputs.Slice",
         epilog=_EPILOG,
     )
     parser.add_argument(
@@ -184,8 +143,10 @@ def _prepare_map(args: argparse.Namespace) -> int:
     )
     seconds = time.monotonic() - began_s
     if args.json:
+        from shmmap.cli.verbs.maps import outputs
+
         print_json(
-            Prepared(
+            outputs.Prepared(
                 origin.path,
                 done.cells,
                 list(layers),
@@ -254,8 +215,10 @@ def _prepare_slice(args: argparse.Namespace) -> int:
         raise
     seconds = time.monotonic() - began_s
     if args.json:
+        from shmmap.cli.verbs.maps import outputs
+
         print_json(
-            Slice(
+            outputs.Slice(
                 store.url,
                 done.version,
                 str(done.run),

@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Any
 
-import msgspec
-
-from shmmap.cli.json_output import Failure, Hex, hexed
 from shmmap.cli.options import (
     Subparsers,
     add_json_option,
@@ -58,44 +55,6 @@ or damaged version, 66 no map or bucket, or slices are missing, 69 a package is 
 keys."""
 
 
-class Published(msgspec.Struct):
-    """The current version, and what was sent for it."""
-
-    map: str
-    url: str
-    changed: bool
-    version: int
-    map_version: Hex
-    root: Annotated[str, msgspec.Meta(description="hash of its object")]
-    cells: int
-    layers: list[str]
-    id_prefix: str
-    encoding: str
-    objects: Annotated[int, msgspec.Meta(description="layers of cells")]
-    bytes: int
-    sent_objects: int
-    sent_bytes: int
-    seconds: float
-    failed: list[Failure]
-    notes: Annotated[list[str], msgspec.Meta(description="oddities of the map")]
-
-
-class Joined(msgspec.Struct):
-    """The current version after --join."""
-
-    url: str
-    run: str
-    slices: int
-    changed: bool
-    version: int
-    map_version: Hex
-    root: str
-    cells: int
-    layers: list[str]
-    objects: Annotated[int, msgspec.Meta(description="that were checked")]
-    seconds: float
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -105,7 +64,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="publish a map in a bucket or a directory",
         description="Publish a map in a bucket or a directory, from where vehicles fetch what they need.\n"
         "With --join and without MAP, add layers that slices have made.",
-        output="maps.publish.Published maps.publish.Joined",
+        output="maps.outputs.PublishedMap maps.outputs.Joined",
         epilog=_EPILOG,
     )
     parser.add_argument("map_path", metavar="MAP", help="what serve takes: a divided map, or one cloud")
@@ -191,14 +150,16 @@ def _join(args: argparse.Namespace) -> int:
     )
     seconds = time.monotonic() - began_s
     if args.json:
+        from shmmap.cli.verbs.maps import outputs
+
         print_json(
-            Joined(
+            outputs.Joined(
                 store.url,
                 str(done.run),
                 done.run.slices,
                 done.version is not None,
                 done.current,
-                hexed(done.map_version),
+                f"{done.map_version:016x}",
                 done.root,
                 done.cells,
                 list(done.layers),
@@ -262,13 +223,15 @@ def _publish(args: argparse.Namespace) -> int:
         raise
     seconds = time.monotonic() - began_s
     if args.json:
+        from shmmap.cli.verbs.maps import outputs
+
         print_json(
-            Published(
+            outputs.PublishedMap(
                 origin.path,
                 store.url,
                 done.version is not None,
                 done.current,
-                hexed(done.map_version),
+                f"{done.map_version:016x}",
                 done.root,
                 done.cells,
                 list(done.layers),

@@ -4,11 +4,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from shmmap.cli.json_output import more_of, with_more
 from shmmap.cli.options import Subparsers, add_json_option, add_verb, at_least
 from shmmap.cli.screens.output import (
     Column,
@@ -45,59 +42,6 @@ missing, 75 the store does not answer or refuses, or another publisher was quick
 credentials or keys."""
 
 
-class Version(msgspec.Struct):
-    """One version."""
-
-    version: int
-    state: Annotated[str, msgspec.Meta(description="current, earlier, or never served")]
-    created: Annotated[str, msgspec.Meta(description="RFC 3339, or empty")]
-    root: Annotated[str, msgspec.Meta(description="hash")]
-    bytes: Annotated[int, msgspec.Meta(description="of the root")]
-    before: int
-    restored: Annotated[int, msgspec.Meta(description="the version whose content it has again, or 0")]
-
-
-class Listed(msgspec.Struct):
-    """All versions, the latest first."""
-
-    url: str
-    current: int
-    valid_until: Annotated[float | None, msgspec.Meta(description="Unix time; null without --trust")]
-    versions: list[Version]
-
-
-class RolledBack(msgspec.Struct):
-    """After --rollback."""
-
-    url: str
-    changed: bool
-    version: Annotated[int, msgspec.Meta(description="the current one")]
-    restored: int
-    objects: Annotated[int, msgspec.Meta(description="that were looked for")]
-
-
-class Refreshed(msgspec.Struct):
-    """After --refresh."""
-
-    url: str
-    version: int
-    valid_until: Annotated[dict[str, str], msgspec.Meta(description="RFC 3339, by role")]
-
-
-def rotated_kind() -> object:
-    """Return what ``--rotate`` prints."""
-    from shmmap.publishing.signing import Rotated
-
-    return more_of(Rotated, url=str)
-
-
-def pruned_kind() -> object:
-    """Return what ``--prune`` prints."""
-    from shmmap.publishing.prune import Pruned
-
-    return more_of(Pruned, url=str)
-
-
 def add_parser(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
@@ -106,8 +50,8 @@ def add_parser(subparsers: Subparsers) -> None:
         run,
         help="list a published map's versions, go back to one, remove old ones",
         description="List the versions of a published map, go back to one, or remove old ones.",
-        output="maps.versions.Listed maps.versions.RolledBack maps.versions.Refreshed"
-        " maps.versions.rotated_kind maps.versions.pruned_kind",
+        output="maps.outputs.Versions maps.outputs.RolledBack maps.outputs.Refreshed"
+        " maps.outputs.rotated_kind maps.outputs.pruned_kind",
         epilog=_EPILOG,
     )
     parser.add_argument("url", metavar="URL", help=URL_HELP)
@@ -195,7 +139,11 @@ def _roll_back(
     restored = restore_version(store, version, progress, signer)
     if as_json:
         changed = restored.version is not None
-        print_json(RolledBack(store.url, changed, restored.current, restored.restored, restored.objects))
+        from shmmap.cli.verbs.maps import outputs
+
+        print_json(
+            outputs.RolledBack(store.url, changed, restored.current, restored.restored, restored.objects)
+        )
     elif restored.version is None:
         print_line(f"version {restored.current} has that content: nothing has changed")
     else:
@@ -211,7 +159,9 @@ def _refresh(store: Store, signer: MapSigner, *, as_json: bool) -> None:
     }
     if as_json:
         until = {role: time.isoformat() for role, time in valid.items()}
-        print_json(Refreshed(store.url, refreshed.current.version, until))
+        from shmmap.cli.verbs.maps import outputs
+
+        print_json(outputs.Refreshed(store.url, refreshed.current.version, until))
         return
     print_line(f"version {refreshed.current.version} is signed")
     print_pairs([(role, f"until {until:%Y-%m-%d %H:%M} UTC") for role, until in valid.items()])
@@ -220,6 +170,8 @@ def _refresh(store: Store, signer: MapSigner, *, as_json: bool) -> None:
 def _rotate(store: Store, signer: MapSigner, role: str, *, as_json: bool) -> None:
     rotated = signer.rotate(role)
     if as_json:
+        from shmmap.cli.json_output import with_more
+
         print_json(with_more(rotated, url=store.url))
         return
     print_line(f"{' and '.join(rotated.roles)}: signed by a new key, as root of trust {rotated.root} says")
@@ -231,6 +183,8 @@ def _prune(store: Store, keep_days: float | None, progress: PrepareProgress, *, 
 
     pruned = prune_versions(store, keep_days=KEEP_DAYS if keep_days is None else keep_days, progress=progress)
     if as_json:
+        from shmmap.cli.json_output import with_more
+
         print_json(with_more(pruned, url=store.url))
         return
     removed = f"{counted(pruned.objects, 'object')}, {format_bytes(pruned.bytes)}"
@@ -274,8 +228,10 @@ def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
                     states[version] = "never served"
     ordered = sorted(entries.values(), key=lambda entry: -entry.version)
     if as_json:
+        from shmmap.cli.verbs.maps import outputs
+
         shown = [
-            Version(
+            outputs.Version(
                 entry.version,
                 states[entry.version],
                 entry.created,
@@ -287,7 +243,7 @@ def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
             for entry in ordered
         ]
         expires_s = verified.expires_s if verified is not None else None
-        print_json(Listed(store.url, current.version, expires_s, shown))
+        print_json(outputs.Versions(store.url, current.version, expires_s, shown))
         return
     print_table(
         [

@@ -29,13 +29,6 @@ class Versions(NamedTuple):
     python: str
 
 
-def versions_kind() -> object:
-    """Return what ``--json`` prints."""
-    from shmmap.cli.json_output import more_of
-
-    return more_of(Versions)
-
-
 def _versions() -> Versions:
     import platform
 
@@ -63,7 +56,7 @@ def add_version(subparsers: Subparsers) -> None:
         run_version,
         help="versions of program, protocol and segment layout",
         description="Print the versions of the program, its wire protocol and its segment layout.",
-        output="run.about.versions_kind",
+        output="run.outputs.versions_kind",
         epilog=_EXIT,
     )
     add_json_option(parser)

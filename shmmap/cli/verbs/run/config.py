@@ -6,9 +6,6 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from shmmap.cli.options import Subparsers, add_json_option, add_verb
 from shmmap.cli.screens.output import print_json, print_line
@@ -22,27 +19,6 @@ Exit code: 0 good, 66 no map there, 78 a mistake: the codes that the daemon woul
 
 _EPILOG = """\
 `check` and `show` read FILE, or the one that the installed service reads, and SHMMAP_* variables."""
-
-
-class Setting(msgspec.Struct):
-    """A setting, and FILE:LINE, the variable, or ``default`` that it comes from."""
-
-    value: Any
-    origin: str
-
-
-class Shown(msgspec.Struct):
-    """Every setting; sizes stand there under two names, such as budget (as in the file) and budget_bytes."""
-
-    file: str | None
-    settings: dict[str, Setting]
-
-
-class Checked(msgspec.Struct):
-    """A file without mistakes."""
-
-    file: str | None
-    good: bool
 
 
 def add_parser(subparsers: Subparsers) -> None:
@@ -63,7 +39,7 @@ def add_parser(subparsers: Subparsers) -> None:
         run_check,
         help="find mistakes",
         description="Find mistakes in the settings that would keep the daemon from starting.",
-        output="run.config.Checked",
+        output="run.outputs.Checked",
         epilog=_CHECK_EXIT,
     )
     show = add_verb(
@@ -73,7 +49,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="print every setting",
         description="Print every setting, under its name in the file; where a default is chosen at start, "
         "how it is chosen.",
-        output="run.config.Shown",
+        output="run.outputs.Settings",
     )
     show.add_argument("--origin", action="store_true", help="say where each setting comes from")
     for one in (check, show):
@@ -111,7 +87,9 @@ def run_check(args: argparse.Namespace) -> int:
 
         read_trusted_root(config.trust)
     if args.json:
-        print_json(Checked(file or None, good=True))
+        from shmmap.cli.verbs.run import outputs
+
+        print_json(outputs.Checked(file or None, good=True))
     else:
         print_line(f"{file or 'no file'}: good")
     return 0
@@ -130,10 +108,12 @@ def run_show(args: argparse.Namespace) -> int:
     live = settings.pop("live")
     tables = [asdict(one) for one in live.value]
     if args.json:
-        shown = {name: Setting(one.value, one.origin) for name, one in settings.items()}
-        shown["live"] = Setting(tables, live.origin)
+        from shmmap.cli.verbs.run import outputs
+
+        shown = {name: outputs.Setting(one.value, one.origin) for name, one in settings.items()}
+        shown["live"] = outputs.Setting(tables, live.origin)
         shown |= {row.called: shown[name] for name, row in ROWS.items()}
-        print_json(Shown(file or None, shown))
+        print_json(outputs.Settings(file or None, shown))
         return 0
     lines = {name: row.example(settings[name].value)[1] for name, row in ROWS.items()}
     width = max(map(len, lines.values()))
