@@ -167,7 +167,7 @@ def around(boxes: Iterable[BoxTuple]) -> BoxTuple | None:
 def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
     """Return what has to be added to a map's coordinates to get those of the clouds it was divided from.
 
-    None where nothing was moved, where somebody else made the map, and where its files are not here.
+    None where nothing was moved, where another program made the map, and where its files are not here.
     """
     map_dir = os.path.dirname(os.path.dirname(id_prefix + "_"))
     if not os.path.exists(os.path.join(map_dir, "shmmap_divide.json")):

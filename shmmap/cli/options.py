@@ -129,15 +129,19 @@ def add_verb(
     help: str,  # noqa: A002
     description: str,
     json: str = "",
+    output: str = "",
     epilog: str = "",
 ) -> argparse.ArgumentParser:
     """Add a verb that ``run`` carries out.
 
-    The lines of ``description`` are paragraphs; ``json`` and ``epilog`` stand below the options as written,
-    with long lines folded.
+    The lines of ``description`` are paragraphs; ``epilog`` stands below the options as written, with long
+    lines folded.  What ``--json`` prints is described by ``json``, a text, or ``output``, names of structs
+    as `shmmap.cli.json_output.output_kinds` takes them.
     """
     if json:
         epilog = f"JSON (fields may be added, none is removed):\n{json}"
+    if output:
+        epilog = f"JSON: --json-schema describes it; fields may be added, none is removed.\n{epilog}".rstrip()
     parser = subparsers.add_parser(
         name,
         help=help,
@@ -145,13 +149,40 @@ def add_verb(
         epilog=epilog,
         formatter_class=_HelpFormatter,
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, **({"json_output": output} if output else {}))
     return parser
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
+    """Add ``--json``, and ``--json-schema`` where the verb names the structs that it prints."""
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    if output := parser.get_default("json_output"):
+        parser.add_argument(
+            "--json-schema",
+            action=_PrintSchema,
+            nargs=0,
+            const=output,
+            default=argparse.SUPPRESS,
+            help="print the JSON's schema",
+        )
+
+
+class _PrintSchema(argparse.Action):
+    """Prints the schema and ends, whatever else is given, as ``--help`` does."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        del namespace, values, option_string
+        from shmmap.cli.json_output import json_schema
+        from shmmap.cli.screens.output import print_json
+
+        print_json(json_schema(str(self.const)))
+        parser.exit()
 
 
 def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:

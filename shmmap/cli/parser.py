@@ -9,44 +9,54 @@ from collections.abc import Sequence
 from typing import Final
 
 from shmmap.cli.program import Parser
-from shmmap.cli.verbs.version import installed_version
+from shmmap.cli.verbs.run.about import installed_version
 
 __all__ = ["NUMBER_OPTIONS", "VERBS", "build_parser", "verb_first"]
 
-VERBS: Final = {
-    "demo": "demo",
-    "divide": "divide",
-    "merge": "merge",
-    "prepare": "prepare",
-    "publish": "publish",
-    "versions": "versions",
-    "fetch": "fetch",
-    "live": "live.group",
-    "serve": "serve",
-    "status": "status",
-    "ls": "ls",
-    "show": "show",
-    "clients": "clients",
-    "top": "top",
-    "tail": "tail",
-    "map": "map_view",
-    "metrics": "metrics",
-    "query": "query",
-    "export": "export",
-    "inspect": "inspect",
-    "reload": "reload",
-    "evict": "evict",
-    "pin": "pin",
-    "unpin": "unpin",
-    "stop": "stop",
-    "doctor": "doctor",
-    "config": "config",
-    "unit": "unit",
-    "cpp": "cpp",
-    "health": "health",
-    "version": "version",
+GROUPS: Final = {
+    "run a daemon": {
+        "demo": "run.demo.add_parser",
+        "serve": "run.serve.add_parser",
+        "config": "run.config.add_parser",
+        "unit": "run.unit.add_parser",
+        "stop": "cells.control.add_stop",
+        "version": "run.about.add_version",
+        "cpp": "run.about.add_cpp",
+    },
+    "look at it": {
+        "status": "look.status.add_parser",
+        "top": "look.top.add_parser",
+        "tail": "look.tail.add_parser",
+        "ls": "look.cells.add_ls",
+        "show": "look.cells.add_show",
+        "map": "look.map_view.add_parser",
+        "clients": "look.clients.add_parser",
+        "metrics": "look.monitors.add_metrics",
+        "health": "look.monitors.add_health",
+        "doctor": "look.doctor.add_parser",
+    },
+    "cells": {
+        "query": "cells.query.add_parser",
+        "export": "cells.export.add_parser",
+        "inspect": "cells.inspect.add_parser",
+        "pin": "cells.pins.add_pin",
+        "unpin": "cells.pins.add_unpin",
+        "evict": "cells.control.add_evict",
+        "reload": "cells.control.add_reload",
+    },
+    "make and publish maps": {
+        "divide": "maps.divide.add_parser",
+        "merge": "maps.merge.add_parser",
+        "prepare": "maps.prepare.add_parser",
+        "publish": "maps.publish.add_parser",
+        "versions": "maps.versions.add_parser",
+        "fetch": "maps.fetch.add_parser",
+    },
+    "live maps": {"live": "live.add_parser"},
 }
-"""Modules by verb, in the order of the help; one is imported when its verb is used, all for the help."""
+"""Functions that add a verb, in the order of the help, for which all are imported; else only the one used."""
+VERBS: Final = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
+_HEADINGS: Final = {next(iter(verbs)): heading for heading, verbs in GROUPS.items()}
 
 _EPILOG: Final = """\
 Try `shmmap demo`: it needs no map.  `shmmap VERB --help` explains a verb and its JSON.
@@ -59,7 +69,7 @@ Exit codes, of every verb:
   66   no such map or file
   69   no daemon answers
   70   internal error: a defect in shmmap
-  71   the daemon cannot start now: something is full, missing or in its way
+  71   the daemon cannot start now: a required resource is unavailable
   73   an output cannot be written
   75   another process runs this instance, or makes this output; a map's store does not answer
   76   daemon and client speak different protocol versions
@@ -71,6 +81,15 @@ _OWN_OPTIONS: Final = frozenset({"--help", "--version"})
 _FLAGS: Final = frozenset({"--json"})  # common options without a value
 NUMBER_OPTIONS: Final = frozenset({"--circle", "--square", "--box", "--z", "--origin", "--translate"})
 """Options whose values may begin with a minus, see `join_negative_values`."""
+
+
+class _GroupedHelp(argparse.RawDescriptionHelpFormatter):
+    """Puts a heading above the first verb of each group."""
+
+    def _format_action(self, action: argparse.Action) -> str:
+        text = super()._format_action(action)
+        heading = _HEADINGS.get(action.dest)
+        return f"{' ' * (self._current_indent - 2)}{heading}:\n{text}" if heading else text
 
 
 def verb_first(words: Sequence[str]) -> list[str]:
@@ -94,11 +113,12 @@ def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
         description="Serve a vehicle's point-cloud map to every process of the machine\n"
         "from one copy in shared memory.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=_GroupedHelp,
     )
     parser.add_argument("--version", action="version", version=f"shmmap {installed_version()}")
     subparsers = parser.add_subparsers(title="verbs", metavar="VERB", required=True, parser_class=Parser)
     wanted = words[:1] if words and words[0] in VERBS else tuple(VERBS)
     for verb in wanted:
-        importlib.import_module(f"shmmap.cli.verbs.{VERBS[verb]}").add_parser(subparsers)
+        module, _, add = VERBS[verb].rpartition(".")
+        getattr(importlib.import_module(f"shmmap.cli.verbs.{module}"), add)(subparsers)
     return parser

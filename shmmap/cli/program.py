@@ -10,15 +10,31 @@ import os
 import re
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import Any, Final, NoReturn
 
 from shmmap.errors import CannotWrite, InternalError, ShmmapError
+from shmmap.formats.durable_file import writing_errors
 
-__all__ = ["Parser", "add_allow_empty", "complain", "exit_code_of", "join_negative_values", "nothing_found"]
+__all__ = [
+    "Parser",
+    "add_allow_empty",
+    "complain",
+    "exit_code_of",
+    "join_negative_values",
+    "keep_interrupts",
+    "nothing_found",
+    "output_file",
+    "write_text",
+    "writing_errors",
+]
+
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
+
 _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
+
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _LATER_S: Final = 0.005
 """By then the callback that an interrupt came in is over, as a rule."""
@@ -93,7 +109,7 @@ def join_negative_values(words: Sequence[str], options: Container[str] | None = 
 
 
 def exit_code_of(name: str, run: Callable[[], int]) -> int:
-    """Run a program to its end and return its exit code; its errors are told on stderr."""
+    """Run a program to its end and return its exit code; its errors are printed on stderr."""
     _open_what_is_closed()
     keep_interrupts()
     try:
@@ -209,3 +225,31 @@ def keep_interrupts() -> None:
         signal.setitimer(signal.ITIMER_REAL, _LATER_S)
 
     sys.unraisablehook = ignored
+
+
+def output_file(text: str) -> Path:
+    """Read the name of a file to write, and find out before the work begins that it can be.
+
+    Raises
+    ------
+    CannotWrite
+        There is no such directory, or it or the file may not be written to.
+    """
+    path = Path(text)
+    with writing_errors(str(path)):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        try:
+            os.stat(os.path.join(path.parent, "."))  # a directory, and there
+        except OSError as error:
+            error.filename = text  # the name that the caller knows
+            raise
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), text)
+    return path
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file; what keeps it from being written is `CannotWrite`."""
+    with writing_errors(str(path)):
+        path.write_text(text, encoding="utf-8")

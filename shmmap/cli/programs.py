@@ -30,7 +30,6 @@ The rest of `shmmap.cli` may change at any time; these names, their parameters a
 from __future__ import annotations
 
 from shmmap.cli.daemon_address import connect
-from shmmap.cli.files import output_file, write_text, writing_errors
 from shmmap.cli.options import add_daemon_options, add_json_option, add_verb, at_least, seconds
 from shmmap.cli.program import (
     Parser,
@@ -39,6 +38,9 @@ from shmmap.cli.program import (
     exit_code_of,
     join_negative_values,
     nothing_found,
+    output_file,
+    write_text,
+    writing_errors,
 )
 from shmmap.cli.screens.output import print_json, print_line, printable
 

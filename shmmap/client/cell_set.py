@@ -48,8 +48,7 @@ class CellSet(Sequence[Cell]):
     map_version : int
         Which state of the map.
     layers : tuple of str
-        The layers asked for, one for each, by the names that cells have them by.  Empty from a daemon older
-        than protocol 1.3.
+        The layers asked for, one for each, by the names that cells have them by.
     covered : bool
         Whether the daemon knows all that the map has of what was asked for.  Where it does not (a map that
         comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may

@@ -91,7 +91,7 @@ class EventStream:
     Raises
     ------
     DaemonUnreachable, ProtocolMismatch
-        As `shmmap.connect`; a daemon older than protocol 1.1 publishes no events.
+        As `shmmap.connect`; or the daemon publishes no events.
     """
 
     def __init__(

@@ -48,7 +48,7 @@ def fallback_runtime_dir() -> str:
 
 
 def why_not_private(directory: str) -> str:
-    """Why a directory that anybody could have made is not this user's own; empty where it is."""
+    """Return why a directory that any user could have made is not this user's own; empty where it is."""
     try:
         status = os.lstat(directory)
     except OSError as error:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the daemon tells everybody who listens.  ``PROTOCOL.md`` is the byte-exact document.
+"""The events that the daemon publishes.  ``PROTOCOL.md`` is the byte-exact document.
 
 An event is one MessagePack array: its kind, its number, the epoch it belongs to, when it happened, and
-what happened.  Events of one epoch are numbered from 1 without gaps, so that whoever misses one knows;
+what happened.  Events of one epoch are numbered from 1 without gaps, so that a missed one is noticed;
 `UNNUMBERED` ones have the number of the last that is.
 """
 
@@ -52,7 +52,7 @@ class _Numbered(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Epoch(_Numbered, tag="epoch", frozen=True):
-    """A life of the daemon: ``what`` is started or stopping; segments it took over from the one before."""
+    """A run of the daemon: ``what`` is started or stopping; segments taken over from the previous run."""
 
     what: str
     map_version: int
@@ -64,7 +64,7 @@ class Loaded(_Numbered, tag="loaded", frozen=True):
     """A segment can be handed out; ``load_ns`` is 0 for one that was retired, still whole and wanted again.
 
     ``again`` says that this very version had been evicted to make room; ``replaces`` is the version
-    that it supersedes, 0 for none; ``ahead`` says that nobody had asked for it yet.
+    that it supersedes, 0 for none; ``ahead`` that it was prefetched.
     """
 
     id: str
@@ -107,7 +107,7 @@ class Failed(_Numbered, tag="failed", frozen=True):
 
 
 class Retried(_Numbered, tag="retried", frozen=True):
-    """A cell that failed is loaded again because somebody asked for it; ``code`` of the failure."""
+    """A cell that failed is loaded again because it was requested; ``code`` of the failure."""
 
     id: str
     layer: str
@@ -170,7 +170,7 @@ class LongTurn(_Numbered, tag="long_turn", frozen=True):
 
 
 class Joined(_Numbered, tag="joined", frozen=True):
-    """A client opened a session; pid 0 where the kernel does not tell."""
+    """A client opened a session; pid 0 where the kernel does not say."""
 
     session: int
     pid: int
@@ -188,14 +188,14 @@ class Left(_Numbered, tag="left", frozen=True):
 
 
 class LiveStarted(_Numbered, tag="live_started", frozen=True):
-    """The process that keeps live maps serves them; so many chunks it found in memory."""
+    """The process that keeps live maps serves them; ``chunks`` were found in memory."""
 
     maps: int
     chunks: int
 
 
 class LiveEnded(_Numbered, tag="live_ended", frozen=True):
-    """The process that keeps live maps ended, for the ``restarts``-th time, and is started anew."""
+    """The process that keeps live maps ended, for the ``restarts``-th time, and restarts."""
 
     restarts: int
 
@@ -208,7 +208,7 @@ class LiveProblem(_Numbered, tag="live_problem", frozen=True):
 
 
 class LiveDamaged(_Numbered, tag="live_damaged", frozen=True):
-    """A file of a live map was damaged and put aside, or a chunk is missing: which, and why."""
+    """A damaged file of a live map was quarantined, or a chunk is missing: which, and why."""
 
     map: str
     what: str
@@ -217,7 +217,7 @@ class LiveDamaged(_Numbered, tag="live_damaged", frozen=True):
 class LiveChanged(_Numbered, tag="live_changed", frozen=True):
     """A live map has changed; ``change`` is the number of its last change, as in `LiveChunkPage`.
 
-    Sent at most twice a second for a map, and not remembered: whoever misses one hears the next.
+    Sent at most twice a second for a map, and not remembered: the next one follows.
     """
 
     map: str
@@ -227,7 +227,7 @@ class LiveChanged(_Numbered, tag="live_changed", frozen=True):
 class Beat(_Numbered, tag="beat", frozen=True):
     """Nothing happened: ``seq`` is the last event's number.
 
-    Sent to whoever subscribes, and once a second, so that a missed last event is noticed too.
+    Sent at a subscription, and once a second, so that a missed last event is noticed too.
     """
 
 
@@ -284,7 +284,7 @@ _encoder: Final = msgspec.msgpack.Encoder()
 encode_event: Final = _encoder.encode
 
 
-@cache  # made when it is first needed: most clients hear no events
+@cache  # made when it is first needed: most clients subscribe to no events
 def _events() -> msgspec.msgpack.Decoder[Event]:
     return msgspec.msgpack.Decoder(Event)
 

@@ -173,7 +173,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     Attributes
     ----------
     map_id
-        16 bytes, the map's for ever.
+        16 bytes, permanently the map's.
     resolution, frame_id
         Edge of a voxel, metres; frame of the map.
     hit, miss, clamp_min, clamp_max, occupied_above, free_below

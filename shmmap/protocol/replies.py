@@ -213,7 +213,7 @@ class Reloaded(msgspec.Struct, array_like=True, tag="reloaded"):
 
 
 class Evicted(msgspec.Struct, array_like=True, tag="evicted"):
-    """Answer to `Evict`: segments freed at once, segments still mapped by somebody, unknown ids.
+    """Answer to `Evict`: segments freed at once, segments still mapped, unknown ids.
 
     ``kept`` counts the segments left alone because an operator pinned them.
     """

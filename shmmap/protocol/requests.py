@@ -44,7 +44,7 @@ Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NA
 class Hello(msgspec.Struct, array_like=True, tag="hello"):
     """First message of a session.
 
-    ``session`` is the slot of the client's session with an earlier life of the daemon, 0 for none: it
+    ``session`` is the slot of the client's session with a previous run of the daemon, 0 for none: it
     keeps it, so that the locks it holds still name it.
     """
 
@@ -59,7 +59,7 @@ class Metadata(msgspec.Struct, array_like=True, tag="metadata"):
     """One page of the catalogue.
 
     ``since`` is a map version: only what changed after it is answered, if the daemon still knows it
-    (`MetadataPage.since_known` tells).  ``start`` is `MetadataPage.next` of the page before.
+    (`MetadataPage.since_known` says).  ``start`` is `MetadataPage.next` of the page before.
     """
 
     request: int
@@ -136,7 +136,7 @@ class Reload(msgspec.Struct, array_like=True, tag="reload"):
 
 
 class Evict(msgspec.Struct, array_like=True, tag="evict"):
-    """Retire cells, all when ``ids`` is nil (privileged); those in use are freed when they are let go."""
+    """Retire cells, all when ``ids`` is nil (privileged); those in use are freed when they are released."""
 
     request: int
     ids: Ids | None = None

@@ -15,23 +15,39 @@ from pathlib import Path
 from typing import Literal
 
 from shmmap.daemon.config import example_file
-from shmmap.errors import CannotWrite, MapMissing
+from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing
 from shmmap.origin.remote.store import is_url, read_url
 from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import DROP_IN, MOUNT
 from shmmap.service.program import Program, command_line, is_hidden, quoted
-from shmmap.service.shipped_files import shipped_names, shipped_text
 
-__all__ = ["PlannedFile", "configuration", "plan_system", "plan_user", "unit_text", "write"]
+__all__ = [
+    "PlannedFile",
+    "configuration",
+    "plan_system",
+    "plan_user",
+    "shipped_directory",
+    "shipped_names",
+    "shipped_text",
+    "unit_text",
+    "write",
+]
+
 
 EXAMPLE_MAP = "/var/lib/shmmap/maps"
+
 SHIPPED_PROGRAM = "/usr/bin/shmmapd"
+
 SHIPPED_BRIDGE = "/usr/bin/shmmap-ros-bridge"
+
 PUBLISHED_MAP = "drop-ins/published-map.conf"
+
 ROOT_OF_TRUST = "ROOT.json"
 """File name of the copy of a root of trust, in the directory of the configuration."""
+
 CREDENTIALS = ("shmmap.aws", "shmmap.google", "shmmap.azure")
 """Files in /etc/shmmap that are passed to the service, whose account need not be able to read them."""
+
 _GENERATED = "# Written by `shmmap unit install`, which replaces it.\n"
 
 
@@ -250,3 +266,37 @@ def write(planned: Sequence[PlannedFile]) -> None:
                 f"cannot write {one.path}: {error.strerror}",
                 hint="run it with sudo, or with --user" if denied else "",
             ) from error
+
+
+def shipped_directory() -> Path:
+    """Return the directory of the files.
+
+    Raises
+    ------
+    InternalError
+        The package was installed without them.
+    """
+    package = Path(__file__).parent.parent
+    for place in (package / "_systemd", package.parent / "systemd"):
+        if (place / "shmmap.toml").is_file():
+            return place
+    raise InternalError("this installation of shmmap came without its unit files")
+
+
+def shipped_names() -> list[str]:
+    """Return all names, relative to the directory: ``system/shmmapd.service``, ..."""
+    root = shipped_directory()
+    return sorted(str(path.relative_to(root)) for path in root.rglob("*") if path.is_file())
+
+
+def shipped_text(name: str) -> str:
+    """Return the text of one file.
+
+    Raises
+    ------
+    BadRequest
+        There is no file of this name; the hint lists those there are.
+    """
+    if name not in shipped_names():
+        raise BadRequest(f"there is no file {name!r}", hint="there are: " + ", ".join(shipped_names()))
+    return (shipped_directory() / name).read_text(encoding="utf-8")

@@ -4,7 +4,7 @@
 The units hide home directories and /tmp from the daemon.  An installation that lies there (a virtual
 environment in a home, a Python of pyenv or uv) is made visible again, read-only and nothing else with
 it.  What only its owner may read stays closed to the service: that is refused, with the commands that install
-the program where everybody can read it.
+the program where every account can read it.
 """
 
 from __future__ import annotations

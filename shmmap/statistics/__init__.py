@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the daemon tells about itself without being asked: counters and resident cells in shared memory."""
+"""Counters and rows of the daemon in shared memory: readable without a request."""

@@ -22,7 +22,7 @@ __all__ = [
 class Counter(NamedTuple):
     """One number the daemon keeps.
 
-    ``kind`` is ``counter`` for what only grows during one life of the daemon and ``gauge`` for a
+    ``kind`` is ``counter`` for what only grows during one run of the daemon and ``gauge`` for a
     present amount; a ``histogram`` counts durations (`shmmap.statistics.histogram`).  ``unit`` is
     empty for plain counts.
     """
@@ -34,7 +34,7 @@ class Counter(NamedTuple):
 
 
 SPANS: Final = {"10s": 10, "1min": 60, "10min": 600}
-"""Spans over which some counters are also told, by suffix, in seconds."""
+"""Spans over which some counters are also summed, by suffix, in seconds."""
 
 WINDOWED: Final = {
     "hits": "Cells answered from memory",
@@ -44,13 +44,13 @@ WINDOWED: Final = {
     "refused_over_budget": "Cells refused because the budget is full",
     "prefetch_misses": "Cells that a moving client requested and had to wait for",
 }
-"""Counters of which the last 10 s, 1 min and 10 min are told: what the present state is judged by."""
+"""Counters of which the last 10 s, 1 min and 10 min are shown: what the present state is judged by."""
 
 TURN_KINDS: Final = {
-    "clients": "clients were heard",
+    "clients": "clients were read",
     "requests": "a request was served, or the first part of a large one",
     "answers": "another part of a large request was served, or one that waited was answered",
-    "loaders": "a loader was heard, and what it loaded published",
+    "loaders": "a loader was read, and what it loaded published",
     "memory": "loads were handed out, room made and memory freed",
     "usage": "the kernel was asked who uses segments",
     "statistics": "the statistics were written",
@@ -115,10 +115,10 @@ COUNTERS: Final = (
     Counter("cells_resident", "gauge", "", "Segments that can be handed out"),
     Counter("stale_cells", "gauge", "", "Resident segments whose successor could not be loaded yet"),
     Counter("bytes_resident", "gauge", "bytes", "Memory of segments that can be handed out"),
-    Counter("zombies", "gauge", "", "Retired segments that somebody still maps"),
-    Counter("bytes_zombie", "gauge", "bytes", "Memory of retired segments that somebody still maps"),
+    Counter("zombies", "gauge", "", "Retired segments that are still mapped"),
+    Counter("bytes_zombie", "gauge", "bytes", "Memory of retired segments that are still mapped"),
     Counter("bytes_reserved", "gauge", "bytes", "Memory set aside for loads in progress"),
-    Counter("bytes_pinned", "gauge", "bytes", "Memory somebody maps, as last probed"),
+    Counter("bytes_pinned", "gauge", "bytes", "Memory that is mapped, as last probed"),
     Counter("bytes_statistics", "gauge", "bytes", "Memory of this statistics segment"),
     Counter("budget_bytes", "gauge", "bytes", "Most memory the segments may occupy"),
     Counter("evictions", "counter", "", "Segments retired to make room"),
@@ -127,7 +127,7 @@ COUNTERS: Final = (
     Counter("hits", "counter", "", "Cells answered from memory"),
     Counter("misses", "counter", "", "Cells that had to be loaded first"),
     Counter("reloads", "counter", "", "Times the map's catalogue was read again"),
-    Counter("adopted", "counter", "", "Segments of an earlier life of the daemon taken over at its start"),
+    Counter("adopted", "counter", "", "Segments of the previous run taken over at the start"),
     Counter("adoptions_failed", "counter", "", "Segments taken over that did not match their checksums"),
     Counter(
         "pin_source",
@@ -141,20 +141,18 @@ COUNTERS: Final = (
     Counter("last_reload_unix_ns", "gauge", "ns", "When the catalogue was last read, wall clock"),
     Counter("last_reload_failed", "gauge", "", "1 if the last attempt to read the catalogue again failed"),
     Counter("loads_after_eviction", "counter", "", WINDOWED["loads_after_eviction"]),
-    Counter("segments_pinned", "gauge", "", "Segments somebody maps, as last probed"),
+    Counter("segments_pinned", "gauge", "", "Segments that are mapped, as last probed"),
     Counter("layers_computed", "counter", "", "Loads that computed a layer"),
     Counter("loads_from_cache", "counter", "", "Loads that found their layer in the disk cache"),
-    Counter("events_published", "counter", "", "Events of this life of the daemon"),
+    Counter("events_published", "counter", "", "Events of this run of the daemon"),
     Counter("map_problems", "gauge", "", "Problems found when the map was last read; its log names them"),
     Counter("defects", "counter", "", "Exceptions that the daemon survived; its log has their tracebacks"),
     Counter("prefetch_misses", "counter", "", WINDOWED["prefetch_misses"]),
-    Counter("prefetch_started", "counter", "", "Loads begun before anybody asked for the cell"),
-    Counter("prefetch_used", "counter", "", "Segments fetched ahead that somebody then asked for"),
-    Counter(
-        "prefetch_in_vain", "counter", "", "Segments fetched ahead that left memory before anybody asked"
-    ),
-    Counter("prefetch_overtaken", "counter", "", "Cells asked for while they were being fetched ahead"),
-    Counter("bytes_prefetched", "gauge", "bytes", "Memory of what was fetched ahead and not asked for yet"),
+    Counter("prefetch_started", "counter", "", "Loads begun before a client requested the cell"),
+    Counter("prefetch_used", "counter", "", "Prefetched segments that a client then requested"),
+    Counter("prefetch_in_vain", "counter", "", "Prefetched segments that left memory unrequested"),
+    Counter("prefetch_overtaken", "counter", "", "Cells requested while they were being prefetched"),
+    Counter("bytes_prefetched", "gauge", "bytes", "Memory of what was prefetched and not requested yet"),
     Counter(
         "bytes_used",
         "counter",
@@ -176,9 +174,7 @@ COUNTERS: Final = (
     Counter("origin_out", "gauge", "", "1 while no load succeeds: the map's files are out of reach"),
     Counter("origin_outages", "counter", "", "Times that no load succeeded"),
     Counter("last_outage_ns", "gauge", "ns", "How long the last time lasted, or the present one does"),
-    Counter(
-        "live_restarts", "counter", "", "Times the process that keeps live maps ended, and was started anew"
-    ),
+    Counter("live_restarts", "counter", "", "Times the process that keeps live maps ended, and restarted"),
     Counter(
         "cells_outside_box", "gauge", "", "Cells loaded with points outside their box; the log names them"
     ),

@@ -2,8 +2,8 @@
 """One daemon for an instance's names, whatever its runtime directory: who writes the statistics has them.
 
 The writer holds an open-file-description lock on its segment while it lives.  It is a write lock, which
-nobody gets who may only read the file, so a client can neither hold the name nor keep a daemon from it.
-Who comes second asks for write locks alone, on files that its own user or root made.
+a process that may only read the file cannot get: a client can neither hold the name nor keep a daemon from
+it.  A second daemon asks for write locks alone, on files that its own user or root made.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def hold(fd: int) -> None:
 
 
 def has_writer(directory: ShmDirectory, name: str) -> bool:
-    """Whether a process writes the statistics ``name``; a file of somebody else does not count."""
+    """Whether a process writes the statistics ``name``; another user's file does not count."""
     try:
         with directory.opened(name) as fd:
             status = os.fstat(fd)
@@ -105,8 +105,8 @@ def _busy(directory: ShmDirectory, instance: str) -> InstanceBusy:
         who = read_statistics(instance, directory.path).identity
     except (ShmmapError, OSError):
         who = None
-    told = f" (pid {who.pid}, listening at {who.endpoint})" if who is not None else ""
+    named = f" (pid {who.pid}, listening at {who.endpoint})" if who is not None else ""
     return InstanceBusy(
-        f"another daemon{told} has instance {instance} in {directory.path}",
+        f"another daemon{named} has instance {instance} in {directory.path}",
         hint="stop it, or choose another --instance or --shm-dir",
     )

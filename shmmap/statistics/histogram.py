@@ -27,7 +27,7 @@ def bucket_of(duration_ns: int) -> int:
         return 0
     if exponent >= LAST_EXPONENT:
         return BUCKETS - 1
-    # the two bits below the leading one tell the quarter of the octave
+    # the two bits below the leading one are the quarter of the octave
     return 4 * (exponent - FIRST_EXPONENT) + (duration_ns >> (exponent - 2)) - 3
 
 

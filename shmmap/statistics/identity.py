@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which daemon writes the statistics, and whether that very process still lives.
 
-A process id alone may belong to somebody else by now; with the process's start time it cannot.
+A process id alone may belong to another process by now; with the process's start time it cannot.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def start_time_ticks(pid: int) -> int:
 
 
 def pid_namespace() -> int:
-    """Return the inode of this process's pid namespace; 0 where /proc does not tell."""
+    """Return the inode of this process's pid namespace; 0 where /proc does not say."""
     try:
         return os.stat("/proc/self/ns/pid").st_ino
     except OSError:
@@ -48,14 +48,14 @@ def pid_namespace() -> int:
 
 @dataclass(frozen=True, slots=True)
 class DaemonIdentity:
-    """One life of the daemon and what it serves.
+    """One run of the daemon and what it serves.
 
     Attributes
     ----------
     pid, start_time_ticks, pid_namespace
         The process: id, start in clock ticks since boot, inode of the namespace the id is valid in.
     epoch
-        64-bit number of this life.
+        64-bit number of this run.
     instance, endpoint, shm_dir
         Name of the instance, path of its socket, directory of its segments.
     map_path, map_version, frame_id
@@ -65,7 +65,7 @@ class DaemonIdentity:
     library_version
         Version of shmmap the daemon runs.
     started_unix_ns
-        Wall-clock start of this life.
+        Wall-clock start of this run.
     """
 
     pid: int
@@ -157,7 +157,7 @@ class WriterProcess:
         self._fd = -1
         self._elsewhere = identity.pid_namespace not in (0, pid_namespace())
         if self._elsewhere:
-            return  # its pid means another process here: only the beat tells
+            return  # its pid means another process here: only the beat counts
         try:
             fd = os.open(f"/proc/{identity.pid}/stat", os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
@@ -202,7 +202,7 @@ def _read_stat(fd: int) -> bytes | None:
 def judge(identity: DaemonIdentity, beat_age_s: float) -> DaemonState:
     """Return how the daemon is, from its process and the age of its last beat in seconds."""
     if identity.pid_namespace and identity.pid_namespace != pid_namespace():
-        process: str = "unknown"  # its pid means another process here: only the beat tells
+        process: str = "unknown"  # its pid means another process here: only the beat counts
     else:
         process = _process_state(identity.pid, identity.start_time_ticks)
     if process == "dead":

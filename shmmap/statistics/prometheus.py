@@ -36,7 +36,7 @@ _LIVE = {
 _NO_TIME_IF_0 = {"origin_out_since_unix_ns", "published_expires_unix_ns", "published_signed_unix_ns"}
 """Times that are 0 are left out: 1970 would raise alarms."""
 
-_TOLD_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
+_SHOWN_ELSEWHERE = {f"{name}_{span}" for name in WINDOWED for span in SPANS}  # Prometheus has rate()
 
 
 def exposition(found: Snapshot, instance: str) -> str:
@@ -67,7 +67,7 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
         return
     yield from one("beat_age_seconds", "gauge", "Time since the daemon last wrote", found.beat_age_s)
     started = identity.started_unix_ns * 1e-9
-    yield from one("start_time_seconds", "gauge", "When this life of the daemon began, Unix time", started)
+    yield from one("start_time_seconds", "gauge", "When this run of the daemon began, Unix time", started)
     more = "".join(
         f',{name}="{_escaped(value)}"'
         for name, value in (
@@ -82,7 +82,7 @@ def _lines(found: Snapshot, instance: str) -> Iterator[str]:
     for counter in found.descriptions:
         value: float = found.counters[counter.name]
         name = counter.name
-        if name in _TOLD_ELSEWHERE or (name in PUBLISHED and not found.counters.get("published_version")):
+        if name in _SHOWN_ELSEWHERE or (name in PUBLISHED and not found.counters.get("published_version")):
             continue
         if name in _NO_TIME_IF_0 and not value:
             continue

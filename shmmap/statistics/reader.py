@@ -33,13 +33,13 @@ _HEADER_BYTES = 16384
 
 
 class StatisticsReader:
-    """Keeps an instance's statistics open, for who looks at them again and again.
+    """Keeps an instance's statistics open, to be read repeatedly.
 
     Parameters
     ----------
     instance, shm_dir
         Which daemon, and the directory of its segments.  It need not run yet: the segment is opened
-        when it is there, and anew when another daemon replaced it.
+        when it is there, and again when another daemon has replaced it.
     """
 
     def __init__(self, instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -> None:
@@ -137,7 +137,7 @@ class StatisticsReader:
 
 
 def read_statistics(instance: str = "default", shm_dir: str = DEFAULT_SHM_DIR) -> Snapshot:
-    """Read once what the instance's daemon tells.
+    """Read the instance's statistics once.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def _newest_state(fd: int, header: Header) -> State:
 
 
 def _rows(fd: int, header: Header, used: int) -> bytes:
-    """Copy the table as of one moment if the writer lets us, else row by row (each has a checksum)."""
+    """Copy the table as of one moment if the writer allows, else row by row (each has a checksum)."""
     nbytes = _within(fd, header.rows_offset, min(used, header.max_rows) * header.row_bytes)
     rows = b""
     for _ in range(_TABLE_ATTEMPTS):

@@ -4,7 +4,7 @@
 Counting costs a dictionary access; `StatisticsWriter.beat` writes what changed.  It writes with
 ``pwrite`` into memory allocated before: a full file system is an error here, never SIGBUS, and a
 reader that cannot be trusted cannot stop or hurt the writer.  Once the segment is there, what cannot
-be written (a limit on the size of files, say) is logged once, stays due, and stops nobody: the
+be written (a limit on the size of files, say) is logged once, stays due, and stops nothing: the
 statistics serve the operator, the daemon serves without them.
 """
 
@@ -76,7 +76,7 @@ class _RowTable(Generic[_Row]):
     write
         Writes bytes at a place; False if that cannot be done.
     allocate
-        Has memory at a place, for so many bytes; False if there is none.
+        Allocates bytes at a place; False if there is no room.
     allocated
         Rows for which there is memory from the start.
     """
@@ -197,7 +197,7 @@ class StatisticsWriter:
         self._changed: dict[Hashable, CellRow] = {}
         self._missing: dict[Hashable, CellRow] = {}  # there was no room for these, or no writing them
         self._removed: list[int] = []
-        self._told = False
+        self._is_logged = False
         self._fd = directory.create()
         try:
             # with the first rows, so that a small daemon never grows after it took its budget
@@ -247,7 +247,7 @@ class StatisticsWriter:
     def map_changed(self) -> None:
         """Have clients see at once that the map has other cells, or a cell another version, than before.
 
-        To be called before any reply or event tells of it.
+        Call it before any reply or event shows the change.
         """
         epoch, count = CHANGES.unpack(self._changes)
         self._changes = CHANGES.pack(epoch, count + 1)
@@ -319,7 +319,7 @@ class StatisticsWriter:
             self._sequence = sequence
 
     def write_rows(self, max_rows: int) -> None:
-        """Write at most so many changed rows, between two beats."""
+        """Write at most ``max_rows`` changed rows, between two beats."""
         if not (self._changed or self._removed or self._missing or self._table_sequence % 2):
             return
         if not self._mark_table(self._table_sequence + 1 | 1):  # odd already where no even one could follow
@@ -352,12 +352,12 @@ class StatisticsWriter:
         return self._write(packed, self._layout.rows_offset + slot * CELL_ROW_BYTES)
 
     def _write(self, data: bytes, place: int) -> bool:
-        """Write all of it; False if that cannot be done, which whoever asked tries again at a later beat."""
+        """Write all of it; False if that cannot be done, and the caller tries again at a later beat."""
         try:
             _write_whole(self._fd, data, place)
         except OSError as error:
-            if not self._told:
-                self._told = True
+            if not self._is_logged:
+                self._is_logged = True
                 log.warning(
                     "statistics not written",
                     error=error.strerror,

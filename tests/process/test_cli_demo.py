@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import pytest
 
 from shmmap import cli
-from shmmap.cli.screens.demo_report import print_report, town_report
+from shmmap.cli.screens.demo import print_report, town_report
 from shmmap.demo.consumer import Pose, StepReport
 from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -12,9 +13,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
+from shmmap.cli.json_output import output_kinds
+from shmmap.cli.parser import build_parser
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import ROOT, Deadline
@@ -92,10 +96,27 @@ def test_query_names_what_failed(shmmap: Shmmap, divided_map: DividedMap) -> Non
     found = shmmap.json("query", "--id", "0_0.pcd", "20_0.pcd", code=1)
     assert [Path(cell["id"]).name for cell in found["cells"]] == ["20_0.pcd"]
     (failed,) = found["failed"]
-    assert sorted(failed) == ["code", "holder_rows", "holders", "id", "layer", "message"]
+    assert sorted(failed) == ["code", "holders", "id", "layer", "message"]
     assert (failed["id"], failed["code"]) == (divided_map.id("0_0.pcd"), "load_failed")
     text = shmmap("query", "--id", "0_0.pcd", code=1)
     assert "load_failed" in text
+
+
+def test_what_is_printed_is_as_the_schemas_say(shmmap: Shmmap) -> None:
+    """Nothing more, and nothing less."""
+    shmmap("query", "--circle", "0,0,5", "--layer", "points", "voxel(2)")
+    for words in (
+        "status", "top", "health", "ls", "clients", "version", "doctor", "pin 0_0.pcd", "unpin --all",
+        "reload", "show 0_0.pcd", "query --circle 0,0,5", "query --id 0_0.pcd nowhere.pcd", "evict --all",
+        "live ls", f"inspect {shmmap.daemon.map_path}", "config show", "stop",
+    ):  # fmt: skip
+        args = build_parser().parse_args(words.split())
+        document = json.loads(shmmap.run(*words.split(), "--json").stdout)
+        outcomes = []
+        for kind in output_kinds(args.json_output):
+            with contextlib.suppress(msgspec.ValidationError):
+                outcomes.append(msgspec.to_builtins(msgspec.convert(document, kind)))
+        assert [json.loads(json.dumps(one)) for one in outcomes] == [document], words
 
 
 def test_status_ls_health_while_the_daemon_is_stopped(shmmap: Shmmap, divided_map: DividedMap) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from shmmap import cli
-from shmmap.cli.screens import demo_progress
+from shmmap.cli.screens import demo as demo_screen
 from shmmap.demo import live_drive
 from shmmap.demo.progress import Progress
 from tests.support.daemon_process import wait_ended
@@ -86,7 +86,7 @@ def test_a_voxel_that_differs_is_told(
         yield Saboteur()
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(demo_progress, "progress_for", progress)
+    monkeypatch.setattr(demo_screen, "progress_for", progress)
     monkeypatch.setattr(live_drive, "LiveDriveSettings", lambda: SMALL_LIVE)
     assert cli.main(["demo", "--live", "--svg", str(tmp_path / "picture.svg")]) == 1
     out = " ".join(capsys.readouterr().out.split())

@@ -372,7 +372,7 @@ def test_a_session_is_taken_over(served: DaemonProcess, plain: Plain) -> None:
 
 def test_a_session_is_a_wish(served: DaemonProcess, plain: Plain) -> None:
     one = plain(served)
-    (power,) = said(r"\(somebody else's; 2\^(\d+) and more\)")
+    (power,) = said(r"\(another session's; 2\^(\d+) and more\)")
     for wish, granted in (
         (12345, True),
         (2 ** int(power) - 1, True),

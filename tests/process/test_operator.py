@@ -23,7 +23,7 @@ import pytest
 
 import shmmap as client_library
 from shmmap.cli.entry import main
-from shmmap.cli.verbs import map_view
+from shmmap.cli.verbs.look import map_view
 from shmmap.client.map_listing import MapListing
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
@@ -217,7 +217,7 @@ def test_a_picture_of_too_many_cells(
         return real(client, *args, **options)
 
     monkeypatch.setattr(client_library.Client, "metadata", noted)
-    monkeypatch.setattr(map_view, "MOST_ON_DISK", 10)
+    monkeypatch.setattr(map_view, "MAX_ON_DISK", 10)
     assert main(["map"]) == 0
     assert not asked
     drawn, said = capsys.readouterr().out.split("its area")

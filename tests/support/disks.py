@@ -24,7 +24,7 @@ class _File:
 
 @dataclass
 class CutDisk:
-    """Files of one directory (`shmmap.daemon.live.disk.folder.Files`); it fails after ``operations`` operations.
+    """Files of one directory (`shmmap.daemon.live.disk.folder.Files`); it fails after ``operations`` of them.
 
     What is written is safe after `sync`, a name after `sync_names`.  After a cut, `after` gives the disk as
     it may be found: of the names that were changed since the last `sync_names` any are as before, and of a

@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap map`` draws: cells by state, clients and the areas they follow; and two ways to draw it."""
+"""The map from above, cells of its clients or chunks of a live map: for a terminal, as SVG or HTML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.screens.output import format_bytes, format_duration
+from shmmap.cli.screens.output import counted, format_bytes, format_duration, format_metres
 from shmmap.cli.screens.picture import CellSquare, Vehicle, top_view_svg
 from shmmap.formats.svg import BoxTuple, escape
 
 if TYPE_CHECKING:
+    from shmmap.client.live.chunk_reader import ChunkInfo
     from shmmap.protocol.rows import CellRow, ClientRow
 
-__all__ = ["GLYPHS", "Scene", "html_page", "svg", "terminal_rows"]
+__all__ = ["GLYPHS", "LIVE_STATES", "Scene", "chunk_squares", "html_page", "svg", "terminal_rows"]
+
 
 GLYPHS: Final = {
     # state: glyph, style on a terminal
@@ -33,7 +35,9 @@ GLYPHS: Final = {
     "client": ("@", "bold red"),
     "none": (" ", ""),
 }
+
 _ORDER: Final = ("zombie", "stale", "fetched", "resident")  # the last of a cell's states is what is drawn
+
 CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wide
 
 
@@ -80,7 +84,7 @@ class Scene:
 
 
 def state_of(row: CellRow) -> str:
-    """Name in `GLYPHS` of a segment's state; ``fetched`` is one that nobody has asked for yet."""
+    """Name in `GLYPHS` of a segment's state; ``fetched`` is one that was prefetched and not requested yet."""
     return "fetched" if row.ahead else row.state
 
 
@@ -90,8 +94,6 @@ def _rank(row: CellRow) -> int:
 
 
 # --- on a terminal ------------------------------------------------------------------------------------
-
-
 def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
     """Return the picture as rows of states, north up; a position is a name in `GLYPHS`."""
     min_x, min_y, max_x, max_y = scene.bounds
@@ -154,8 +156,6 @@ def _outline(client: ClientRow, points: int = 180) -> list[tuple[float, float]]:
 
 
 # --- as a file ----------------------------------------------------------------------------------------
-
-
 def svg(scene: Scene) -> str:
     """Return the picture as SVG, with a tooltip on every cell and client."""
     known = scene.by_cell()
@@ -230,3 +230,44 @@ def html_page(scene: Scene) -> str:
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(scene.title)}</title>'
         f"<style>{_STYLE}</style></head>\n<body>\n{svg(scene)}{table}\n</body></html>\n"
     )
+
+
+LIVE_STATES: Final = {
+    "saved": "on disk",
+    "clean": "in memory, saved",
+    "loading": "loading",
+    "saving": "saving",
+    "dirty": "not saved yet",
+}
+"""States of chunks and what they are called; of chunks above one another that of the last here is drawn."""
+
+_LIVE_ORDER: Final = list(LIVE_STATES)
+
+
+def chunk_squares(chunks: Iterable[ChunkInfo], resolution: float) -> list[CellSquare]:
+    """Return a square for each column of chunks, with a line of its tooltip for each chunk.
+
+    Parameters
+    ----------
+    resolution
+        Edge of a voxel, metres.
+    """
+    columns: dict[tuple[int, int], list[ChunkInfo]] = {}
+    for chunk in chunks:
+        columns.setdefault((chunk.key.x, chunk.key.y), []).append(chunk)
+    return [_chunk_square(column, resolution) for _, column in sorted(columns.items())]
+
+
+def _chunk_square(column: list[ChunkInfo], resolution: float) -> CellSquare:
+    min_x, min_y, _, max_x, max_y, _ = column[0].key.box(resolution)
+    lines = []
+    for chunk in sorted(column, key=lambda chunk: chunk.key.z):
+        known = f", {counted(chunk.active, 'known voxel')}" if chunk.state != "saved" else ""
+        low, high = (format_metres(chunk.key.box(resolution)[axis]) for axis in (2, 5))
+        what = LIVE_STATES.get(chunk.state, chunk.state)
+        lines.append(f"{chunk.key.text}, z {low} to {high} m: {what}, {format_bytes(chunk.bytes)}{known}")
+    state = max(
+        (chunk.state for chunk in column),
+        key=lambda one: _LIVE_ORDER.index(one) if one in _LIVE_ORDER else -1,
+    )
+    return CellSquare((min_x, min_y, max_x, max_y), state, "\n".join(lines))

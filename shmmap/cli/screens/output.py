@@ -31,10 +31,13 @@ __all__ = [
     "print_table",
     "printable",
     "rows_text",
+    "user_name",
     "wants_style",
 ]
 
+
 _EDGES: Final = 2  # blanks left and right of a table
+
 _NARROWEST: Final = 20  # columns that text needs to be worth breaking
 
 
@@ -88,7 +91,11 @@ def json_text(value: object, *, indent: int | None = None) -> str:
 
 
 def print_json(value: object) -> None:
-    """Print one JSON document; a number JSON cannot hold (NaN, infinity) is a defect."""
+    """Print a struct or plain values as one JSON document; NaN and infinity are a defect."""
+    if hasattr(value, "__struct_fields__"):
+        import msgspec
+
+        value = msgspec.to_builtins(value)
     sys.stdout.write(json_text(value, indent=2 if sys.stdout.isatty() else None) + "\n")
 
 
@@ -130,7 +137,7 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     shown = columns_that_fit(columns, rows, console.width - _EDGES)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
     for index in shown:
-        # only the first column, a name, may be folded: numbers in pieces tell nothing
+        # only the first column, a name, may be folded: numbers in pieces say nothing
         column = columns[index]
         table.add_column(column.name, justify=column.align, overflow="fold", no_wrap=index > 0)
     for row in rows:
@@ -177,3 +184,15 @@ def print_hanging(head: str, text: str) -> None:
             lines = textwrap.wrap(lines[0], room, break_long_words=False, break_on_hyphens=False)
     for number, line in enumerate(lines):
         print(f"{' ' * len(head) if number else head}{line}".rstrip())
+
+
+def user_name(uid: int) -> str:
+    """Return the name of a user id; the number where there is none, ``?`` where it is not known."""
+    import pwd
+
+    if uid < 0:
+        return "?"
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except (KeyError, OverflowError):
+        return str(uid)

@@ -7,10 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from shmmap.cli.screens.live_maps import STATE_STYLES, live_problems
 from shmmap.cli.screens.output import counted, format_bytes, format_duration, printable
-from shmmap.cli.screens.prefetching import prefetch_words
-from shmmap.cli.screens.published_map import published_words
+from shmmap.cli.screens.status_parts import STATE_STYLES, live_problems, prefetch_words, published_words
 from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.statistics.counters import TURN_KINDS
 
@@ -25,7 +23,7 @@ __all__ = ["Line", "budget_parts", "screen"]
 Line: TypeAlias = list[tuple[str, str]]  # (text, style) pieces
 
 LABEL: Final = 12
-WORTH_TELLING_NS: Final = 1_000_000
+WORTH_SHOWING_NS: Final = 1_000_000
 _WIDE: Final = 100  # columns from which there is room for everything about a client
 _SHORTEST_NAME: Final = 14
 SPAN_TITLES: Final = (("10s", "10 s"), ("1min", "1 min"), ("10min", "10 min"))
@@ -46,7 +44,7 @@ _LATENCIES: Final = {
     "load_cached": "  disk cache",
 }
 _SOURCES: Final = ("load_points", "load_computed", "load_cached")
-"""A loader's own time by what it did, told of where it was done."""
+"""A loader's own time by what it did, shown where it was done."""
 _PARTS: Final = (
     # part, what it is called, glyph, style
     ("in_use", "in use", "█", "cyan"),
@@ -64,7 +62,7 @@ def budget_parts(counters: dict[str, int]) -> dict[str, int]:
     Loading is reserved for loads under way, statistics is what the statistics themselves take.
     """
     resident, zombie = counters["bytes_resident"], counters["bytes_zombie"]
-    # retired segments are there only because somebody maps them
+    # retired segments are there only because they are mapped
     pinned = min(max(counters["bytes_pinned"] - zombie, 0), resident)
     parts = {
         "in_use": pinned,
@@ -147,7 +145,7 @@ def _flowing(label: str, units: Sequence[Line], width: int, *, gap: int = 3) -> 
 
 def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
     uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
-    told = {
+    words = {
         "healthy": f"  up {format_duration(uptime_s)}",
         "stopped": f"  no heartbeat for {format_duration(found.beat_age_s)}: `kill -CONT {identity.pid}`",
         "hung": f"  no heartbeat for {format_duration(found.beat_age_s)}",
@@ -161,7 +159,7 @@ def _title(found: Snapshot, identity: DaemonIdentity) -> Line:
             _STATE_NAMES.get(found.state, found.state.upper()),
             _STATE_STYLES.get(found.state, "bold red"),
         ),
-        (told, ""),
+        (words, ""),
     ]
 
 
@@ -232,8 +230,8 @@ def _longest_turns(counters: dict[str, int]) -> list[Line]:
     """What others have waited for at most, longest first: some that took over a millisecond, else one."""
     longest = {kind: counters.get(f"longest_turn_{kind}_ns", 0) for kind in TURN_KINDS}
     shown = sorted(longest, key=lambda kind: -longest[kind])
-    told = [kind for kind in shown if longest[kind] >= WORTH_TELLING_NS][:3] or shown[:1]
-    return [[(f"longest turn {format_duration(longest[kind] * 1e-9)} ({kind})", "")] for kind in told]
+    named = [kind for kind in shown if longest[kind] >= WORTH_SHOWING_NS][:3] or shown[:1]
+    return [[(f"longest turn {format_duration(longest[kind] * 1e-9)} ({kind})", "")] for kind in named]
 
 
 def _loads(counters: dict[str, int]) -> list[Line]:

@@ -1,18 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a long run is, on stderr: a line redrawn on a terminal, a line now and then in a pipe."""
+"""Long runs over clouds: how far one is, on stderr, and what it made and took."""
 
 from __future__ import annotations
 
 import sys
 import time
-from typing import Final, TextIO
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, TextIO
 
-from shmmap.cli.screens.output import format_duration
+from shmmap.cli.screens.output import format_bytes, format_duration, print_json, print_pairs
 
-__all__ = ["StageProgress"]
+if TYPE_CHECKING:
+    from shmmap.dividing.merge import MergedCloud
+    from shmmap.origin.map_report import DividedMap
+
+__all__ = ["StageProgress", "fields_text", "print_result"]
+
 
 _REDRAW_S: Final = 0.2
+
 _LINE_S: Final = 10.0  # between lines where each one stays
+
 _SETTLE_S: Final = 1.0  # before that, no rate is worth showing
 
 
@@ -58,7 +66,7 @@ class StageProgress:
             self._show()
 
     def advance(self, points: int) -> None:
-        """So many more points are done."""
+        """Count further points as done."""
         self._points += points
         if self._counted_from < 0:
             self._counted_from = self._points  # what a resumed run finds done says nothing of its rate
@@ -106,3 +114,23 @@ class StageProgress:
         if self._live and self._name and not self._quiet:
             self._stream.write("\r\x1b[K")
             self._stream.flush()
+
+
+def fields_text(fields: Sequence[tuple[str, str]]) -> str:
+    """Return (name, dtype) pairs for a reader: ``"x:f4 y:f4 z:f4"``."""
+    return " ".join(f"{name}:{dtype.lstrip('<|')}" for name, dtype in fields)
+
+
+def print_result(
+    made: DividedMap | MergedCloud, lines: Sequence[tuple[str, str]], *, seconds: float, as_json: bool
+) -> None:
+    """Print all of ``made`` as JSON, or ``lines`` about it; with the time and the memory it took."""
+    from shmmap.dividing.settings import peak_memory_bytes
+
+    peak = peak_memory_bytes()
+    if as_json:
+        from shmmap.cli.json_output import with_more
+
+        print_json(with_more(made, seconds=seconds, peak_memory_bytes=peak))
+    else:
+        print_pairs([*lines, ("time", format_duration(seconds)), ("peak memory", format_bytes(peak))])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One module a verb."""
+"""The verbs, in the groups of ``shmmap --help``."""

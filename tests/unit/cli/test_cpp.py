@@ -11,7 +11,7 @@ import pytest
 
 import shmmap
 from shmmap.cli.entry import main
-from shmmap.cli.verbs.cpp import prefix
+from shmmap.cli.verbs.run.about import prefix
 from tests.support.daemon_process import ROOT
 from tests.support.pages import read_page
 

@@ -14,7 +14,7 @@ import pytest
 
 from shmmap import errors
 from shmmap.cli.entry import main
-from shmmap.cli.verbs import version
+from shmmap.cli.verbs.run import about
 
 EXIT_CODES = {
     "ConfigError": 78,
@@ -38,7 +38,7 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     def run(args: argparse.Namespace) -> int:
         raise error
 
-    monkeypatch.setattr(version, "run", run)
+    monkeypatch.setattr(about, "run_version", run)
 
 
 @pytest.mark.parametrize(("name", "code"), EXIT_CODES.items())

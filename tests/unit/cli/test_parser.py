@@ -1,27 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grammar of the command line: verbs, numbers, areas, and what wrong usage prints."""
+"""The grammar of the command line: verbs, numbers, areas, which daemon, and what wrong usage prints."""
 
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Iterator
 
 import pytest
 
+from shmmap.cli import json_output
 from shmmap.cli.areas import area_from
+from shmmap.cli.daemon_address import endpoint
+from shmmap.cli.daemon_address import instance as instance_of
 from shmmap.cli.entry import main
 from shmmap.cli.options import numbers, seconds
-from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
+from shmmap.cli.parser import GROUPS, NUMBER_OPTIONS, VERBS, build_parser, verb_first
 from shmmap.cli.program import join_negative_values
+from shmmap.cli.verbs.cells.query import held_cell
 from shmmap.errors import BadRequest
 from shmmap.geometry import AutowareSquare, Box, Circle
+from shmmap.protocol.rows import LiveMapRow
 
 CONTRACT = ["serve", "status", "ls", "show", "clients", "query", "reload", "evict"]
+
 CONTRACT += ["pin", "unpin", "stop"]
+
 CONTRACT += ["config", "unit", "doctor", "cpp"]
+
 CONTRACT += ["inspect", "export", "demo", "health", "version"]
+
 CONTRACT += ["divide", "merge", "prepare", "live"]
+
 CONTRACT += ["top", "tail", "map", "metrics"]
+
 CONTRACT += ["publish", "versions", "fetch"]
+
+
+def every_parser(
+    parser: argparse.ArgumentParser, words: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], argparse.ArgumentParser]]:
+    """Parsers of all verbs and their actions, by their words."""
+    yield words, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, below in action.choices.items():
+                yield from every_parser(below, (*words, name))
 
 
 def parse(*words: str) -> argparse.Namespace:
@@ -35,7 +59,7 @@ def test_help_lists_exactly_the_verbs_of_the_contract(capsys: pytest.CaptureFixt
     listed = [
         line.split()[0]
         for line in capsys.readouterr().out.split("verbs:")[1].splitlines()
-        if line.startswith("    ") and line[4] != " "
+        if line.startswith("    ") and line[4] != " " and not line.endswith(":")
     ]
     assert sorted(set(listed) - {"VERB"}) == sorted(CONTRACT)
 
@@ -47,7 +71,43 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
     assert ended.value.code == 0
     text = capsys.readouterr().out
     assert text.startswith(f"usage: shmmap {verb}")
-    assert ("--json" in text) == ("JSON (fields may be added" in text)
+    assert ("--json" in text) == ("fields may be added, none is removed" in text)
+
+
+def test_help_has_every_verb_under_the_heading_of_its_group(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    for heading, verbs in GROUPS.items():
+        first = lines.index(f"{heading}:") + 1
+        shown = [line.split()[0] for line in lines[first:] if line.split()[:1] and line.split()[0] in VERBS]
+        assert shown[: len(verbs)] == list(verbs)
+
+
+JSON_VERBS = {
+    words: parser.get_default("json_output")
+    for words, parser in every_parser(build_parser())
+    if parser.get_default("json_output")
+}
+
+
+@pytest.mark.parametrize("words", JSON_VERBS, ids=" ".join)
+def test_every_verb_has_a_schema_of_its_json(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever else is missing on the command line; each kind of output with its fields."""
+    with pytest.raises(SystemExit) as ended:
+        main([*words, "--json-schema"])
+    schema = json.loads(capsys.readouterr().out)
+    assert (ended.value.code, schema["$schema"].rpartition("/")[2]) == (0, "schema")
+    refs = [schema] if "$ref" in schema else schema["anyOf"]
+    for ref in refs:
+        assert schema["$defs"][ref["$ref"].rpartition("/")[2]]["properties"]
+
+
+def test_rows_of_the_protocol_are_printed_whole() -> None:
+    """What is added to a row of a live map is added to its JSON."""
+    assert json_output.LiveMap.__struct_fields__ == LiveMapRow.__struct_fields__
 
 
 @pytest.mark.parametrize(
@@ -204,3 +264,64 @@ def test_which_cells_are_meant_has_to_be_clear(
 def test_a_cache_that_keeps_nothing_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["prepare", ".", "--layer", "points", "--cache-size", "0"]) == 2
     assert "--cache-size 0 keeps no layer" in capsys.readouterr().err
+
+
+VARIABLES = {
+    "SHMMAP_ENDPOINT": "/v/one.sock",
+    "SHMMAP_INSTANCE": "two",
+    "SHMMAP_RUNTIME_DIR": "/v/dir",
+}
+
+
+@pytest.mark.parametrize(
+    ("flags", "variables", "socket", "name"),
+    [
+        ([], [], None, "default"),
+        ([], ["SHMMAP_ENDPOINT"], "/v/one.sock", "one"),
+        ([], ["SHMMAP_INSTANCE"], "/x/shmmap/two.sock", "two"),
+        ([], ["SHMMAP_INSTANCE", "SHMMAP_RUNTIME_DIR"], "/v/dir/two.sock", "two"),
+        (["--endpoint", "/f/three.sock"], [*VARIABLES], "/f/three.sock", "three"),
+        (["--instance_of", "four"], [*VARIABLES], "/v/dir/four.sock", "four"),
+        (["--instance_of", "four"], ["SHMMAP_ENDPOINT"], "/x/shmmap/four.sock", "four"),
+        (["--instance_of", "default"], ["SHMMAP_ENDPOINT"], "/x/shmmap/default.sock", "default"),
+        (["--runtime-dir", "/f"], [*VARIABLES], "/f/two.sock", "two"),
+        (["--endpoint", "/f/three.sock", "--instance_of", "four"], [], "/f/three.sock", "four"),
+    ],
+)
+def test_flags_count_before_variables(
+    flags: list[str],
+    variables: list[str],
+    socket: str | None,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for variable, value in VARIABLES.items():
+        monkeypatch.delenv(variable, raising=False)
+        if variable in variables:
+            monkeypatch.setenv(variable, value)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/x")
+    args = build_parser().parse_args(["clients", *flags])
+    assert (endpoint(args), instance_of(args)) == (socket, name)
+
+
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [
+        ("cell.pcd", "cell.pcd"),
+        ("cell.pcd@1f", ("cell.pcd", 0x1F)),
+        ("/maps/a@b/cell.pcd", "/maps/a@b/cell.pcd"),
+        ("/maps/a@b/cell@2.pcd", "/maps/a@b/cell@2.pcd"),
+        ("/maps/a@b/cell.pcd@ffffffffffffffff", ("/maps/a@b/cell.pcd", (1 << 64) - 1)),
+        ("cell@c0ffee", ("cell", 0xC0FFEE)),
+    ],
+)
+def test_held(text: str, held: str | tuple[str, int]) -> None:
+    assert held_cell(text) == held
+
+
+@pytest.mark.parametrize(
+    "text", ["cell.pcd@", "@1f", "cell.pcd@xyz", "cell.pcd@1ffffffffffffffff", "cell.pcd@-1"]
+)
+def test_not_held(text: str) -> None:
+    with pytest.raises(BadRequest, match="--held"):
+        held_cell(text)

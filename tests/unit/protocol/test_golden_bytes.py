@@ -3,21 +3,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
-import numpy as np
 import pytest
 
+from shmmap.errors import ProtocolMismatch
 from shmmap.protocol import events as e
+from shmmap.protocol import live
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import (
-    PackedArray,
     decode_reply,
     decode_request,
     encode,
-    encode_cells,
-    encode_handle,
 )
 from tests.support.message_pack import pack, unpack
 
@@ -374,36 +372,352 @@ REPLIES: list[tuple[Any, list[Any], str]] = [
     ),
 ]
 
+LIVE_REQUESTS: list[tuple[Any, list[Any], str]] = [
+    (
+        live.LiveList(1),
+        ["live_list", 1],
+        "92a96c6976655f6c69737401",
+    ),
+    (
+        live.LiveOpen(2, "lidar", "front", "map"),
+        ["live_open", 2, "lidar", "front", "map"],
+        "95a96c6976655f6f70656e02a56c69646172a566726f6e74a36d6170",
+    ),
+    (
+        live.LiveScan(3, "lidar", 1, 2**63, "3f2a.17", 4096, (1.0, -2.0, 0.5)),
+        ["live_scan", 3, "lidar", 1, 2**63, "3f2a.17", 4096, [1.0, -2.0, 0.5]],
+        (
+            "98a96c6976655f7363616e03a56c6964617201cf8000000000000000a7336632612e3137cd100093"
+            "cb3ff0000000000000cbc000000000000000cb3fe0000000000000"
+        ),
+    ),
+    (
+        live.LiveMove(4, "lidar", (1.0, -2.0, 0.5)),
+        ["live_move", 4, "lidar", [1.0, -2.0, 0.5]],
+        ("94a96c6976655f6d6f766504a56c6964617293cb3ff0000000000000cbc000000000000000cb3fe0000000000000"),
+    ),
+    (
+        live.LiveSave(5, "lidar"),
+        ["live_save", 5, "lidar"],
+        "93a96c6976655f7361766505a56c69646172",
+    ),
+    (
+        live.LiveChunks(6, "lidar", live.SphereMessage(1.0, 2.0, 3.0, 4.0), 7, True, (-1, 0, 2)),
+        ["live_chunks", 6, "lidar", ["sphere", 1.0, 2.0, 3.0, 4.0], 7, True, [-1, 0, 2]],
+        (
+            "97ab6c6976655f6368756e6b7306a56c6964617295a6737068657265cb3ff0000000000000cb4000"
+            "000000000000cb4008000000000000cb401000000000000007c393ff0002"
+        ),
+    ),
+    (
+        live.LiveVoxels(7, "lidar", "free", m.BoxMessage(0.0, 1.0, 2.0, 3.0, -1.0, 1.0), "all", 9),
+        ["live_voxels", 7, "lidar", "free", ["box", 0.0, 1.0, 2.0, 3.0, -1.0, 1.0], "all", 9],
+        (
+            "97ab6c6976655f766f78656c7307a56c69646172a46672656597a3626f78cb0000000000000000cb"
+            "3ff0000000000000cb4000000000000000cb4008000000000000cbbff0000000000000cb3ff00000"
+            "00000000a3616c6c09"
+        ),
+    ),
+    (
+        live.LiveRelease(8, "lidar", "/shmmap-live.default.lidar.voxels.00"),
+        ["live_release", 8, "lidar", "/shmmap-live.default.lidar.voxels.00"],
+        (
+            "94ac6c6976655f72656c6561736508a56c69646172d9242f73686d6d61702d6c6976652e64656661"
+            "756c742e6c696461722e766f78656c732e3030"
+        ),
+    ),
+]
 
-@pytest.mark.parametrize(
-    ("message", "elements", "golden"), REQUESTS + REPLIES, ids=lambda v: type(v).__name__
+LIVE_REPLIES: list[tuple[Any, list[Any], str]] = [
+    (
+        live.LiveListed(
+            1,
+            (
+                live.LiveMapRow(
+                    "lidar",
+                    "/map",
+                    0.2,
+                    "map",
+                    0,
+                    1,
+                    2,
+                    3,
+                    4,
+                    5,
+                    6,
+                    7,
+                    8,
+                    9,
+                    10,
+                    11,
+                    ("a",),
+                    ("0/front",),
+                    "full",
+                    12,
+                    13,
+                    ((14, 15),),
+                    16,
+                    17,
+                ),
+            ),
+        ),
+        [
+            "live_listed",
+            1,
+            [
+                [
+                    "lidar",
+                    "/map",
+                    0.2,
+                    "map",
+                    0,
+                    1,
+                    2,
+                    3,
+                    4,
+                    5,
+                    6,
+                    7,
+                    8,
+                    9,
+                    10,
+                    11,
+                    ["a"],
+                    ["0/front"],
+                    "full",
+                    12,
+                    13,
+                    [[14, 15]],
+                    16,
+                    17,
+                ]
+            ],
+        ],
+        (
+            "93ab6c6976655f6c69737465640191dc0018a56c69646172a42f6d6170cb3fc999999999999aa36d"
+            "6170000102030405060708090a0b91a16191a7302f66726f6e74a466756c6c0c0d91920e0f1011"
+        ),
+    ),
+    (
+        live.LiveOpened(
+            2,
+            bytes(16),
+            0.2,
+            "map",
+            847,
+            -405,
+            -1992,
+            3476,
+            0,
+            0,
+            "/dev/shm",
+            "/p.",
+            "/m",
+            1,
+            5,
+            9,
+            (0.7, 0.4),
+            77,
+        ),
+        [
+            "live_opened",
+            2,
+            b"\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00\x00",
+            0.2,
+            "map",
+            847,
+            -405,
+            -1992,
+            3476,
+            0,
+            0,
+            "/dev/shm",
+            "/p.",
+            "/m",
+            1,
+            5,
+            9,
+            [0.7, 0.4],
+            77,
+        ],
+        (
+            "dc0013ab6c6976655f6f70656e656402c41000000000000000000000000000000000cb3fc9999999"
+            "99999aa36d6170cd034fd1fe6bd1f838cd0d940000a82f6465762f73686da32f702e"
+            "a22f6d01050992cb3fe6666666666666cb3fd999999999999a4d"
+        ),
+    ),
+    (
+        live.LiveApplied(3, 5, 4),
+        ["live_applied", 3, 5, 4],
+        "94ac6c6976655f6170706c696564030504",
+    ),
+    (
+        live.LiveMoved(4, U64),
+        ["live_moved", 4, U64],
+        "93aa6c6976655f6d6f76656404cfffffffffffffffff",
+    ),
+    (
+        live.LiveDurable(5, 6, 7),
+        ["live_durable", 5, 6, 7],
+        "94ac6c6976655f64757261626c65050607",
+    ),
+    (
+        live.LiveChunkPage(
+            6, 7, (live.LiveChunkRow((-1, 0, 2), 3, 4, "dirty", 5, 6, 7, 8),), True, ((1, 2, 3),), False
+        ),
+        ["live_chunk_page", 6, 7, [[[-1, 0, 2], 3, 4, "dirty", 5, 6, 7, 8]], True, [[1, 2, 3]], False],
+        ("97af6c6976655f6368756e6b5f706167650607919893ff00020304a5646972747905060708c39193010203c2"),
+    ),
+    (
+        live.LiveVoxelsReply(7, 8, "/s", 9, 126),
+        ["live_voxels_reply", 7, 8, "/s", 9, 126],
+        "96b16c6976655f766f78656c735f7265706c790708a22f73097e",
+    ),
+    (
+        live.LiveReleased(8),
+        ["live_released", 8],
+        "92ad6c6976655f72656c656173656408",
+    ),
+]
+
+EVENTS: list[tuple[Any, list[Any], str]] = [
+    (
+        e.Epoch(1, 2, 3, "started", 4, 5, 6),
+        ["epoch", 1, 2, 3, "started", 4, 5, 6],
+        "98a565706f6368010203a773746172746564040506",
+    ),
+    (
+        e.Loaded(1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8, True),
+        ["loaded", 1, 2, 3, "a", "points", 4, 5, 6, 7, True, 8, True],
+        "9da66c6f61646564010203a161a6706f696e747304050607c308c3",
+    ),
+    (
+        e.Changed(1, 2, 3, "a", 4, "changed"),
+        ["changed", 1, 2, 3, "a", 4, "changed"],
+        "97a76368616e676564010203a16104a76368616e676564",
+    ),
+    (
+        e.Evicted(1, 2, 3, "a", "points", 4, 5, "room"),
+        ["evicted", 1, 2, 3, "a", "points", 4, 5, "room"],
+        "99a765766963746564010203a161a6706f696e74730405a4726f6f6d",
+    ),
+    (
+        e.Failed(1, 2, 3, "a", "points", "load_failed", "no", 0.5),
+        ["failed", 1, 2, 3, "a", "points", "load_failed", "no", 0.5],
+        "99a66661696c6564010203a161a6706f696e7473ab6c6f61645f6661696c6564a26e6fcb3fe0000000000000",
+    ),
+    (
+        e.Retried(1, 2, 3, "a", "points", "load_failed"),
+        ["retried", 1, 2, 3, "a", "points", "load_failed"],
+        "97a772657472696564010203a161a6706f696e7473ab6c6f61645f6661696c6564",
+    ),
+    (
+        e.Pressure(1, 2, 3, "a", "points", "over_budget", 4, 5, 6, 7, 8),
+        ["pressure", 1, 2, 3, "a", "points", "over_budget", 4, 5, 6, 7, 8],
+        "9ca87072657373757265010203a161a6706f696e7473ab6f7665725f6275646765740405060708",
+    ),
+    (
+        e.PrefetchMiss(1, 2, 3, 4, 5, "c", 6, "a", "points"),
+        ["prefetch_miss", 1, 2, 3, 4, 5, "c", 6, "a", "points"],
+        "9aad70726566657463685f6d6973730102030405a16306a161a6706f696e7473",
+    ),
+    (
+        e.Reloaded(1, 2, 3, 4, 5, 6, 7, 8, "no"),
+        ["reload", 1, 2, 3, 4, 5, 6, 7, 8, "no"],
+        "9aa672656c6f61640102030405060708a26e6f",
+    ),
+    (
+        e.LongTurn(1, 2, 3, "requests", 12_000_000),
+        ["long_turn", 1, 2, 3, "requests", 12_000_000],
+        "96a96c6f6e675f7475726e010203a87265717565737473ce00b71b00",
+    ),
+    (
+        e.Joined(1, 2, 3, 4, 5, 6, "c"),
+        ["joined", 1, 2, 3, 4, 5, 6, "c"],
+        "98a66a6f696e6564010203040506a163",
+    ),
+    (e.Left(1, 2, 3, 4, 5, "c", 6), ["left", 1, 2, 3, 4, 5, "c", 6], "98a46c6566740102030405a16306"),
+    (
+        e.LiveStarted(1, 2, 3, 4, 5),
+        ["live_started", 1, 2, 3, 4, 5],
+        "96ac6c6976655f737461727465640102030405",
+    ),
+    (
+        e.LiveEnded(1, 2, 3, 4),
+        ["live_ended", 1, 2, 3, 4],
+        "95aa6c6976655f656e64656401020304",
+    ),
+    (
+        e.LiveProblem(1, 2, 3, "m", "full"),
+        ["live_problem", 1, 2, 3, "m", "full"],
+        "96ac6c6976655f70726f626c656d010203a16da466756c6c",
+    ),
+    (
+        e.LiveDamaged(1, 2, 3, "m", "torn"),
+        ["live_damaged", 1, 2, 3, "m", "torn"],
+        "96ac6c6976655f64616d61676564010203a16da4746f726e",
+    ),
+    (
+        e.LiveChanged(1, 2, 3, "m", 4),
+        ["live_changed", 1, 2, 3, "m", 4],
+        "96ac6c6976655f6368616e676564010203a16d04",
+    ),
+    (e.Beat(1, 2, 3), ["beat", 1, 2, 3], "94a462656174010203"),
+]
+
+
+def kinds(value: object) -> str:
+    return type(value).__name__
+
+
+every_request = pytest.mark.parametrize(
+    ("message", "elements", "golden"), [*REQUESTS, *LIVE_REQUESTS], ids=kinds
 )
-def test_packs_to_the_golden_bytes(message: msgspec.Struct, elements: list[Any], golden: str) -> None:
-    assert encode(message) == bytes.fromhex(golden)
-    assert unpack(bytes.fromhex(golden)) == elements
-    assert pack(elements) == bytes.fromhex(golden)  # both encoders choose the shortest form
+every_reply = pytest.mark.parametrize(("message", "elements", "golden"), [*REPLIES, *LIVE_REPLIES], ids=kinds)
 
 
-@pytest.mark.parametrize(("message", "elements", "golden"), REQUESTS, ids=lambda v: type(v).__name__)
-def test_requests_unpack_from_the_golden_bytes(message: object, elements: list[Any], golden: str) -> None:
-    assert decode_request(bytes.fromhex(golden)) == message
+def test_every_message_is_here() -> None:
+    assert {type(row[0]) for row in (*REQUESTS, *LIVE_REQUESTS)} == set(get_args(m.Request))
+    assert {type(row[0]) for row in (*REPLIES, *LIVE_REPLIES)} == set(get_args(m.Reply))
+    assert {type(event) for event, _, _ in EVENTS} == set(get_args(e.Event))
 
 
-@pytest.mark.parametrize(("message", "elements", "golden"), REPLIES, ids=lambda v: type(v).__name__)
-def test_replies_unpack_from_the_golden_bytes(message: object, elements: list[Any], golden: str) -> None:
-    assert decode_reply(bytes.fromhex(golden)) == message
-
-
-@pytest.mark.parametrize(("message", "elements", "golden"), REQUESTS, ids=lambda v: type(v).__name__)
-def test_requests_of_a_later_minor_version_are_read(
-    message: object, elements: list[Any], golden: str
-) -> None:
+@every_request
+def test_requests(message: object, elements: list[Any], golden: str) -> None:
+    """Also those of a later minor version, with further elements."""
+    data = bytes.fromhex(golden)
+    assert encode(message) == pack(elements) == data
+    assert unpack(data) == elements
+    assert decode_request(data) == message
     assert decode_request(pack([*elements, "something new", [1, {"a": None}]])) == message
 
 
-@pytest.mark.parametrize(("message", "elements", "golden"), REPLIES, ids=lambda v: type(v).__name__)
-def test_replies_of_a_later_minor_version_are_read(message: object, elements: list[Any], golden: str) -> None:
+@every_reply
+def test_replies(message: object, elements: list[Any], golden: str) -> None:
+    data = bytes.fromhex(golden)
+    assert encode(message) == pack(elements) == data
+    assert unpack(data) == elements
+    assert decode_reply(data) == message
     assert decode_reply(pack([*elements, "something new"])) == message
+
+
+@pytest.mark.parametrize(("event", "elements", "golden"), EVENTS, ids=kinds)
+def test_events(event: e.Event, elements: list[Any], golden: str) -> None:
+    data = bytes.fromhex(golden)
+    assert e.encode_event(event) == data == pack(elements)
+    assert unpack(data) == elements
+    assert e.decode_event(data) == event
+    assert e.decode_event(pack([*elements, "something new"])) == event
+
+
+def test_an_event_of_a_later_version_is_left_out() -> None:
+    assert e.decode_event(pack(["danced", 1, 2, 3, "a"])) is None
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\x93", pack("text"), pack([1, 2, 3, 4]), pack(["beat"])])
+def test_what_is_no_event_is_refused(data: bytes) -> None:
+    with pytest.raises(ProtocolMismatch):
+        e.decode_event(data)
 
 
 @pytest.mark.parametrize(
@@ -435,57 +749,8 @@ def test_defaults_as_documented(short: list[Any], full: object) -> None:
     assert decode_request(pack(short)) == full
 
 
-def test_a_handle_packed_once_is_the_same_bytes_inside_a_reply() -> None:
-    raw = msgspec.Raw(encode_handle(HANDLE))
-    reply = ("cells", 4, 3, 5, [raw, raw], (), b"", (), ())
-    assert decode_reply(encode(reply)) == m.Cells(4, 3, 5, (HANDLE, HANDLE))
-
-
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65535, 65536])
-def test_a_reply_put_together_from_packed_handles_is_the_same_bytes(count: int) -> None:
-    """At every size at which MessagePack changes the form of an array."""
-    whole = m.Cells(
-        4, U64, 5, (HANDLE,) * count, ("b.pcd",), bytes(8), (m.PendingCell("c", "points"),),
-        (m.FailedCell("d", "points", "x", "y"),), ("points", "voxel(leaf=1.0)"), False, "offline",
-    )  # fmt: skip
-    together = encode_cells(
-        4, U64, 5, [encode_handle(HANDLE)] * count, whole.removed, whole.removed_packed,
-        whole.layers, whole.covered, PackedArray(whole.pending), PackedArray(whole.failed),
-        reason=whole.reason,
-    )  # fmt: skip
-    assert together == encode(whole)
-    assert encode_cells(4, 3, 5, [], (), b"", ()) == encode(m.Cells(4, 3, 5))
-
-
-@pytest.mark.parametrize(("minor", "elements"), [(2, 9), (5, 11)])
-def test_a_reply_of_an_older_daemon(minor: int, elements: int) -> None:
-    """Before 1.3 it has neither layers nor covered: of what it answered it knew everything."""
-    (golden,) = [hexed for message, _, hexed in REPLIES if isinstance(message, m.Cells)]
-    older = unpack(bytes.fromhex(golden))[:elements]
-    older[8] = [failed[:5] for failed in older[8]]  # before 1.6 it does not say where a cell lies
-    reply = decode_reply(pack(older))
+def test_elements_that_a_reply_lacks_have_their_defaults() -> None:
+    (elements,) = [elements for message, elements, _ in REPLIES if isinstance(message, m.Cells)]
+    reply = decode_reply(pack(elements[:9]))
     assert isinstance(reply, m.Cells)
-    assert (reply.layers, reply.covered) == (((), True) if minor < 3 else (("points",), False))
-    assert (reply.reason, [failed.box for failed in reply.failed]) == ("", [None, None])
-
-
-def test_replies_with_cells_have_only_grown_at_their_end() -> None:
-    (golden,) = [hexed for message, _, hexed in REPLIES if isinstance(message, m.Cells)]
-    older = pack(unpack(bytes.fromhex(golden))[:8])
-    assert bytes.fromhex(golden)[1 : len(older)] == older[1:]
-
-
-def test_numbers_that_numpy_computed() -> None:
-    plain = m.Intent(1.5, 2.0, 3.0, 0.0, None, ())
-    numpy = m.Intent(np.float32(1.5), np.float64(2), np.int64(3))
-    assert unpack(encode(numpy))[:3] == unpack(encode(plain))[:3]
-    with pytest.raises(TypeError):
-        encode(m.Show(1, object()))  # type: ignore[arg-type]
-
-
-def test_a_warm_handle_stays_under_200_bytes() -> None:
-    long = m.Handle(
-        "pointcloud_map_-123456_-654321.pcd", U64, "points", "f" * 16, 0, 2**32, 2**32,
-        -123456.5, -654321.5, -123436.5, -654301.5,
-    )  # fmt: skip
-    assert len(encode_handle(long)) < 200
+    assert (reply.layers, reply.covered, reply.reason) == ((), True, "")

@@ -18,10 +18,19 @@ from shmmap.segment.names import HUGE_PAGES_DIR
 from shmmap.service import program
 from shmmap.service.file_system import FileSystem
 from shmmap.service.huge_pages import check_possible
-from shmmap.service.installation import PlannedFile, configuration, plan_system, plan_user, unit_text, write
+from shmmap.service.installation import (
+    PlannedFile,
+    configuration,
+    plan_system,
+    plan_user,
+    shipped_names,
+    shipped_text,
+    unit_text,
+    write,
+)
 from shmmap.service.program import Program, command_line, outermost, quoted
-from shmmap.service.shipped_files import shipped_names, shipped_text
 from tests.support.daemon_process import ROOT
+from tests.support.pages import read_page
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -448,3 +457,10 @@ def test_a_wheel_ships_them() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert included["systemd"] == "shmmap/_systemd"
+
+
+def test_the_operators_guide_names_each_shipped_file() -> None:
+    guide = read_page("systemd/README.md").text
+    named = set(re.findall(r"`((?:system|user|drop-ins|sysusers\.d|tmpfiles\.d)/[^`/ ]+)`", guide))
+    named |= {"shmmap.toml"} if "`shmmap.toml`" in guide else set()
+    assert named == set(shipped_names()) - {"README.md"}

@@ -1,2 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap live``: one module an action."""
+"""``shmmap live``: what is done with live maps."""
+
+from __future__ import annotations
+
+from shmmap.cli.options import Subparsers, add_verb
+from shmmap.cli.verbs.live import files, served
+
+__all__ = ["add_parser"]
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "live",
+        files.run_fsck,
+        help="list, save, check, export or reset live maps",
+        description="Look after live maps: what programs map while they drive.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    for add in (
+        served.add_ls,
+        served.add_show,
+        served.add_save,
+        files.add_fsck,
+        files.add_export,
+        files.add_reset,
+    ):
+        add(actions)

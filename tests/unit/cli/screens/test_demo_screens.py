@@ -10,8 +10,14 @@ import pytest
 from rich.console import Console
 from rich.live import Live
 
-from shmmap.cli.screens.demo_progress import LiveProgress, PlainProgress
-from shmmap.cli.screens.demo_report import DemoReport, live_report, print_report, town_report
+from shmmap.cli.screens.demo import (
+    DemoReport,
+    LiveProgress,
+    PlainProgress,
+    live_report,
+    print_report,
+    town_report,
+)
 from shmmap.demo.consumer import Pose
 from shmmap.demo.demo import DemoResult, Round
 from shmmap.demo.demo_town import TownMap

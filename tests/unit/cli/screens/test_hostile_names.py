@@ -25,7 +25,7 @@ from shmmap.cli.screens.output import (
     printable,
 )
 from shmmap.cli.screens.picture import CellSquare, Vehicle, top_view_svg
-from shmmap.cli.verbs.tail import _print_text
+from shmmap.cli.verbs.look.tail import _print_text
 
 HOSTILE = "a\x1b]0;owned\x07\r\n\x9b2J\u202e\udcff\u2028\x00z"
 

@@ -6,15 +6,15 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.cli.screens.live_maps import status_lines
-from shmmap.cli.screens.live_scene import chunk_squares
-from shmmap.cli.screens.map_scene import GLYPHS, Scene, html_page, svg, terminal_rows
-from shmmap.cli.screens.prefetching import prefetch_as_json
+from shmmap.cli.screens.map_scene import GLYPHS, Scene, chunk_squares, html_page, svg, terminal_rows
+from shmmap.cli.screens.status_parts import status_lines
 from shmmap.cli.screens.top_screen import budget_parts, screen
+from shmmap.cli.verbs.look.outputs import Prefetching
 from shmmap.client.live.chunk_reader import ChunkInfo
 from shmmap.protocol.rows import CellRow, CellState, ClientRow, LiveMapRow, Window
 from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
@@ -137,13 +137,13 @@ def test_what_was_prefetched_and_what_of_it_was_used(width: int) -> None:
 
 
 def test_what_programs_are_told_of_prefetching() -> None:
-    assert prefetch_as_json(DRIVING) == {
+    assert msgspec.to_builtins(Prefetching.of(DRIVING)) == {
         "outage_tolerance_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "prefetch_misses": 7,
         "prefetch_started": 120, "prefetch_used": 100, "prefetch_in_vain": 3, "prefetch_overtaken": 0,
         "bytes_prefetched": 0, "over_fetch": 1.05,
     }  # fmt: skip
-    of_an_earlier_version = prefetch_as_json({"hits": 3})
-    assert (of_an_earlier_version["prefetch_misses"], of_an_earlier_version["over_fetch"]) == (0, None)
+    of_an_earlier_version = Prefetching.of({"hits": 3})
+    assert (of_an_earlier_version.prefetch_misses, of_an_earlier_version.over_fetch) == (0, None)
 
 
 def test_load_times_by_what_was_loaded() -> None:

@@ -8,11 +8,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tests.support.stored_live_map import contents, stored_drive
 
 from shmmap.cli.entry import main
 from shmmap.daemon.live.disk.folder import Folder
 from tests.support.divided_map import read_pcd
+from tests.support.live_reference import contents, stored_drive
 
 Captured = pytest.CaptureFixture[str]
 
@@ -134,7 +134,7 @@ def test_exports_of_a_damaged_map(directory: Path, capsys: Captured, tmp_path: P
     assert main([*words, "--json"]) == 0
     said = capsys.readouterr()
     assert f'"{path.name}.damaged.1"' in said.out
-    assert "1 damaged file put aside before" in said.err
+    assert "1 damaged file in quarantine" in said.err
 
 
 def test_nothing_to_export(tmp_path: Path, capsys: Captured) -> None:

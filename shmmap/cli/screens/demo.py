@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``shmmap demo`` shows: its progress, and at the end what was measured, as text or JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import sys
+import textwrap
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_line, print_table
+from shmmap.demo.progress import Progress
+
+if TYPE_CHECKING:
+    from rich.live import Live
+    from rich.progress import TaskID
+
+    from shmmap.demo.demo import DemoResult
+    from shmmap.demo.live_drive import LiveDriveResult
+
+__all__ = [
+    "DemoReport",
+    "LiveProgress",
+    "PlainProgress",
+    "live_report",
+    "print_report",
+    "progress_for",
+    "town_report",
+]
+
+
+_PLAIN_EVERY_S: Final = 10.0
+
+_BAR: Final = 12  # columns: the text of a stage, its numbers and its time fit beside it
+
+
+class PlainProgress(Progress):
+    """A line per stage when it begins, one per event, and one every ten seconds of a long stage."""
+
+    def __init__(self) -> None:
+        self._total = self._done = 0
+        self._printed_s = 0.0
+
+    def stage(self, text: str, total: int) -> None:
+        """Print that a stage begins."""
+        self._total, self._done, self._printed_s = total, 0, time.monotonic()
+        print_line(f"{text} ...", flush=True)
+
+    def step(self, *lines: str) -> None:
+        """Print how far a long stage is."""
+        del lines
+        self._done += 1
+        now_s = time.monotonic()
+        if now_s - self._printed_s >= _PLAIN_EVERY_S and self._done < self._total:
+            self._printed_s = now_s
+            print_line(f"  step {self._done} of {self._total}", flush=True)
+
+    def event(self, text: str) -> None:
+        """Print what has happened."""
+        print_line(f"  {text}", flush=True)
+
+
+class LiveProgress(Progress):
+    """A bar for each stage; below them the last event, and the lines of the last step."""
+
+    def __init__(self, live: Live) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bars
+
+        self._live = live
+        self._bars = Bars(
+            "  {task.description}",
+            BarColumn(_BAR),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            auto_refresh=False,
+        )
+        self._stage: TaskID | None = None
+        self._event = ""
+
+    def stage(self, text: str, total: int) -> None:
+        """Draw a new bar."""
+        self._stage, self._event = self._bars.add_task(text, total=total), ""
+        self._draw()
+
+    def step(self, *lines: str) -> None:
+        """Draw the step and its lines."""
+        if self._stage is not None:
+            self._bars.advance(self._stage)
+        self._draw(*lines)
+
+    def event(self, text: str) -> None:
+        """Draw the event until the stage ends, or until the next event."""
+        self._event = text
+        self._draw()
+
+    def close(self) -> None:
+        """Leave only the bars on the screen."""
+        self._event = ""
+        self._draw()
+
+    def _draw(self, *lines: str) -> None:
+        from rich.console import Group
+        from rich.text import Text
+
+        below = [Text(f"  {self._event}", style="yellow")] if self._event else []
+        below += [Text(f"    {line}", style="cyan", overflow="ellipsis", no_wrap=True) for line in lines]
+        self._live.update(Group(self._bars, *below), refresh=True)
+
+
+@contextlib.contextmanager
+def progress_for(*, quiet: bool) -> Iterator[Progress]:
+    """Choose what to show: nothing, lines, or a live view on a terminal that can do that."""
+    if quiet:
+        yield Progress()
+        return
+    if not sys.stdout.isatty() or os.environ.get("TERM", "dumb") == "dumb":
+        yield PlainProgress()
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    with Live(console=Console(highlight=False), auto_refresh=False, transient=False) as live:
+        progress = LiveProgress(live)
+        yield progress
+        progress.close()
+
+
+_WIDTH: Final = 79  # columns of the longest line
+
+_NARROWEST: Final = 30
+
+_NAMES: Final = 10  # columns, in front of the lines
+
+_COLUMNS: Final = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP")
+
+
+@dataclass(frozen=True, slots=True)
+class DemoReport:
+    """The result of a demonstration for its spectators.
+
+    Attributes
+    ----------
+    document
+        What ``--json`` prints.
+    lines
+        The texts by name.
+    picture_svg
+        The picture.
+    passed
+        Whether all was as it has to be.
+    rows
+        Of the table of memory and times; empty without one.
+    """
+
+    document: dict[str, Any]
+    lines: dict[str, str]
+    picture_svg: str
+    passed: bool
+    rows: Sequence[Sequence[str]] = ()
+
+
+def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
+    """Print the table and the lines, each with its name in front; in a pipe, too, no wider than a page."""
+    print_line()
+    if report.rows:
+        columns = [Column(name, "right" if number else "left") for number, name in enumerate(_COLUMNS)]
+        print_table(columns, report.rows)
+        print_line()
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
+    duration = f"{format_duration(duration_s)}; picture: {picture}"
+    for name, text in {**report.lines, "duration": duration}.items():
+        for line in textwrap.wrap(
+            text,
+            max(min(width, _WIDTH), _NARROWEST),
+            initial_indent=f"{name:{_NAMES}}",
+            subsequent_indent=" " * _NAMES,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ):
+            print_line(line)
+
+
+def town_report(result: DemoResult) -> DemoReport:
+    """Report a drive on one shared copy of the map, and on private ones."""
+    rows = []
+    for each in result.rounds:
+        copies = "private copies" if each.consumers > 1 else "private copy"
+        for name, drive in ((copies, each.private), ("with shmmap", each.shared)):
+            seconds = (drive.cpu_s, drive.start_s, drive.follow_max_s)
+            rows.append(
+                [f"{each.consumers} {name}", format_bytes(drive.total_bytes), *map(format_duration, seconds)]
+            )
+    town, out, found = result.town, result.outage, result.localization
+    more_shared, more_private = result.one_more_bytes
+    document = {
+        "town": {
+            "cells": town.cells,
+            "points": town.points,
+            "file_bytes": town.file_bytes,
+            "build_s": town.build_s,
+        },
+        "rounds": [dataclasses.asdict(each) for each in result.rounds],
+        "one_more_bytes": {"shared": more_shared, "private": more_private},
+        "outage": dataclasses.asdict(out),
+        "localization": dataclasses.asdict(found) if found else None,
+    }
+    return DemoReport(
+        document, _town_lines(result), _draw(result), found is None or found.trustworthy == found.scans, rows
+    )
+
+
+def _town_lines(result: DemoResult) -> dict[str, str]:
+    town, out, found = result.town, result.outage, result.localization
+    last = result.rounds[-1]
+    count, shared, private = last.consumers, last.shared, last.private
+    more_shared, more_private = result.one_more_bytes
+    too_small = ""
+    if shared.total_bytes >= private.total_bytes:  # every process also has a fixed size
+        too_small = (
+            f". The map around the vehicle ({format_bytes(shared.map_bytes)}) is too small to gain"
+            " from sharing; --density 100 makes a larger one"
+        )
+    position = f"left out: the package {result.missing} is not installed"
+    if found is not None:
+        position = (
+            f"{found.scans} LiDAR scans: {found.error_m * 100:.1f} cm off,"
+            f" {found.error_max_m * 100:.1f} cm at most; first pose after"
+            f" {format_duration(found.first_pose_s)}"
+        )
+    return {
+        "town": (
+            f"{town.cells} cells, {town.points / 1e6:.1f} million points; a process needs {shared.cells}"
+            f" cells, {format_bytes(shared.map_bytes)}"
+        ),
+        "memory": (
+            f"{count} processes, a private copy each: {format_bytes(private.total_bytes)}; with shmmap:"
+            f" {format_bytes(shared.total_bytes)}{too_small}"
+        ),
+        "one more": (
+            f"each further process: {format_bytes(more_private)} with a copy, {format_bytes(more_shared)}"
+            " with shmmap"
+        ),
+        "waiting": (
+            f"a control loop waits up to {format_duration(private.follow_max_s)} for new cells; shmmap:"
+            f" {format_duration(shared.follow_max_s)}"
+        ),
+        "CPU": (
+            f"{count} copies: {format_duration(private.cpu_s)}; shmmap: {format_duration(shared.cpu_s)},"
+            f" {format_duration(shared.daemon_start_cpu_s)} of it to start the daemon"
+        ),
+        "kill -9": (
+            f"back in {format_duration(out.down_s)} with {out.adopted} of {out.segments} cells;"
+            f" no process paused over {format_duration(out.longest_pause_s)}"
+        ),
+        "position": position,
+    }
+
+
+def _draw(result: DemoResult) -> str:
+    """Draw the town from above, with the route and the cells in shared memory, as SVG."""
+    from shmmap.cli.screens.picture import CellSquare, Raster, Vehicle, top_view_svg
+
+    town, shared = result.town, result.rounds[-1].shared
+    states = {row.box: row for row in result.resident}
+    cells = []
+    for box in town.boxes:
+        row = states.get(box)
+        title = f"{box[0]:g}, {box[1]:g}" + (f": {row.points:,} points, {row.state}" if row else "")
+        cells.append(CellSquare(box, row.state if row else "", title))
+    end = town.route[-1]
+    resident = sum(1 for cell in cells if cell.state == "resident")
+    return top_view_svg(
+        town.bounds,
+        cells,
+        title=f"A generated town: {town.cells} cells, {town.points / 1e6:.1f} million points",
+        note=f"At the end of the drive {resident} cells are in shared memory, once for all"
+        f" {shared.consumers} processes: {format_bytes(shared.shm_bytes)}.",
+        raster=Raster(town.bounds, town.picture_png),
+        driven=[(pose.x, pose.y) for pose in town.route],
+        vehicle=Vehicle(end.x, end.y, end.heading, result.radius),
+    )
+
+
+def live_report(result: LiveDriveResult) -> DemoReport:
+    """Report a drive that was mapped, what was killed on it, and whether a voxel was lost."""
+    voxels = f"{result.voxels:,}".replace(",", " ")
+    compared = f"all {voxels} voxels on disk are as in a map without bounds of the same scans"
+    if result.differing:
+        differing = f"{result.differing:,}".replace(",", " ")
+        compared = (
+            f"{differing} of {voxels} voxels on disk are NOT as in a map without bounds of the same scans"
+        )
+    lines = {
+        "drive": (
+            f"{result.scans} LiDAR scans, {result.points / 1e6:.1f} million points, on {result.length_m:g} m;"
+            f" mapped in {format_duration(result.mapping_s)}, with both kills"
+        ),
+        "map": (
+            f"{result.chunks} chunks, {voxels} known voxels; each takes"
+            f" {result.active_bytes / max(1, result.active):.1f} bytes in memory,"
+            f" {result.file_bytes / max(1, result.voxels):.1f} on disk"
+        ),
+        "memory": (
+            f"chunks in service took at most {format_bytes(result.max_bytes)} of"
+            f" {format_bytes(result.budget_bytes)}; {result.evicted} times a chunk was saved and evicted,"
+            f" {result.came_back} times one came back"
+        ),
+        "kill -9": (
+            f"the daemon after scan {result.daemon_killed_at}: back in"
+            f" {format_duration(result.daemon_down_s)}, and found {result.daemon_chunks} chunks in memory;"
+            f" the mapping program after scan {result.mapper_killed_at}: its next run continued with scan"
+            f" {result.mapper_resumed_at}"
+        ),
+        "compared": compared,
+    }
+    document = dataclasses.asdict(result)
+    picture_svg = document.pop("picture_svg")
+    return DemoReport(document, lines, picture_svg, passed=not result.differing)

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``status`` and ``top`` say of prefetching, a published map and live maps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+from shmmap.doctor.signed_map import signature_lines, trust_problems
+from shmmap.quantities import counted, format_bytes, format_duration, format_utc
+
+if TYPE_CHECKING:
+    from shmmap.protocol.rows import LiveMapRow
+
+__all__ = [
+    "STATE_STYLES",
+    "live_problems",
+    "over_fetch",
+    "prefetch_words",
+    "published_lines",
+    "published_words",
+    "since",
+    "status_lines",
+]
+
+
+def over_fetch(counters: Mapping[str, int]) -> float | None:
+    """Return bytes loaded by bytes that were handed out at least once; None before the first.
+
+    What was fetched ahead and not used yet counts as loaded only.  The ratio is below 1 after a warm start,
+    when segments that the previous run loaded are handed out.
+    """
+    used = counters.get("bytes_used", 0)
+    return counters.get("bytes_loaded", 0) / used if used else None
+
+
+def prefetch_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
+    """Return short texts, each with whether it is a problem; none while prefetching has nothing to do."""
+    misses, lately = counters.get("prefetch_misses", 0), counters.get("prefetch_misses_1min", 0)
+    if not (counters.get("prefetch_started") or misses):
+        return []
+    words = [
+        (f"{counters['prefetch_started']:,} fetched ahead", False),
+        (f"{counters['prefetch_used']:,} then asked for", False),
+        (f"{counters['prefetch_in_vain']:,} in vain", False),
+        (f"prefetch misses {misses:,} ({lately:,} in 1 min)", lately > 0),
+    ]
+    if (ratio := over_fetch(counters)) is not None:
+        words.append((f"loaded {ratio:.2f} times what was used", False))
+    return words
+
+
+def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
+    """Return label and text of each line; none where the map is files."""
+    if not counters.get("published_version"):
+        return []
+    lines = [("version", _version(counters)), ("known", _known(counters)), ("fetched", _fetched(counters))]
+    lines[1:1] = [("signature", text) for text in _signature(counters)]
+    if troubles := _troubles(counters):
+        lines.append(("", troubles))
+    return lines
+
+
+def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
+    """Return the same as short texts, each with whether it is a problem."""
+    if not counters.get("published_version"):
+        return []
+    problems = trust_problems(counters, time.time())
+    pieces = [(f"version {_version(counters)}", False)]
+    pieces += [(text, text in problems) for text in _signature(counters)]
+    pieces += [(_known(counters), False), (_fetched(counters), False), (_troubles(counters), True)]
+    return [(text, trouble) for text, trouble in pieces if text]
+
+
+def since(counters: Mapping[str, int]) -> str:
+    """Return `` (since TIME)`` while the origin is out of reach, else an empty string."""
+    began_ns = counters.get("origin_out_since_unix_ns", 0)
+    return f" (since {format_utc(began_ns // 10**9, seconds=True)})" if began_ns else ""
+
+
+def _version(counters: Mapping[str, int]) -> str:
+    taken_ns = counters["published_taken_unix_ns"]
+    ago = format_duration(max(time.time() - taken_ns * 1e-9, 0.0))
+    return f"{counters['published_version']}, taken on {format_utc(taken_ns // 10**9)}, {ago} ago"
+
+
+def _signature(counters: Mapping[str, int]) -> list[str]:
+    return signature_lines(counters, time.time())
+
+
+def _known(counters: Mapping[str, int]) -> str:
+    cells, known = counters["map_cells"], counters["map_cells_known"]
+    pages = (
+        f"{counters['map_pages_known']:,} of {counted(counters['map_pages'], 'page')} of the list of cells"
+    )
+    return (
+        f"all {counted(cells, 'cell')}"
+        if known >= cells
+        else f"{known:,} of {counted(cells, 'cell')}, {pages}"
+    )
+
+
+def _fetched(counters: Mapping[str, int]) -> str:
+    fetched = f"{counted(counters['objects_fetched'], 'object')}, {format_bytes(counters['bytes_fetched'])}"
+    disk = f"{counted(counters['objects_from_disk'], 'object')}, {format_bytes(counters['bytes_from_disk'])}"
+    return f"{fetched}; from the disk {disk}"
+
+
+def _troubles(counters: Mapping[str, int]) -> str:
+    found = (
+        ("fetches_failed", "fetches failed"),
+        ("objects_damaged_on_disk", "objects were damaged on the disk"),
+        ("objects_damaged_in_store", "came damaged from the store"),
+    )
+    return ", ".join(f"{counters[name]:,} {text}" for name, text in found if counters[name])
+
+
+STATE_STYLES: Final = {
+    "loading": "bright_black",
+    "clean": "green",
+    "dirty": "blue",
+    "saving": "cyan",
+}
+"""Colours of chunks by state, as Rolling-Bonxai has them."""
+
+
+def live_problems(row: LiveMapRow) -> list[str]:
+    """What is wrong with a live map, a line each."""
+    found = [row.problem] if row.problem else []
+    if row.damaged_count:
+        found.append(f"damaged files, missing chunks: {row.damaged_count:,}; `shmmap live ls` names them")
+    return found
+
+
+def status_lines(rows: Sequence[LiveMapRow], restarts: int) -> list[tuple[str, str]]:
+    """Return the lines of ``status``: one for each map, and what is wrong; none where there are no maps."""
+    lines = []
+    for row in rows:
+        unsaved = f"{row.unsaved:,} not saved" if row.unsaved else "all saved"
+        memory = f"{format_bytes(row.bytes)} of {format_bytes(row.budget_bytes)}"
+        known = counted(row.active, "known voxel")
+        lines.append((f"live {row.name}", f"{counted(row.chunks, 'chunk')}, {memory}, {known}, {unsaved}"))
+        lines += [("", problem) for problem in live_problems(row)]
+    if restarts:
+        often = counted(restarts, "time")
+        lines.append(("", f"the process that keeps live maps ended {often}: see the daemon's log"))
+    return lines

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What verbs about cells print as JSON; imported for that alone."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from shmmap.cli.json_output import Box, Hex, Holder, Point, hexed
+
+if TYPE_CHECKING:
+    from shmmap.client.cell_set import CellSet
+    from shmmap.formats.cloud import CloudDescription
+
+__all__ = [
+    "Bounds",
+    "CloudFile",
+    "Crs",
+    "Directory",
+    "Eviction",
+    "Exported",
+    "FailedLayer",
+    "Field",
+    "File",
+    "Found",
+    "FoundCell",
+    "Outside",
+    "PendingLayer",
+    "Pin",
+    "Pins",
+    "Reload",
+    "ServedMap",
+    "Stop",
+    "UnreadFile",
+]
+
+
+class Reload(msgspec.Struct):
+    """What is different in the map."""
+
+    map_version: Hex
+    changed: Annotated[int, msgspec.Meta(description="cells whose file changed")]
+    added: int
+    removed: int
+    problems: list[str]
+
+
+class Eviction(msgspec.Struct):
+    """Numbers of segments."""
+
+    freed: int
+    still_mapped: Annotated[int, msgspec.Meta(description="retired, freed when no client maps them")]
+    kept: Annotated[int, msgspec.Meta(description="in service, because an operator pinned them")]
+    unknown: Annotated[list[str], msgspec.Meta(description="ids that the map does not have")]
+
+
+class Stop(msgspec.Struct):
+    """The daemon that ends."""
+
+    stopping: Annotated[int, msgspec.Meta(description="its pid")]
+
+
+class Pin(msgspec.Struct):
+    """A layer of a cell that is kept."""
+
+    id: str
+    layer: str
+    state: Annotated[
+        str, msgspec.Meta(description="resident, stale, loading, absent, or the code of its failure")
+    ]
+    bytes: int
+
+
+class Pins(msgspec.Struct):
+    """What is pinned."""
+
+    cells: list[Pin]
+    unknown: Annotated[list[str], msgspec.Meta(description="ids that the map does not have")]
+
+
+class FoundCell(msgspec.Struct):
+    """Where a layer of a cell lies in shared memory."""
+
+    id: str
+    version: Hex
+    layer: str
+    segment: str
+    offset: int
+    bytes: int
+    points: int
+    stale: bool
+    box: Box
+
+
+class PendingLayer(msgspec.Struct):
+    """A layer of a cell that is being loaded."""
+
+    id: str
+    layer: str
+
+
+class FailedLayer(msgspec.Struct):
+    """A layer of a cell that could not be had; ``holders`` map memory of the full budget."""
+
+    id: str
+    layer: str
+    code: str
+    message: str
+    holders: list[Holder]
+
+
+class Found(msgspec.Struct):
+    """What a client would get."""
+
+    epoch: Hex
+    map_version: Hex
+    frame_id: str
+    cells: list[FoundCell]
+    removed: Annotated[list[str], msgspec.Meta(description="held ids that the client should drop")]
+    pending: list[PendingLayer]
+    failed: list[FailedLayer]
+
+    @classmethod
+    def of(cls, found: CellSet, frame_id: str) -> Found:
+        """Return all of an answer."""
+        return cls(
+            hexed(found.epoch),
+            hexed(found.map_version),
+            frame_id,
+            [
+                FoundCell(
+                    cell.id,
+                    cell.version_hex,
+                    cell.layer,
+                    cell.segment,
+                    cell.offset,
+                    cell.nbytes,
+                    cell.points,
+                    cell.stale,
+                    cell.box,
+                )
+                for cell in found.cells
+            ],
+            list(found.removed),
+            [PendingLayer(cell.id, cell.layer) for cell in found.pending],
+            [
+                FailedLayer(
+                    error.cell_id, error.layer, error.code, error.message, list(map(Holder.of, error.holders))
+                )
+                for error in found.failed
+            ],
+        )
+
+
+class File(msgspec.Struct):
+    """A file, and the ids of the cells in it."""
+
+    path: str
+    points: int
+    cells: list[str]
+
+
+class Exported(msgspec.Struct):
+    """What was written."""
+
+    files: list[File]
+
+
+class Field(msgspec.Struct):
+    """A field; ``xyz`` is x, y and z."""
+
+    name: str
+    dtype: Annotated[str, msgspec.Meta(description="as numpy writes it")]
+    count: Annotated[int, msgspec.Meta(description="values per point")]
+    unit: str
+
+
+class Bounds(msgspec.Struct):
+    """Bounds of finite points."""
+
+    min: list[float]
+    max: list[float]
+
+    @classmethod
+    def of(cls, found: CloudDescription) -> Bounds | None:
+        """Return the bounds of a file; None without a finite point."""
+        lowest, highest = (bound.tolist() for bound in found.bounds)
+        return cls(lowest, highest) if all(map(math.isfinite, lowest)) else None
+
+
+class Crs(msgspec.Struct):
+    """What a file says of its coordinates."""
+
+    name: str
+    epsg: Annotated[int, msgspec.Meta(description="0: not said")]
+    geographic: Annotated[bool, msgspec.Meta(description="x and y are degrees")]
+    unit_m: Annotated[list[float], msgspec.Meta(description="metres per unit of x and y, of z")]
+    units: list[str]
+
+
+class CloudFile(msgspec.Struct):
+    """A file of points."""
+
+    path: str
+    format: str
+    encoding: Annotated[str, msgspec.Meta(description="of a PCD file")]
+    version: str
+    file_bytes: int
+    points: Annotated[int, msgspec.Meta(description="in the file")]
+    dropped: Annotated[int, msgspec.Meta(description="those of them that are not finite")]
+    width: int
+    height: int
+    fields: list[Field]
+    bounds: Bounds | None
+    viewpoint: Annotated[list[float], msgspec.Meta(description="x, y, z, qw, qx, qy, qz")]
+    warnings: list[str]
+    crs: Crs | None
+
+    @classmethod
+    def of(cls, found: CloudDescription) -> CloudFile:
+        """Return all that a file holds."""
+        crs = found.crs
+        return cls(
+            found.path,
+            found.format,
+            found.encoding,
+            found.version,
+            found.file_bytes,
+            found.points,
+            found.dropped,
+            found.width,
+            found.height,
+            [Field(spec.name, spec.dtype.str, spec.components, spec.unit) for spec in found.columns],
+            Bounds.of(found),
+            list(found.viewpoint),
+            list(found.warnings),
+            None
+            if crs is None
+            else Crs(
+                crs.name,
+                crs.epsg,
+                crs.geographic,
+                [unit.metres for unit in crs.units],
+                [unit.name for unit in crs.units],
+            ),
+        )
+
+
+class UnreadFile(msgspec.Struct):
+    """A file that cannot be read, and why."""
+
+    path: str
+    message: str
+
+
+class Outside(msgspec.Struct):
+    """A cell with points outside its box."""
+
+    path: str
+    box: Box
+
+
+class ServedMap(msgspec.Struct):
+    """A directory as a divided map."""
+
+    cells: int
+    outside_box: list[Outside]
+    far: Annotated[list[str], msgspec.Meta(description="on cells far from all others")]
+    origin: Annotated[
+        Point, msgspec.Meta(description="to add for the coordinates of the clouds it was divided from")
+    ] = (0.0, 0.0, 0.0)
+    crs: str = ""
+    unit_m: tuple[float, float] = (1.0, 1.0)
+    problems: list[str] = []
+
+
+class Directory(msgspec.Struct):
+    """A directory of files: sums and bounds of all."""
+
+    path: str
+    files: list[CloudFile]
+    failed: list[UnreadFile]
+    points: int
+    dropped: int
+    file_bytes: int
+    bounds: Bounds | None
+    map: Annotated[ServedMap | None, msgspec.Meta(description="null where it is no divided map")]

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap query``: what a client would get."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from typing import TYPE_CHECKING
+
+from shmmap.cli.areas import add_area_or_ids, area_from, no_cell_there, print_near_cells
+from shmmap.cli.options import (
+    Subparsers,
+    add_daemon_options,
+    add_layer_option,
+    add_verb,
+    layers_from,
+    seconds,
+)
+from shmmap.cli.program import add_allow_empty, complain, nothing_found
+from shmmap.cli.screens.output import (
+    Column,
+    counted,
+    format_bytes,
+    format_metres,
+    print_hanging,
+    print_json,
+    print_line,
+    print_table,
+    rows_text,
+)
+from shmmap.errors import BadRequest
+from shmmap.lacking import failure_lines, near_cells_hint, not_covered, pending_lines, unknown_ids
+
+if TYPE_CHECKING:
+    from shmmap.client.cell_set import CellSet
+    from shmmap.client.client import Client
+    from shmmap.geometry import Area
+
+__all__ = ["add_parser", "held_cell", "run"]
+
+_EXIT = """\
+Codes of failures: unknown_cell, load_failed, load_timeout, over_budget, no_space, offline.
+Exit code: 0; 1 when a cell is pending, failed or unknown, when the daemon does not know yet all that lies in
+the area, when the area touches no cell, or when a layer is empty in every cell.
+With --held, 0 when nothing is new."""
+
+
+_COLUMNS = (
+    Column("CELL"),
+    Column("X", "right", spare=2),
+    Column("Y", "right", spare=2),
+    Column("LAYER", spare=1),
+    Column("ROWS", "right"),
+    Column("MEMORY", "right"),
+    Column("VERSION", spare=4),
+    Column("SEGMENT", spare=5),
+)
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "query",
+        run,
+        help="what a client would get for an area or for ids",
+        description="Ask the daemon for cells, as a client does: it loads those that are not in "
+        "memory.  Prints "
+        "where each of them lies in shared memory.\n"
+        "ROWS: points, or what a layer has instead, such as voxels.",
+        output="cells.outputs.Found",
+        epilog=_EXIT,
+    )
+    add_area_or_ids(parser)
+    add_layer_option(parser, "what to have of each cell (default: points)")
+    parser.add_argument(
+        "--held",
+        metavar="ID[@VERSION]",
+        nargs="+",
+        action="extend",
+        help="print only what changes for a client that has these cells; without @VERSION: in their current "
+        "version",
+    )
+    parser.add_argument(
+        "--wait",
+        metavar="SECONDS|none",
+        type=lambda text: None if text == "none" else seconds(text),
+        default=10.0,
+        help="how long to wait for cells that have to be loaded; none: do not wait: print what is in memory, "
+        "the rest is loaded in the background (default: 10)",
+    )
+    add_allow_empty(parser)
+    add_daemon_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the answer."""
+    from shmmap.cli.daemon_address import connect
+
+    area = area_from(args)
+    held_given = args.held is not None
+    held = [held_cell(text) for text in args.held or ()]
+    if held and area is None:
+        raise BadRequest("--held needs an area", hint="add --circle, --square or --box")
+    layers = layers_from(args)
+    with connect(args) as client:
+        if area is None:
+            found = client.selected(args.id, layers, wait=args.wait, strict=None)
+        elif held_given:
+            found = client.differential(area, held, layers, wait=args.wait, strict=None)
+        else:
+            found = client.area(area, layers, wait=args.wait, strict=None)
+        welcome = client.welcome
+        if args.json:
+            from shmmap.cli.verbs.cells import outputs
+
+            print_json(outputs.Found.of(found, welcome.frame_id))
+        else:
+            _print_text(found, welcome.id_prefix, summed=bool(found.cells) or held_given)
+        if not found.complete:
+            if not found.covered:
+                complain("shmmap", *not_covered(found))
+            print_near_cells(near_cells_hint(client, unknown_ids(found.failed)))
+            return 1
+        return _judge_empty(args, client, area, found)
+
+
+def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, found: CellSet) -> int:
+    """Return the exit code of a complete answer; where there is nothing in it, say so."""
+    if found.cells:
+        held = args.held is not None
+        rows: dict[str, int] = {}
+        for cell in found.cells:
+            rows[cell.layer] = rows.get(cell.layer, 0) + cell.points
+        empty = [layer for layer, points in rows.items() if not points]
+        if empty and not held:
+            cells = len({cell.id for cell in found.cells})
+            return nothing_found(args, f"{', '.join(empty)}: no points in {counted(cells, 'cell')}")
+    elif area is not None and (args.held is None or not len(client.metadata(area))):
+        return no_cell_there(args, client, area)
+    return 0
+
+
+def held_cell(text: str) -> str | tuple[str, int]:
+    """Read ``ID`` or ``ID@VERSION``, split at the last @; the version is 1 to 16 hex digits."""
+    cell_id, at, version = text.rpartition("@")
+    if not at or "/" in version or "." in version:
+        return text  # the @ belongs to a name
+    if not cell_id or not re.fullmatch("[0-9a-fA-F]{1,16}", version):
+        raise BadRequest(
+            f"--held: {text!r} is not ID@VERSION",
+            hint="a version is up to 16 hex digits, as `query` prints it",
+        )
+    return cell_id, int(version, 16)
+
+
+def _print_text(found: CellSet, id_prefix: str, *, summed: bool) -> None:
+    if found.cells:
+        print_table(
+            _COLUMNS,
+            [
+                [
+                    cell.id.removeprefix(id_prefix),
+                    format_metres(cell.box[0]),
+                    format_metres(cell.box[1]),
+                    cell.layer,
+                    f"{cell.points:,}",
+                    format_bytes(cell.nbytes),
+                    cell.version_hex + (" stale" if cell.stale else ""),
+                    cell.segment,
+                ]
+                for cell in found.cells
+            ],
+        )
+    for cell_id in found.removed:
+        print_line(f"removed: {cell_id}")
+    for line in pending_lines(found.pending):
+        print_line(line)
+    for line in failure_lines(found.failed):
+        indent = len(line) - len(line.lstrip())
+        print_hanging(line[:indent], line[indent:])
+    if not summed:
+        return
+    rows, nbytes = (sum(getattr(cell, name) for cell in found.cells) for name in ("points", "nbytes"))
+    other = next((cell.layer for cell in found.cells if cell.layer != "points"), "points")
+    cells = counted(len({cell.id for cell in found.cells}), "cell")
+    print_line(f"{cells}, {rows_text(rows, other)}, {format_bytes(nbytes)}")

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap health`` and ``shmmap metrics``: what scripts and monitors ask."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
+from shmmap.cli.screens.output import counted, format_duration, print_json, print_line
+from shmmap.doctor.signed_map import trust_problems
+from shmmap.errors import DaemonUnreachable
+
+if TYPE_CHECKING:
+    from shmmap.statistics.snapshot import Snapshot
+
+__all__ = ["add_health", "add_metrics", "run_health", "run_metrics"]
+
+
+_HEALTH_EXIT = """\
+Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
+also 1 while clients lack something: cells were refused in the last minute, the map's files are out of
+reach, the map could not be read again or has problems, its signature has expired, the version that its origin
+offers is refused, or a live map has a problem."""
+
+
+def add_health(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "health",
+        run_health,
+        help="is the daemon healthy? (exit code 0: yes)",
+        description="Say whether the daemon is healthy, starting (it does not listen yet), unreachable (its"
+        " socket was removed), paused (by SIGSTOP or a debugger), hung or dead.  Reads its statistics in"
+        " shared memory, so it answers whatever the daemon does.",
+        output="look.outputs.Health",
+        epilog=_HEALTH_EXIT,
+    )
+    parser.add_argument(
+        "--strict", action="store_true", help="unhealthy, too, while clients lack something (exit code 1)"
+    )
+    add_statistics_options(parser)
+
+
+def run_health(args: argparse.Namespace) -> int:
+    """Print one word and why; return what the exit code says."""
+    from shmmap.cli.daemon_address import has_lost_socket, snapshot
+
+    found, identity = snapshot(args)
+    troubles = _troubles(found)
+    lost = found.state == "healthy" and has_lost_socket(found)
+    state = "unreachable" if lost else found.state
+    if args.json:
+        from shmmap.cli.verbs.look.outputs import Health
+
+        beat_age_s, defects = round(found.beat_age_s, 6), found.counters.get("defects", 0)
+        print_json(Health(state, beat_age_s, identity.pid, identity.instance, defects, troubles))
+    else:
+        age = format_duration(found.beat_age_s)
+        shown = "paused" if state == "stopped" else state
+        print_line(f"{shown}: pid {identity.pid}, last heartbeat {age} ago{_defects(found)}")
+        if lost:
+            print_line(
+                f"another program removed its socket {identity.endpoint}: it makes it again within seconds,"
+                " or its log says what is in the way"
+            )
+        if args.strict:
+            for trouble in troubles:
+                print_line(f"  {trouble}")
+    if args.strict and troubles and state == "healthy":
+        return 1
+    return {"healthy": 0, "dead": DaemonUnreachable.exit_code}.get(state, 1)
+
+
+def _troubles(found: Snapshot) -> list[str]:
+    """What clients lack although the daemon answers."""
+    counts = found.counters
+    counted_troubles = (
+        (counts.get("refused_over_budget_1min", 0), "cells refused for lack of memory in the last minute"),
+        (counts.get("map_problems", 0), "problems in the map (`shmmap doctor`)"),
+        (sum(bool(row.problem) for row in found.live), "live maps with a problem (`shmmap live ls`)"),
+    )
+    troubles = [f"{count:,} {text}" for count, text in counted_troubles if count]
+    if counts.get("origin_out", 0):
+        troubles.append("no load succeeds: the map's files are out of reach (`shmmap doctor`)")
+    troubles += trust_problems(counts, time.time())
+    if counts.get("last_reload_failed", 0) and not counts.get("published_refusal", 0):
+        troubles.append("the map could not be read again: its old state is served")
+    return troubles
+
+
+def _defects(found: Snapshot) -> str:
+    """Return the defects that the daemon survived, if any: to be reported."""
+    count = found.counters.get("defects", 0)
+    return f"; it survived {counted(count, 'exception')}, see its log" if count else ""
+
+
+_METRICS_EPILOG = """\
+For node_exporter's textfile collector, from a timer:
+  shmmap metrics > /var/lib/node_exporter/shmmap.prom.new
+  mv /var/lib/node_exporter/shmmap.prom.new /var/lib/node_exporter/shmmap.prom
+Exit code: 0, or 69 when the daemon is dead or was never started (shmmap_up is 0 then)."""
+
+
+def add_metrics(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "metrics",
+        run_metrics,
+        help="counters and latencies in Prometheus' format",
+        description="Print counters, gauges and latency histograms in Prometheus' text format.  Reads the "
+        "daemon's statistics: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
+        "`shmmap stop`.",
+        epilog=_METRICS_EPILOG,
+    )
+    add_statistics_options(parser, json=False)
+
+
+def run_metrics(args: argparse.Namespace) -> int:
+    """Print one scrape."""
+    from shmmap.cli.daemon_address import locate
+    from shmmap.statistics.prometheus import exposition
+    from shmmap.statistics.reader import read_statistics
+
+    name, directory = locate(args)
+    found = read_statistics(name, directory)
+    sys.stdout.write(exposition(found, name))
+    return DaemonUnreachable.exit_code if found.state in ("absent", "dead") else 0

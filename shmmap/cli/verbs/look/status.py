@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap status``: one screen about the daemon, read from its statistics segment."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import TYPE_CHECKING
+
+from shmmap.cli.areas import moved_by
+from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
+from shmmap.cli.screens.output import (
+    counted,
+    format_bytes,
+    format_duration,
+    format_metres,
+    print_json,
+    print_pairs,
+)
+from shmmap.cli.screens.status_parts import (
+    prefetch_words,
+    published_lines,
+    since,
+    status_lines,
+)
+from shmmap.doctor.verdicts import cache_verdict, outage_so_far
+from shmmap.errors import DaemonUnreachable
+
+if TYPE_CHECKING:
+    from shmmap.statistics.identity import DaemonIdentity
+    from shmmap.statistics.snapshot import Snapshot
+
+__all__ = ["add_parser", "run"]
+
+_EXIT = """\
+Exit code: 0, or 69 when the daemon is dead or was never started."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "status",
+        run,
+        help="state of the daemon: memory, clients, requests, cache size",
+        description="Show the state of the daemon: memory, clients, requests, loads, live maps, whether the "
+        "cache is large enough, and what was fetched ahead for moving clients.  Reads its statistics in "
+        "shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
+        "`shmmap stop`.",
+        output="look.outputs.Status",
+        epilog=_EXIT,
+    )
+    add_statistics_options(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the state of the daemon."""
+    from shmmap.cli.daemon_address import snapshot
+
+    found, identity = snapshot(args)
+    if args.json:
+        from shmmap.cli.verbs.look.outputs import Status
+
+        print_json(Status.of(found, identity))
+    else:
+        uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
+        print_pairs(_lines(found, identity, uptime_s))
+    return DaemonUnreachable.exit_code if found.state == "dead" else 0
+
+
+def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[tuple[str, str]]:
+    count = found.counters
+    used = count["bytes_resident"] + count["bytes_zombie"] + count["bytes_reserved"]
+    budget = count["budget_bytes"]
+    share = f" ({100 * used / budget:.0f} %)" if budget else ""
+    state = {
+        "healthy": f"healthy, pid {identity.pid}, up {format_duration(uptime_s)}",
+        "starting": f"starting, pid {identity.pid}, for {format_duration(uptime_s)}: it does not listen yet",
+        "stopped": f"PAUSED, pid {identity.pid}: continue it with `kill -CONT {identity.pid}`",
+        "hung": f"HUNG, pid {identity.pid}: no heartbeat for {format_duration(found.beat_age_s)}",
+        "dead": f"DEAD: pid {identity.pid} crashed or was killed; start it again, it keeps the "
+        f"cells in memory",
+    }[found.state]
+    asked = count["hits"] + count["misses"]
+    lines = [
+        ("daemon", state),
+        ("instance", f"{identity.instance} (shmmap {identity.library_version})"),
+        ("endpoint", identity.endpoint),
+        ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
+        ("memory", f"{format_bytes(used)} taken of {format_bytes(budget)}{share} in {identity.shm_dir}"),
+        ("resident", f"{count['cells_resident']:,} segments, {format_bytes(count['bytes_resident'])}"),
+        ("in use", f"{format_bytes(count['bytes_pinned'])} mapped by clients"),
+    ]
+    if (origin := moved_by(identity.id_prefix)) is not None:
+        x, y, z = map(format_metres, origin)
+        lines.insert(
+            4, ("frame", f"add ({x}, {y}, {z}) m for the coordinates of the cloud it was divided from")
+        )
+    if count.get("origin_out", 0):
+        kept = "in memory and on the disk" if published_lines(count) else "in memory"
+        out = f"out of reach for {outage_so_far(count)}{since(count)}"
+        lines.append(("origin", f"{out}: what is {kept} is served"))
+    lines += published_lines(count)
+    if problems := count.get("map_problems", 0):
+        lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
+    if outside := count.get("cells_outside_box", 0):
+        cells = f"{counted(outside, 'cell')} with points outside the cell's box"
+        lines.append(("misplaced", f"{cells}: see the daemon's log, or `shmmap inspect` the map"))
+    if count["stale_cells"]:
+        lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
+    if count["zombies"]:
+        retired = f"{count['zombies']:,} segments, {format_bytes(count['bytes_zombie'])}"
+        lines.append(("retired", f"{retired}: freed when no client maps them"))
+    if count["adopted"]:
+        failed = f", {count['adoptions_failed']:,} of them damaged" if count["adoptions_failed"] else ""
+        lines.append(("warm start", f"{count['adopted']:,} segments kept from the previous daemon{failed}"))
+    if count["pin_source"]:
+        source = "the clients' locks" if count["pin_source"] == 1 else "what clients report"
+        lines.append(("use", f"this system grants no leases: memory in use is known from {source} only"))
+    lines += [
+        (
+            "clients",
+            f"{count['sessions']:,} now, {count['sessions_opened']:,} so far, verbs of `shmmap` included",
+        ),
+        ("requests", f"{count['requests']:,}, {format_bytes(count['bytes_sent'])} sent"),
+        ("cells asked", f"{asked:,}" + (f", {100 * count['hits'] / asked:.0f} % in memory" if asked else "")),
+        (
+            "loads",
+            (
+                f"{count['loads_finished']:,} done, {count['load_queue']:,} queued,"
+                f" {count['loads_failed']:,} failed, {count['loads_timed_out']:,} timed out,"
+                f" {counted(count['worker_crashes'], 'crashed loader')}"
+            ),
+        ),
+    ]
+    if count["loads_failed"]:
+        lines.append(("", "`shmmap doctor` names the cells that fail"))
+    lines += status_lines(found.live, count.get("live_restarts", 0))
+    verdict = cache_verdict(count)
+    lines.append(("cache", verdict.text))
+    if verdict.hint:
+        lines.append(("", verdict.hint))
+    if words := prefetch_words(count):
+        lines.append(("prefetch", ", ".join(text for text, _trouble in words)))
+    if count["refused_quota"]:
+        over = (
+            f"{count['refused_quota']:,} cells refused since the start: a client asked for more than its part"
+        )
+        lines.append(("quota", f"{over} (--session-quota)"))
+    return lines

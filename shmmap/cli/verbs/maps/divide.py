@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``shmmap divide IN... OUT``: clouds of any size into a divided map."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, NoReturn
+
+from shmmap.cli.options import Subparsers, add_json_option, add_unit_options, add_verb, numbers, size_bytes
+from shmmap.cli.program import complain
+from shmmap.cli.screens.work_progress import fields_text, print_result
+
+if TYPE_CHECKING:
+    from shmmap.dividing.frame import Translation
+    from shmmap.origin.map_report import DividedMap
+
+__all__ = ["add_parser", "metres", "run", "translation"]
+
+_EPILOG = """\
+IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb, or a table of
+numbers: .txt .csv .asc) or a directory of files, tables left out; all together become one map.  Files may
+be larger than memory.
+A cell has the points with x0 <= x < x0 + size and y0 <= y < y0 + size; points that are not finite are
+left out and counted.  All fields are kept, with their types, unless --fields names those to keep.
+OUT appears complete or not at all.  Autoware's map loader reads it.
+Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no such input,
+73 OUT cannot be written, 75 another run is making OUT."""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "divide",
+        run,
+        help="divide clouds into a map of square cells",
+        description="Divide clouds of any size into a map of square cells that `serve` and Autoware read.",
+        output="maps.outputs.divided_kind",
+        epilog=_EPILOG,
+    )
+    parser.add_argument("inputs", metavar="IN", nargs="+", help="clouds, or directories of clouds")
+    parser.add_argument("out", metavar="OUT", help="the map directory to make")
+    cells = parser.add_argument_group("cells")
+    cells.add_argument(
+        "--cell-size", metavar="METRES", type=metres, default=20.0, help="side of a cell (default: 20)"
+    )
+    cells.add_argument(
+        "--origin",
+        metavar="X,Y",
+        type=lambda text: numbers(text, "X,Y"),
+        default=[0.0, 0.0],
+        help="a corner of the lattice of cells, in the frame of the inputs (default: 0,0)",
+    )
+    cells.add_argument("--prefix", default="", help="start of the file names, before _<x>_<y>.pcd")
+    points = parser.add_argument_group("points")
+    points.add_argument(
+        "--translate",
+        metavar="X,Y,Z|auto|none",
+        type=translation,
+        default="auto",
+        help="added to every point; auto (the default) shifts float64 and LAS clouds to the origin if "
+        "float32 would lose more than 0.5 mm where they are, as `serve` does with a cloud; none keeps their "
+        "frame, in float64 where needed",
+    )
+    add_unit_options(points)
+    points.add_argument(
+        "--leaf",
+        metavar="METRES",
+        type=metres,
+        default=0.0,
+        help="thin out: one point, the mean, for each voxel of this side",
+    )
+    points.add_argument(
+        "--order",
+        type=_order_is_gone,
+        help=argparse.SUPPRESS,
+    )
+    points.add_argument(
+        "--encoding",
+        choices=("binary", "binary_compressed", "ascii"),
+        default="binary",
+        help="encoding of the PCD files (default: binary)",
+    )
+    points.add_argument(
+        "--fields",
+        metavar="NAME,...",
+        type=lambda text: [name.strip() for name in text.split(",")],
+        action="extend",
+        default=[],
+        help="keep only these fields, such as x,y,z,intensity (default: all)",
+    )
+    points.add_argument(
+        "--common-fields", action="store_true", help="keep only the fields that all inputs have"
+    )
+    work = parser.add_argument_group("work")
+    work.add_argument(
+        "--max-memory",
+        metavar="BYTES",
+        type=size_bytes,
+        default="1G",
+        help="most memory the process may take (default: 1G)",
+    )
+    work.add_argument("--force", action="store_true", help="replace a divided map that exists")
+    work.add_argument(
+        "--resume", action="store_true", help="continue where a killed run of the same command stopped"
+    )
+    work.add_argument(
+        "--check", action="store_true", help="read the map back and verify it before it appears"
+    )
+    work.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_json_option(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Divide, and say what came out."""
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.dividing.divide import divide
+    from shmmap.dividing.settings import DivideSettings
+
+    origin_x, origin_y = args.origin
+    settings = DivideSettings(
+        cell_size=args.cell_size,
+        origin=(origin_x, origin_y),
+        translate=args.translate,
+        unit=args.unit or "",
+        vertical_unit=args.vertical_unit or "",
+        leaf=args.leaf,
+        prefix=args.prefix,
+        encoding=args.encoding,
+        memory_bytes=args.max_memory,
+        common_fields=args.common_fields,
+        fields=tuple(dict.fromkeys(args.fields)),
+        force=args.force,
+        resume=args.resume,
+        check=args.check,
+    )
+    began_s = time.monotonic()
+    try:
+        made = divide(args.inputs, args.out, settings, progress=StageProgress(quiet=args.quiet))
+    except KeyboardInterrupt:
+        complain("shmmap", "interrupted", "the same command with --resume continues")
+        raise
+    seconds = time.monotonic() - began_s
+    print_result(made, _lines(made), seconds=seconds, as_json=args.json)
+    return 0
+
+
+def metres(text: str) -> float:
+    """Read a length in metres."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected metres, not {text!r}") from None
+
+
+def _order_is_gone(text: str) -> NoReturn:
+    """Refuse an option of earlier versions."""
+    raise argparse.ArgumentTypeError(
+        f"{text}: this option is gone, leave it out; points keep the order of the input"
+    )
+
+
+def translation(text: str) -> Translation:
+    """Read what is to be added to points."""
+    if text == "auto":
+        return "auto"
+    if text == "none":
+        return "none"
+    x, y, z = numbers(text, "X,Y,Z")
+    return x, y, z
+
+
+def _lines(made: DividedMap) -> list[tuple[str, str]]:
+    left_out = f", {made.dropped:,} not finite" if made.dropped else ""
+    lines = [
+        ("map", made.path),
+        ("cells", f"{made.cells:,}, side {made.cell_size:g} m"),
+        ("points", f"{made.points:,} of {made.points_read:,} read{left_out}"),
+        ("fields", fields_text(made.fields)),
+    ]
+    if made.crs:
+        lines.append(("crs", made.crs))
+    if made.resumed_points:
+        lines.append(("resumed", f"after {made.resumed_points:,} points"))
+    return [*lines, *(("note", note) for note in made.notes)]

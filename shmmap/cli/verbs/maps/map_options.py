@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of the verbs that read all of a map, or work on a published one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from shmmap.cli.options import add_unit_options, at_least
+from shmmap.cli.screens.output import print_line
+
+if TYPE_CHECKING:
+    from shmmap.cli import json_output
+    from shmmap.origin.catalogue import MapOrigin
+    from shmmap.origin.remote.store import Store
+    from shmmap.origin.remote.verify_apart import Verified
+    from shmmap.prepare.run import Failure
+    from shmmap.publishing.signing import MapSigner
+
+__all__ = [
+    "URL_HELP",
+    "add_map_options",
+    "add_sign_option",
+    "add_store_options",
+    "add_trust_option",
+    "failure_rows",
+    "origin_at",
+    "print_failures",
+    "refuse_map_options",
+    "signer_at",
+    "store_at",
+    "verified_at",
+    "worker_count",
+]
+
+
+_SHOWN_FAILURES: Final = 20
+
+
+def add_map_options(parser: argparse.ArgumentParser) -> None:
+    """Add how the map is read, and by how many processes."""
+    parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
+    parser.add_argument(
+        "--strict", action="store_true", help="accept only what Autoware's own loader accepts"
+    )
+    add_unit_options(parser)
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=at_least(0),
+        default=0,
+        help="number of processes (default: one for each core)",
+    )
+
+
+def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str] = ()) -> None:
+    """Refuse options about reading files, and ``others``, where no file is read; ``what`` says why."""
+    from shmmap.errors import BadRequest
+
+    for option in ("metadata", "strict", "unit", "vertical_unit", *others):
+        if getattr(args, option):
+            raise BadRequest(f"--{option.replace('_', '-')} does not go with {what}")
+
+
+def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:
+    """Return the map at ``args.map_path``, to be read as the options say."""
+    from shmmap.dividing.served_cloud import find_origin
+
+    return find_origin(
+        args.map_path,
+        metadata=args.metadata or "",
+        strict=args.strict,
+        cache_dir=cache_dir,
+        unit=args.unit or "",
+        vertical_unit=args.vertical_unit or "",
+    )
+
+
+def worker_count(args: argparse.Namespace) -> int:
+    """Return the number of processes that the options ask for."""
+    import os
+
+    return args.workers or len(os.sched_getaffinity(0))
+
+
+def failure_rows(failures: Sequence[Failure]) -> list[json_output.Failure]:
+    """Return layers that could not be made, for JSON."""
+    from shmmap.cli import json_output
+
+    return [json_output.Failure(one.cell_id, one.layer, one.message) for one in failures]
+
+
+def print_failures(failures: Sequence[Failure]) -> None:
+    """Print layers that could not be made; of many, only the first."""
+    for failure in failures[:_SHOWN_FAILURES]:
+        print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
+    if len(failures) > _SHOWN_FAILURES:
+        print_line(f"failed: {len(failures) - _SHOWN_FAILURES:,} more")
+
+
+URL_HELP = "where the map is published: s3://, gs://, az://, https://, file://, or a directory"
+
+
+def add_store_options(parser: argparse.ArgumentParser) -> None:
+    """Add how a store is reached, besides its URL."""
+    group = parser.add_argument_group("the store")
+    group.add_argument(
+        "--insecure-http",
+        action="store_true",
+        help="accept plain http:// from other machines, although it can be read and changed in transit",
+    )
+    group.add_argument(
+        "--instance-credentials",
+        action="store_true",
+        help="ask the cloud's metadata address for credentials if none are given",
+    )
+
+
+def store_at(url: str, args: argparse.Namespace) -> Store:
+    """Return the store at a URL, opened as the options say."""
+    from shmmap.optional_packages import needed_packages
+
+    with needed_packages("a published map"):
+        from shmmap.origin.remote.opened_store import open_store
+        from shmmap.origin.remote.store import may_be_plain
+
+        plain = may_be_plain(url, insecure_http=args.insecure_http, trust=getattr(args, "trust", None))
+        return open_store(url, insecure_http=plain, instance_credentials=args.instance_credentials)
+
+
+def add_sign_option(parser: argparse.ArgumentParser) -> None:
+    """Add where the keys of a signed map are."""
+    parser.add_argument("--sign", metavar="KEYDIR", help="sign with the keys in this directory")
+
+
+def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False) -> MapSigner | None:
+    """Return what signs a map, as the options say; None: it is not signed."""
+    from shmmap.optional_packages import TO_SIGN, needed_packages
+
+    if args.sign is None:
+        return None
+    with needed_packages("a signed map", together=TO_SIGN):
+        from shmmap.publishing.signing import MapSigner
+
+    return MapSigner(store, args.sign, make_keys=make_keys)
+
+
+def add_trust_option(group: argparse._ActionsContainer) -> None:
+    """Add the root of trust."""
+    group.add_argument(
+        "--trust", metavar="ROOT.json", help="take only what is signed under this root, and nothing older"
+    )
+
+
+def verified_at(store: Store, args: argparse.Namespace) -> Verified | None:
+    """Return the version that is signed under the root of trust; None: none was given."""
+    import os
+
+    if args.trust is None:
+        return None
+    from shmmap.daemon.config_live import state_directory
+    from shmmap.errors import ConfigError
+    from shmmap.origin.remote.store import may_be_plain
+    from shmmap.origin.remote.verify_apart import VerifySettings, verify_apart
+
+    state_dir = state_directory("")
+    if not state_dir:
+        raise ConfigError("there is no directory to keep what was verified", hint="set XDG_STATE_HOME")
+    return verify_apart(
+        VerifySettings(
+            store.url,
+            os.path.abspath(args.trust),
+            state_dir,
+            may_be_plain(store.url, insecure_http=args.insecure_http, trust=args.trust),
+            args.instance_credentials,
+        )
+    )

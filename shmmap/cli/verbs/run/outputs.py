@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What verbs that run a daemon print as JSON; imported for that alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from shmmap.cli.json_output import more_of
+
+__all__ = ["Checked", "Setting", "Settings", "versions_kind"]
+
+
+class Setting(msgspec.Struct):
+    """A setting, and FILE:LINE, the variable, or ``default`` that it comes from."""
+
+    value: Any
+    origin: str
+
+
+class Settings(msgspec.Struct):
+    """Every setting; sizes stand there under two names, such as budget (as in the file) and budget_bytes."""
+
+    file: str | None
+    settings: dict[str, Setting]
+
+
+class Checked(msgspec.Struct):
+    """A file without mistakes."""
+
+    file: str | None
+    good: bool
+
+
+def versions_kind() -> object:
+    """Return what ``--json`` prints."""
+    from shmmap.cli.verbs.run.about import Versions
+
+    return more_of(Versions)

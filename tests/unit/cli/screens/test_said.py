@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines that verbs print: events, and cells that could not be had."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from shmmap.cli import json_output
+from shmmap.cli.screens.output import user_name
+from shmmap.cli.verbs.look.tail import _print_json, _print_text
+from shmmap.errors import CellError, LoadFailed, OverBudget
+from shmmap.lacking import failure_lines
+from shmmap.protocol import events as e
+from shmmap.protocol.messages import Holder
+
+
+@pytest.mark.parametrize(
+    ("event", "told"),
+    [
+        (e.LiveStarted(1, 2, 3, 2, 0), "2 live maps served"),
+        (e.LiveStarted(1, 2, 3, 1, 40), "1 live map served, 40 chunks found in memory"),
+        (e.LiveEnded(1, 2, 3, 1),
+         "the live worker ended (1 time by now), and restarts"),
+        (e.LiveProblem(1, 2, 3, "lidar", "chunk 0_0_0 cannot be saved: full"),
+         "lidar: chunk 0_0_0 cannot be saved: full"),
+        (e.LiveProblem(1, 2, 3, "lidar", ""), "lidar: chunks are loaded and saved again"),
+        (e.LiveDamaged(1, 2, 3, "lidar", "3_-1_0: version 7 is missing"),
+         "lidar: 3_-1_0: version 7 is missing"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_live_maps(capsys: pytest.CaptureFixture[str], event: Any, told: str) -> None:
+    _print_text(event)
+    _, _, said = capsys.readouterr().out.partition("  ")
+    assert said == f"live      {told}\n"
+
+
+def test_cells_that_a_client_had_to_wait_for(capsys: pytest.CaptureFixture[str]) -> None:
+    late = e.PrefetchMiss(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
+    _print_text(late)
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.endswith("miss planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points")
+    _print_json(late)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["event"], told["session"], told["cells"]) == ("prefetch_miss", "00000000000000ab", 4)
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_cells_that_were_fetched_ahead(capsys: pytest.CaptureFixture[str], ahead: bool) -> None:
+    loaded = e.Loaded(1, 2, 3, "0_0.pcd", "points", 4, 4096, 10, 5_000_000, ahead=ahead)
+    _print_text(loaded)
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.endswith("in 5.0 ms" + ", ahead of the clients" * ahead)
+    _print_json(loaded)
+    assert json.loads(capsys.readouterr().out)["ahead"] is ahead
+
+
+def test_that_they_change_is_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
+    changed = e.LiveChanged(1, 2, 3, "lidar", 77)
+    _print_text(changed)
+    assert capsys.readouterr().out == ""
+    _print_json(changed)
+    told = json.loads(capsys.readouterr().out)
+    assert (told["event"], told["map"], told["change"]) == ("live_changed", "lidar", 77)
+
+
+FULL = "the budget of 1.0 MiB is in use"
+
+NDT = Holder(0xAB, 42, 1000, "ndt", 900 << 10, 30, "python3")
+
+ASKER = Holder(0xCD, 43, 1000, "shmmap", 0, 0, "shmmap")
+
+STRANGER = Holder(0, 0, -1, "unknown", 2048, 1)
+
+
+def refused(name: str, *holders: Holder, message: str = FULL) -> CellError:
+    path = f"/map/{name}"
+    return OverBudget(f"{path} (points): {message}", cell_id=path, layer="points", holders=holders)
+
+
+def test_one_line_a_cause_and_each_holder_once() -> None:
+    failed: list[CellError] = [refused(f"{x}_0.pcd", NDT, ASKER, STRANGER) for x in range(36)]
+    failed.append(LoadFailed("/map/bad.pcd (points): cut off", cell_id="/map/bad.pcd", layer="points"))
+    assert failure_lines(failed) == [
+        f"failed: 36 cells (points): {FULL} [over_budget]: 0_0.pcd, 1_0.pcd, 2_0.pcd, ...",
+        "  in use: 900 KiB in 30 cells by ndt, pid 42",
+        "  in use: 2.0 KiB in 1 cell by a process that did not open them through the client library",
+        "failed: /map/bad.pcd (points): cut off [load_failed]",
+    ]
+
+
+def test_a_path_is_told_once() -> None:
+    message = "/map/bad.pcd (points): /map/bad.pcd: cut off"
+    failed = LoadFailed(message, cell_id="/map/bad.pcd", layer="points")
+    assert failure_lines([failed]) == ["failed: /map/bad.pcd (points): cut off [load_failed]"]
+
+
+def test_who_asks_is_no_holder_of_nothing() -> None:
+    assert failure_lines([refused("a.pcd", ASKER)]) == [f"failed: /map/a.pcd (points): {FULL} [over_budget]"]
+
+
+def test_different_causes_are_different_lines() -> None:
+    lines = failure_lines([refused("a.pcd"), refused("b.pcd"), refused("c.pcd", message="too large")])
+    assert len(lines) == 2
+    assert "2 cells" in lines[0]
+
+
+def test_holders_in_json() -> None:
+    assert json_output.Holder.of(NDT) == json_output.Holder(
+        "00000000000000ab", 42, 1000, user_name(1000), "ndt", "python3", 30, 921600
+    )
