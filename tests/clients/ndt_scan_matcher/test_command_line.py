@@ -51,12 +51,32 @@ def test_align_prints_json(files: dict[str, Path], scan: str, capsys: pytest.Cap
 def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     code = main(
         [
-            "align", "--map", str(files["map.npz"]), "--scan", str(files["scan.npz"]), "--guess", GUESS,
-            "--leaf", "2", "--epsilon", "0.05", "--max-iterations", "20", "--step-size", "0.2",
-            "--variant", "pclomp", "--neighbors", "direct7", "--line-search", "--max-points", "700",
-            "--backend", "numpy",
+            "align",
+            "--map",
+            str(files["map.npz"]),
+            "--scan",
+            str(files["scan.npz"]),
+            "--guess",
+            GUESS,
+            "--leaf",
+            "2",
+            "--epsilon",
+            "0.05",
+            "--max-iterations",
+            "20",
+            "--step-size",
+            "0.2",
+            "--variant",
+            "pclomp",
+            "--neighbors",
+            "direct7",
+            "--line-search",
+            "--max-points",
+            "700",
+            "--backend",
+            "numpy",
         ]
-    )  # fmt: skip
+    )
     out = capsys.readouterr().out
     assert code == 0
     assert "T_map_base" in out

@@ -23,7 +23,7 @@ from shmmap_clients.ndt_scan_matcher import (
     VoxelMap,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import derive
+from shmmap_clients.ndt_scan_matcher.backends.kernels import derive
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
@@ -143,9 +143,14 @@ def test_more_poses_than_the_limit_are_refused_at_once_and_split_by_the_matcher(
 
 def test_limits_that_make_no_sense_are_refused() -> None:
     wrong: tuple[dict[str, Any], ...] = (
-        {"map_bytes": 0}, {"poses": 0}, {"poses": 100_000}, {"deadline_s": 0.0}, {"deadline_s": -1.0},
-        {"deadline_s": math.inf}, {"deadline_s": math.nan},
-    )  # fmt: skip
+        {"map_bytes": 0},
+        {"poses": 0},
+        {"poses": 100_000},
+        {"deadline_s": 0.0},
+        {"deadline_s": -1.0},
+        {"deadline_s": math.inf},
+        {"deadline_s": math.nan},
+    )
     for given in wrong:
         with pytest.raises(shmmap.BadRequest):
             Limits(**given)
@@ -183,11 +188,21 @@ def test_a_drive_counts_what_each_limit_left_out() -> None:
     for cut in (Cut(points=3), Cut(points=1, deadline=True), Cut(voxels=5, map_bytes=500), Cut()):
         statistics.add(
             Frame(
-                name="scan", stamp_s=0.0, result=dataclasses.replace(result, cut=cut), T_guess=np.eye(4),
-                T_truth=None, state="uncertain", relocalized=False, clock_jumped=False,
-                thin_s=0.0, map_s=0.0, align_s=0.0, relocalize_s=0.0, waited=False,
+                name="scan",
+                stamp_s=0.0,
+                result=dataclasses.replace(result, cut=cut),
+                T_guess=np.eye(4),
+                T_truth=None,
+                state="uncertain",
+                relocalized=False,
+                clock_jumped=False,
+                thin_s=0.0,
+                map_s=0.0,
+                align_s=0.0,
+                relocalize_s=0.0,
+                waited=False,
             )
-        )  # fmt: skip
+        )
     summary = statistics.summary(UpdateStatistics(), 0, TrustLimits(nvtl=1.0), backend="opencl")
     assert summary.cut_frames == 3
     assert summary.cut_by == {"points": 2, "deadline": 1, "voxels": 1, "map_bytes": 1}

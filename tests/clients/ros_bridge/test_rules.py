@@ -69,7 +69,7 @@ def test_what_a_client_was_sent_is_what_it_holds() -> None:
 def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
     requesters = Requesters(most=2)
     for client in ("one", "two", "one", "three"):
-        requesters.answered(who, [], [], {"a": 1})
+        requesters.answered(client, [], [], {"a": 1})
     assert len(requesters) == 2
     assert [requesters.held(client, ["a"], {"a": 5})[0].version for client in ("one", "two", "three")] == [
         1,
@@ -97,8 +97,9 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
             assert waiting.put(request("other"))
     taken = [waiting.get() for _ in range(len(waiting))]
     assert [(one.requester.name, one.message) for one in taken] == [
-        ("other", 0), *(("flood", number) for number in range(3, MOST_OF_ONE + 3)),
-    ]  # fmt: skip
+        ("other", 0),
+        *(("flood", number) for number in range(3, MOST_OF_ONE + 3)),
+    ]
     assert not waiting
     for number in range(MOST_WAITING):
         assert waiting.put(request(f"{number}"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
@@ -43,8 +43,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from shmmap import Client
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
+    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
     from shmmap_clients.pose_initializer import Relocalizer
     from shmmap_clients.scans.scan_sequence import Scan
 
@@ -113,21 +116,16 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
     from shmmap_clients.ndt_scan_matcher.drive.drive_summary import frame_document
     from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame, Tracking
-    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher
-    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import PosePublisher
     from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.scans.trajectory import read_route, tum_line
-    from shmmap_clients.streams import is_endpoint
 
     plot = DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: a publisher may wait for this program's subscription
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
-        listener = None
-        if args.odometry is not None and is_endpoint(args.odometry):
-            listener = OdometrySubscriber(args.odometry)
-            stack.callback(listener.close)
+        listener = _odometry(args, stack)
         drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
         tum = drive.open_text(str(args.tum)) if args.tum else None
         if publisher is not None and args.listener_wait > 0:
@@ -138,22 +136,9 @@ def run(args: argparse.Namespace) -> int:
         T_first, known = _start(args, first)
         prediction = _prediction(args, T_first, listener, drive.scans)
         matcher = stack.enter_context(matcher_from(args))
-        rules = MapRules(
-            args.update_distance,
-            args.map_radius,
-            args.lidar_radius,
-            args.leaf,
-            matcher.limits.voxels,
-            max_bytes=matcher.limits.most_map_bytes,
-        )
         client = stack.enter_context(connect(args, "shmmap-ndt"))
-        maps = stack.enter_context(
-            MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
-        )
-        relocalizer = None
-        by_default = args.rough is not None or not is_endpoint(args.scans)
-        if by_default if args.relocalize is None else args.relocalize:
-            relocalizer = _relocalizer(args, stack)
+        maps = stack.enter_context(_map_updater(args, client, matcher, route))
+        relocalizer = _relocalizer(args, stack)
         follower = Follower(
             matcher,
             maps,
@@ -190,6 +175,38 @@ def run(args: argparse.Namespace) -> int:
         print_summary(summary, drive.reader.left_out)
     allowed = summary.no_map if args.allow_empty else 0
     return 0 if summary.trustworthy + allowed == summary.frames and not summary.too_slow else 1
+
+
+def _odometry(args: argparse.Namespace, stack: contextlib.ExitStack) -> OdometrySubscriber | None:
+    """Return the odometry of an endpoint; None where it is in a file, or there is none."""
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
+    from shmmap_clients.streams import is_endpoint
+
+    if args.odometry is None or not is_endpoint(args.odometry):
+        return None
+    listener = OdometrySubscriber(args.odometry)
+    stack.callback(listener.close)
+    return listener
+
+
+def _map_updater(
+    args: argparse.Namespace,
+    client: Client,
+    matcher: NdtMatcher,
+    route: NDArray[np.float64] | Sequence[tuple[float, float]],
+) -> MapUpdater:
+    """Return what keeps the map around the vehicle."""
+    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+
+    rules = MapRules(
+        args.update_distance,
+        args.map_radius,
+        args.lidar_radius,
+        args.leaf,
+        matcher.limits.voxels,
+        max_bytes=matcher.limits.most_map_bytes,
+    )
+    return MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
 
 
 def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], bool]:
@@ -231,10 +248,17 @@ def _prediction(
     return Odometry(T_first, lambda: read)
 
 
-def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer:
-    """Return what searches for a lost vehicle; it has a session of its own from the first search on."""
-    from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
+def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer | None:
+    """Return what searches for a lost vehicle, if that is wanted.
 
+    It has a session of its own from the first search on.
+    """
+    from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
+    from shmmap_clients.streams import is_endpoint
+
+    by_default = args.rough is not None or not is_endpoint(args.scans)
+    if not (by_default if args.relocalize is None else args.relocalize):
+        return None
     rules = InitializerRules(map_radius=args.map_radius, leaf=args.leaf, height=args.height)
 
     def initializer() -> PoseInitializer:
