@@ -43,11 +43,6 @@ HOW = Scoring("radius", "autoware")
 
 
 @pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
-
-
-@pytest.fixture(scope="module")
 def scan() -> NDArray[np.float64]:
     return scan_from(street(seed=7), TRUTH, 800)
 

@@ -36,7 +36,7 @@ from shmmap_clients.ndt_scan_matcher.backends.registry import FallbackBackend
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street, worth
+from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, worth
 from tests.support.opencl_device import need_device
 from tests.support.process_costs import anonymous_bytes, descriptors
 
@@ -49,11 +49,6 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture(scope="module", autouse=True)
 def device() -> None:
     need_device()
-
-
-@pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
 
 
 def program_with(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
