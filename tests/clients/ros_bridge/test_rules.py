@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
-from shmmap_clients.ros_bridge import names
+from shmmap_clients.ros_bridge import participant
 from shmmap_clients.ros_bridge.catalogue import Requesters
 from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
@@ -125,10 +125,10 @@ def test_clients_take_turns() -> None:
 
 
 def test_names_in_full() -> None:
-    assert names.resolved("a/b_1", "/map") == "/map/a/b_1"
-    assert names.resolved("/a", "/map") == "/a"
-    assert names.resolved("a", "/") == "/a"
-    assert (names.request_topic("/a"), names.reply_topic("/a"), names.topic("/a")) == (
+    assert participant.resolved("a/b_1", "/map") == "/map/a/b_1"
+    assert participant.resolved("/a", "/map") == "/a"
+    assert participant.resolved("a", "/") == "/a"
+    assert (participant.request_topic("/a"), participant.reply_topic("/a"), participant.topic("/a")) == (
         "rq/aRequest",
         "rr/aReply",
         "rt/a",
@@ -140,15 +140,15 @@ def test_names_in_full() -> None:
 )
 def test_names_that_are_none(name: str) -> None:
     with pytest.raises(shmmap.BadRequest):
-        names.resolved(name, "/map")
+        participant.resolved(name, "/map")
     with pytest.raises(shmmap.BadRequest):
-        names.resolved("a", name if name != "/" else "//")
+        participant.resolved("a", name if name != "/" else "//")
 
 
 def test_a_node_s_name_has_no_slash() -> None:
-    assert names.node_name("loader") == "loader"
+    assert participant.node_name("loader") == "loader"
     with pytest.raises(shmmap.BadRequest):
-        names.node_name("/loader")
+        participant.node_name("/loader")
 
 
 def test_settings_are_the_user_s_and_those_of_ros() -> None:
