@@ -129,7 +129,7 @@ def test_a_hoarder_meets_its_quota_and_others_get_theirs(
         del held
 
 
-def test_errors_say_where_nobody_answers(cpp_program: Path) -> None:
+def test_errors_say_where_no_daemon_answers(cpp_program: Path) -> None:
     with pytest.raises(shmmap.NoSocket, match=r"/nowhere/shmmap\.sock"):
         CppClient(cpp_program, "/nowhere/shmmap.sock")
     with pytest.raises(shmmap.NoSocket, match="107 bytes"):

@@ -270,7 +270,7 @@ def test_a_map_is_written_in_advance_and_the_old_one_stays(
         before = worth(there, NEAR, how)
         assert there.uploads.writes == writes + 1, "all was done in advance"
         assert off(before, worth(ready("numba", last, scan), NEAR, how)) <= 1e-12
-    assert there.uploads.laid_out_anew == 0
+    assert there.uploads.laid_out_again == 0
 
 
 def test_a_map_that_another_was_prepared_in_place_of_is_written_again(
@@ -369,7 +369,7 @@ def test_a_write_that_fails_leaves_nothing_behind(
         with pytest.raises(DeviceError):
             there.prepare(voxel_map, how)
     assert there.maps.used_bytes == used
-    assert there.uploads.laid_out_anew == 0
+    assert there.uploads.laid_out_again == 0
     there.prepare(voxel_map, how)
     there.set_map(voxel_map)
     assert off(worth(there, NEAR, how), worth(ready("numba", voxel_map, scan), NEAR, how)) <= 1e-12

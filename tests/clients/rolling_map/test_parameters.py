@@ -219,7 +219,7 @@ def test_version_2_is_refused_with_the_names_of_version_1(read: Any) -> None:
         ("#" * (1 << 20) + "\n", "larger than a parameter file"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(read: Any, text: str, said: str) -> None:
+def test_what_is_wrong_is_reported_with_its_place(read: Any, text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         read(text)
 

@@ -81,7 +81,7 @@ JSON (fields may be added, none is removed).
    "map_prepare_ms": its part of the backend: spread each,
    "map_updates", "cells_added", "cells_removed", "map_private_bytes",
    "map_written_bytes", "map_writes": to a device,
-   "map_laid_out_anew": maps written again for lack of room}}
+   "map_laid_out_again": maps written again for lack of room}}
   A spread is {{"mean", "variance", "p50", "p99", "max"}}; ate is the distance
   of the poses to the true ones in metres, or degrees.
 --json-lines writes a line for each scan, as soon as it is localized:
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: a publisher may wait for this program's subscription
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
-        listener = _odometry(args, stack)
+        subscriber = _odometry(args, stack)
         drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
         tum = drive.open_text(str(args.tum)) if args.tum else None
         if publisher is not None and args.listener_wait > 0:
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
         if first is None:
             return drive.no_scans()
         T_first, known = _start(args, first)
-        prediction = _prediction(args, T_first, listener, drive.scans)
+        prediction = _prediction(args, T_first, subscriber, drive.scans)
         matcher = stack.enter_context(matcher_from(args))
         client = stack.enter_context(connect(args, "shmmap-ndt"))
         maps = stack.enter_context(_map_updater(args, client, matcher, route))
@@ -152,8 +152,8 @@ def run(args: argparse.Namespace) -> int:
         report = FollowReport(drive, client, matcher, maps, relocalizer, hint)
 
         def step(scan: Scan) -> Frame:
-            if listener is not None and args.odometry_wait > 0:
-                listener.wait_until(scan.stamp_s, args.odometry_wait)
+            if subscriber is not None and args.odometry_wait > 0:
+                subscriber.wait_until(scan.stamp_s, args.odometry_wait)
             frame = follower.follow(scan)
             if args.plot:
                 plot.add(frame)
@@ -184,9 +184,9 @@ def _odometry(args: argparse.Namespace, stack: contextlib.ExitStack) -> Odometry
 
     if args.odometry is None or not is_endpoint(args.odometry):
         return None
-    listener = OdometrySubscriber(args.odometry)
-    stack.callback(listener.close)
-    return listener
+    subscriber = OdometrySubscriber(args.odometry)
+    stack.callback(subscriber.close)
+    return subscriber
 
 
 def _map_updater(
@@ -225,7 +225,7 @@ def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], 
 def _prediction(
     args: argparse.Namespace,
     T_first: NDArray[np.float64],
-    listener: OdometrySubscriber | None,
+    subscriber: OdometrySubscriber | None,
     source: Iterable[Scan],
 ) -> MotionPrediction:
     """Return what predicts the next pose; the first velocity is the truth's, or that of the route's times."""
@@ -234,8 +234,8 @@ def _prediction(
     from shmmap_clients.scans.scan_sequence import ScanSequence
     from shmmap_clients.scans.trajectory import read_trajectory
 
-    if listener is not None:
-        return Odometry(T_first, lambda: listener.trajectory)
+    if subscriber is not None:
+        return Odometry(T_first, lambda: subscriber.trajectory)
     if args.odometry is None:
         truth = source.trajectory if isinstance(source, ScanSequence) else None
         if truth is not None:
