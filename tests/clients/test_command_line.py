@@ -112,8 +112,11 @@ def test_no_returns_are_left_out_and_counted(tmp_path: Path, capsys: pytest.Capt
         assert compare([*words, "--out", f"{tmp_path}/out"]) == 0
         found = json.loads(capsys.readouterr().out)
         assert {name: found[name] for name in ("points", "kept", "too_near", "not_finite")} == {
-            "points": 4011, "kept": 11, "too_near": 67, "not_finite": 3
-        }  # fmt: skip
+            "points": 4011,
+            "kept": 11,
+            "too_near": 67,
+            "not_finite": 3,
+        }
         index = read_cloud(tmp_path / "out" / "scan.pcd").columns["index"]
         assert index.tolist() == [*range(len(scan) - 11, len(scan))], "rows of the file"
         assert compare([*words, "--min-range", "0.3"]) == 0

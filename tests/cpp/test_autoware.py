@@ -190,7 +190,7 @@ def test_ids_that_were_not_handed_out_here(
     assert inside not in [line[0] for line in of(answer, "remove")]
 
 
-def test_a_node_that_begins_anew_gets_everything(
+def test_a_node_that_restarts_receives_everything(
     daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
@@ -202,10 +202,10 @@ def test_a_node_that_begins_anew_gets_everything(
 
 
 @pytest.mark.parametrize("kill", [False, True])
-def test_a_daemon_that_begins_anew(
+def test_a_daemon_that_restarts(
     daemon: DaemonFactory, node: AutowareNode, divided_map: DividedMap, *, kill: bool
 ) -> None:
-    """Versions are the same in its next life: only what has changed comes, and what is gone is removed."""
+    """Versions are the same after its restart: only what has changed comes, and what is gone is removed."""
     one = daemon(divided_map.root)
     node.ask("loader", one.endpoint, 60, 30)
     node.ask("update", *EVERYTHING)

@@ -39,8 +39,11 @@ def run(program: Path, endpoint: str, *words: object) -> list[str]:
     """What an example prints."""
     done = subprocess.run(
         [program, *map(str, words)],
-        env={**os.environ, "SHMMAP_ENDPOINT": endpoint}, check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        env={**os.environ, "SHMMAP_ENDPOINT": endpoint},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     assert done.stderr == ""
     return done.stdout.splitlines()
 

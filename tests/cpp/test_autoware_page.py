@@ -121,8 +121,15 @@ def check(source: str, folder: Path) -> None:
 
 def test_every_block_is_tested() -> None:
     assert set(PAGE.blocks) == {
-        "serve", "patch", "options", "proposal", "proposal-ndt", "proposal-update", "ndt-leaves", "pcl-cloud",
-    }  # fmt: skip
+        "serve",
+        "patch",
+        "options",
+        "proposal",
+        "proposal-ndt",
+        "proposal-update",
+        "ndt-leaves",
+        "pcl-cloud",
+    }
     assert len(re.findall(r"^```\w+$", PAGE.text, re.MULTILINE)) == len(PAGE.blocks)
 
 

@@ -26,10 +26,17 @@ from tests.support.divided_map import DividedMap
 from tests.support.skips import open3d_or_skip
 
 LAYERS = (
-    "points", "crop(z_min=-1.0, z_max=3.0)", "denoise(neighbors=10)", "elevation(resolution=1.0)",
-    "ground(resolution=1.0)", "ndt(leaf=2.0)", "normals(radius=1.0)", "sample(count=100)", "search(leaf=1.0)",
+    "points",
+    "crop(z_min=-1.0, z_max=3.0)",
+    "denoise(neighbors=10)",
+    "elevation(resolution=1.0)",
+    "ground(resolution=1.0)",
+    "ndt(leaf=2.0)",
+    "normals(radius=1.0)",
+    "sample(count=100)",
+    "search(leaf=1.0)",
     "voxel(leaf=1.0)",
-)  # fmt: skip
+)
 QUICK_LAYERS = tuple(layer for layer in LAYERS if not layer.startswith(("denoise", "normals")))
 MUTATIONS = int(os.environ.get("SHMMAP_TEST_MUTATIONS", "50000"))
 """Mutated messages of each kind; a million takes some minutes."""
@@ -122,7 +129,7 @@ def test_a_hoarder_meets_its_quota_and_others_get_theirs(
         del held
 
 
-def test_errors_say_where_nobody_answers(cpp_program: Path) -> None:
+def test_errors_say_where_no_daemon_answers(cpp_program: Path) -> None:
     with pytest.raises(shmmap.errors.NoSocket, match=r"/nowhere/shmmap\.sock"):
         CppClient(cpp_program, "/nowhere/shmmap.sock")
     with pytest.raises(shmmap.errors.NoSocket, match="107 bytes"):
@@ -184,9 +191,20 @@ def test_messages_that_are_wrong(program: CppProgram) -> None:
         ["e.pcd", "points", "offline", "no"],
     ]
     reply = [
-        "cells", 3, 5, 7, [handle] * 3, ["a.pcd"], bytes(range(8)), [["b.pcd", "points"]], failed,
-        ["points"], False, "offline", later,
-    ]  # fmt: skip
+        "cells",
+        3,
+        5,
+        7,
+        [handle] * 3,
+        ["a.pcd"],
+        bytes(range(8)),
+        [["b.pcd", "points"]],
+        failed,
+        ["points"],
+        False,
+        "offline",
+        later,
+    ]
     row = ["-20_20.pcd", 2**63, -20.0, 20.0, 0.0, 40.0, 8192, -1.0, None]
     page = ["metadata_page", 3, 5, 7, [row] * 3, 3, True, ["a.pcd"], later]
     event = ["loaded", 17, 2**63, 10**18, "a.pcd", "points", 2**63, 8192, 500, 10**6, False, 0, later]

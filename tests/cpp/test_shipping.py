@@ -48,8 +48,11 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([sys.executable, "-m", "venv", where], check=True, env=without_settings())
     done = subprocess.run(
         [where / "bin" / "pip", "install", "-q", "--no-deps", ROOT],
-        check=False, capture_output=True, text=True, env=without_settings(),
-    )  # fmt: skip
+        check=False,
+        capture_output=True,
+        text=True,
+        env=without_settings(),
+    )
     if "satisfies the requirement hatchling" in done.stderr:
         pytest.skip("pip cannot reach hatchling, which builds the wheel")
     assert done.returncode == 0, done.stderr

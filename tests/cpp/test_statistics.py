@@ -70,22 +70,35 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
     assert len(rows(answer, "histogram")) == len(python.histograms) > 0
     cells = [
         [
-            cell.id, cell.layer, cell.segment, str(cell.version), str(cell.bytes), str(cell.points),
-            str(1 + STATES.index(cell.state)), str(cell.hits), " ".join(f"{side:.17g}" for side in cell.box),
+            cell.id,
+            cell.layer,
+            cell.segment,
+            str(cell.version),
+            str(cell.bytes),
+            str(cell.points),
+            str(1 + STATES.index(cell.state)),
+            str(cell.hits),
+            " ".join(f"{side:.17g}" for side in cell.box),
             str(int(cell.ahead)),
         ]
         for cell in python.cells
-    ]  # fmt: skip
+    ]
     assert sorted(rows(answer, "cell")) == sorted(cells)
     assert len(cells) > 10
     assert {cell.ahead for cell in python.cells} == {False, True}
     (listed,) = python.clients
     assert rows(answer, "client") == [
         [
-            str(listed.session), str(listed.pid), str(listed.uid), str(listed.cells), str(listed.bytes),
-            "somebody", listed.command, "1.5",
+            str(listed.session),
+            str(listed.pid),
+            str(listed.uid),
+            str(listed.cells),
+            str(listed.bytes),
+            "somebody",
+            listed.command,
+            "1.5",
         ]
-    ]  # fmt: skip
+    ]
 
 
 def test_how_the_daemon_is(daemon: DaemonFactory, program: CppProgram, divided_map: DividedMap) -> None:

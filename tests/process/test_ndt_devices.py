@@ -67,7 +67,7 @@ def test_a_drive_is_followed_on_a_device_as_without(
             assert summary["map_written_bytes"] > 100_000
         else:
             assert summary["map_writes"] == summary["map_written_bytes"] == 0
-        assert summary["map_laid_out_anew"] == 0
+        assert summary["map_laid_out_again"] == 0
         found[way] = poses(lines)
     for way in ("copy", "svm"):
         np.testing.assert_allclose(found[way], found["numba"], atol=1e-9)

@@ -196,10 +196,20 @@ class CompareMapFilter:
         explained = np.empty(len(scan), np.bool_)
         table = self._table
         self._explain(
-            scan, pose, self.rule.code, self.rule.distance, self.rule.distance_z, table.leaf, table.rows,
-            table.bin_columns, *table.bin_first, *table.bin_shape, table.bin_start, table.bin_cells,
+            scan,
+            pose,
+            self.rule.code,
+            self.rule.distance,
+            self.rule.distance_z,
+            table.leaf,
+            table.rows,
+            table.bin_columns,
+            *table.bin_first,
+            *table.bin_shape,
+            table.bin_start,
+            table.bin_cells,
             explained,
-        )  # fmt: skip
+        )
         return explained
 
 

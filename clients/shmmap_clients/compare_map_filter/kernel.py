@@ -69,10 +69,22 @@ _SIGNATURES: Final = [types.void(read_only(t, 2), *_ARGUMENTS) for t in (types.f
 
 @compiled(*_SIGNATURES)
 def explain(
-    points: Any, T: Any, mode: Any, d: Any, d_z: Any, leaf: Any, rows: Any, bin_columns: Any,
-    bin_first_x: Any, bin_first_y: Any, bins_x: Any, bins_y: Any, bin_start: Any, bin_cells: Any,
+    points: Any,
+    T: Any,
+    mode: Any,
+    d: Any,
+    d_z: Any,
+    leaf: Any,
+    rows: Any,
+    bin_columns: Any,
+    bin_first_x: Any,
+    bin_first_y: Any,
+    bins_x: Any,
+    bins_y: Any,
+    bin_start: Any,
+    bin_cells: Any,
     explained: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Say of each point whether the map explains it; see `rule.explain`, which this equals."""
     inverse = 1.0 / leaf
     inverse_z = 1.0 / d_z

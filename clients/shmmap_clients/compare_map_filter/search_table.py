@@ -146,13 +146,18 @@ class SearchTable:
         rows = np.array(
             [
                 (
-                    cell.xyz.ctypes.data, cell.tile.ctypes.data, cell.start.ctypes.data,
-                    cell.tile.shape[1], cell.tile.shape[0], *cell.first, cell.xyz.dtype.itemsize == 8,
+                    cell.xyz.ctypes.data,
+                    cell.tile.ctypes.data,
+                    cell.start.ctypes.data,
+                    cell.tile.shape[1],
+                    cell.tile.shape[0],
+                    *cell.first,
+                    cell.xyz.dtype.itemsize == 8,
                 )
                 for cell in cells
             ],
             np.int64,
-        )  # fmt: skip
+        )
         low = np.array([cell.first for cell in cells], np.int64) - _REACH_COLUMNS
         high = np.array([cell.columns_end for cell in cells], np.int64) + _REACH_COLUMNS
         # about a cell in each bin, and never more bins than a cache holds
@@ -172,6 +177,12 @@ class SearchTable:
         bins, members = np.array(sorted(entries), np.int64).T
         start = np.searchsorted(bins, np.arange(int(shape[0]) * int(shape[1]) + 1)).astype(np.int32)
         return cls(
-            cells, rows, cells[0].leaf, wide, (int(first[0]), int(first[1])), (int(shape[0]), int(shape[1])),
-            start, members.astype(np.int32),
-        )  # fmt: skip
+            cells,
+            rows,
+            cells[0].leaf,
+            wide,
+            (int(first[0]), int(first[1])),
+            (int(shape[0]), int(shape[1])),
+            start,
+            members.astype(np.int32),
+        )

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -33,7 +34,8 @@ from shmmap_clients.command_line import (
 from shmmap_clients.shared_options import add_quiet_option
 
 if TYPE_CHECKING:
-    from shmmap_clients.elevation_map.build import BuildProgress
+    from shmmap import Client
+    from shmmap_clients.elevation_map.build import BuildProgress, BuiltElevation
     from shmmap_clients.elevation_map.heights import ElevationRule
 
 __all__ = ["main"]
@@ -81,6 +83,28 @@ def _add_build(subparsers: Any) -> None:
     parser.add_argument(
         "--hillshade", type=output_file, metavar="FILE", help="write a shaded relief (PNG) and its world file"
     )
+    _add_height_options(parser)
+    parser.add_argument(
+        "--epsg", type=at_least(1), metavar="CODE", help="coordinate system to name in a GeoTIFF"
+    )
+    parser.add_argument(
+        "--cache", metavar="DIR", help="where heights are kept (default: $XDG_CACHE_HOME/shmmap/elevation)"
+    )
+    parser.add_argument(
+        "--wait",
+        type=seconds,
+        default=60.0,
+        metavar="SECONDS",
+        help="how long to wait for one cell (default: 60)",
+    )
+    add_quiet_option(parser)
+    add_allow_empty(parser)
+    add_json_option(parser)
+    add_daemon_options(parser, json=False)
+
+
+def _add_height_options(parser: argparse.ArgumentParser) -> None:
+    """Add what the height of a column is."""
     rule = parser.add_argument_group("heights")
     rule.add_argument(
         "--rule",
@@ -120,23 +144,6 @@ def _add_build(subparsers: Any) -> None:
         metavar="M",
         help="fill in the height of columns without one, at most this far from columns with one (default: 1)",
     )
-    parser.add_argument(
-        "--epsg", type=at_least(1), metavar="CODE", help="coordinate system to name in a GeoTIFF"
-    )
-    parser.add_argument(
-        "--cache", metavar="DIR", help="where heights are kept (default: $XDG_CACHE_HOME/shmmap/elevation)"
-    )
-    parser.add_argument(
-        "--wait",
-        type=seconds,
-        default=60.0,
-        metavar="SECONDS",
-        help="how long to wait for one cell (default: 60)",
-    )
-    add_quiet_option(parser)
-    add_allow_empty(parser)
-    add_json_option(parser)
-    add_daemon_options(parser, json=False)
 
 
 def _build(args: argparse.Namespace) -> int:
@@ -144,7 +151,6 @@ def _build(args: argparse.Namespace) -> int:
     import numpy as np
 
     from shmmap import BadRequest
-    from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
     from shmmap_clients.elevation_map.grid import FILLED, MEASURED
     from shmmap_clients.elevation_map.heights import ElevationRule
     from shmmap_clients.elevation_map.holes import fill_reach
@@ -159,18 +165,10 @@ def _build(args: argparse.Namespace) -> int:
         raise BadRequest(f"{args.hillshade}: a hillshade is written as .png")
     fill_reach(args.fill_radius / rule.resolution)
     with ProgressLine(quiet=args.quiet, written_over=sys.stderr.isatty()) as line:
-        progress = _Progress(line, "points" if args.rule == "surface" else "columns")
         with connect(args, _NAME) as client:
-            for attempt in range(_ATTEMPTS):
-                try:
-                    with writing_errors("the cache of elevation maps"):
-                        built = build_elevation_map(
-                            client, rule, _cache(args.cache), wait_s=args.wait, progress=progress
-                        )
-                    break
-                except MapChanged:
-                    if attempt == _ATTEMPTS - 1:
-                        raise
+            built = _built(
+                args, client, rule, _Progress(line, "points" if args.rule == "surface" else "columns")
+            )
             extent = map_extent(client)
         grid = built.grid
         document = {
@@ -190,38 +188,66 @@ def _build(args: argparse.Namespace) -> int:
         for _, _, kind in grid.blocks(args.fill_radius):
             counts += np.bincount(kind.ravel(), minlength=3)
     measured = int(counts[MEASURED])
-    share = measured / built.occupied if built.occupied else None
     written = [*files, *([args.hillshade] if args.hillshade else [])]
-    summary = {
-        "map_version": document["map_version"],
-        "cells": built.cells,
-        "loaded": built.loaded,
-        "rows": grid.shape[0],
-        "columns": grid.shape[1],
-        "resolution": grid.resolution,
-        "origin": list(grid.origin),
-        "occupied": built.occupied,
-        "measured": measured,
-        "measured_share": share,
-        "filled": int(counts[FILLED]),
-        "stray": built.stray,
-        "failed": [
-            {"id": error.cell_id, "code": error.code, "message": str(error)} for error in built.failed
-        ],
-        "far": [{"id": cell, "metres": metres} for cell, metres in built.far],
-        "files": [str(path) for path in written],
-    }
+    _report(args, built, measured, int(counts[FILLED]), [str(path) for path in written])
+    code = 1 if built.failed else 0
+    if not measured:
+        why = "no cell has a point" if not built.occupied else _sparse(rule, measured, built.occupied)
+        return max(code, nothing_found(args, f"no column has a height: {why}; {extent}", name=_NAME))
+    if measured < _FEW * built.occupied:
+        complain(_NAME, f"warning: {_sparse(rule, measured, built.occupied)}")
+    return code
+
+
+def _built(
+    args: argparse.Namespace, client: Client, rule: ElevationRule, progress: Callable[[BuildProgress], None]
+) -> BuiltElevation:
+    """Return the elevation of the whole map; where the map changes meanwhile, that of the changed one."""
+    from shmmap_clients.elevation_map.build import MapChanged, build_elevation_map
+
+    def build() -> BuiltElevation:
+        with writing_errors("the cache of elevation maps"):
+            return build_elevation_map(client, rule, _cache(args.cache), wait_s=args.wait, progress=progress)
+
+    for _ in range(_ATTEMPTS - 1):
+        with contextlib.suppress(MapChanged):
+            return build()
+    return build()
+
+
+def _report(
+    args: argparse.Namespace, built: BuiltElevation, measured: int, filled: int, written: list[str]
+) -> None:
+    """Print the summary, and on stderr what is missing."""
+    grid = built.grid
     if args.json:
+        summary = {
+            "map_version": f"{built.map_version:016x}",
+            "cells": built.cells,
+            "loaded": built.loaded,
+            "rows": grid.shape[0],
+            "columns": grid.shape[1],
+            "resolution": grid.resolution,
+            "origin": list(grid.origin),
+            "occupied": built.occupied,
+            "measured": measured,
+            "measured_share": measured / built.occupied if built.occupied else None,
+            "filled": filled,
+            "stray": built.stray,
+            "failed": [
+                {"id": error.cell_id, "code": error.code, "message": str(error)} for error in built.failed
+            ],
+            "far": [{"id": cell, "metres": metres} for cell, metres in built.far],
+            "files": written,
+        }
         print_json(summary)
     else:
         print(
             f"{built.cells} cells, {built.loaded} loaded: {grid.shape[1]} x {grid.shape[0]} columns of"
             f" {grid.resolution:g} m, {built.occupied} with points, {measured} with a height,"
-            f" {counts[FILLED]} more with heights filled in"
+            f" {filled} more with heights filled in"
         )
-        print_line(
-            f"wrote {', '.join(map(str, written))}" if written else "wrote nothing: name files with --out"
-        )
+        print_line(f"wrote {', '.join(written)}" if written else "wrote nothing: name files with --out")
         for error in built.failed:
             print_line(f"missing: {error}", file=sys.stderr)
     for cell, metres in built.far[:_NAMED]:
@@ -232,13 +258,6 @@ def _build(args: argparse.Namespace) -> int:
         )
     if len(built.far) > _NAMED:
         complain(_NAME, f"warning: {len(built.far) - _NAMED} more cells lie far from all others: left out")
-    code = 1 if built.failed else 0
-    if not measured:
-        why = "no cell has a point" if not built.occupied else _sparse(rule, measured, built.occupied)
-        return max(code, nothing_found(args, f"no column has a height: {why}; {extent}", name=_NAME))
-    if share is not None and share < _FEW:
-        complain(_NAME, f"warning: {_sparse(rule, measured, built.occupied)}")
-    return code
 
 
 def _sparse(rule: ElevationRule, measured: int, occupied: int) -> str:

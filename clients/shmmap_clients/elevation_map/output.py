@@ -150,11 +150,19 @@ def _geotiff(
     ]
     with _interim(path) as interim:
         tifffile.imwrite(
-            interim, _tiles(grid, fill_radius), shape=grid.shape, dtype=np.float32, tile=(_TILE, _TILE),
-            photometric="minisblack", compression="zlib", metadata=None,
-            description=json.dumps(document), extratags=tags, bigtiff=math.prod(grid.shape) > 1 << 29,
+            interim,
+            _tiles(grid, fill_radius),
+            shape=grid.shape,
+            dtype=np.float32,
+            tile=(_TILE, _TILE),
+            photometric="minisblack",
+            compression="zlib",
+            metadata=None,
+            description=json.dumps(document),
+            extratags=tags,
+            bigtiff=math.prod(grid.shape) > 1 << 29,
             maxworkers=1,  # several would have a quarter of a gigabyte of tiles waiting for them
-        )  # fmt: skip
+        )
 
 
 def _tiles(grid: ElevationGrid, fill_radius: float) -> Iterator[NDArray[np.float32]]:

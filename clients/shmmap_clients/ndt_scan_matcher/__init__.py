@@ -10,6 +10,10 @@
     result = matcher.align(scan, T_guess)
 
 The same result as Autoware's, ndt_omp's or PCL's program, by the chosen variant; see `Settings`.
+
+To follow one alignment read ``matching/matcher.py``, ``matching/newton.py``, ``backends/numba_backend.py``,
+``backends/kernels.py``, ``matching/result.py``; it also enters ``matching/evaluation.py`` (pose vectors),
+``map/voxel_map.py`` (the kernel's table) and ``backends/backend.py`` (the scan's buffer).
 """
 
 from __future__ import annotations

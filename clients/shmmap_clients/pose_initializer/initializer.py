@@ -349,7 +349,7 @@ class PoseInitializer:
         if not self._window.complete:
             raise NoAnswer(
                 f"no cell around ({rough.x:.3f}, {rough.y:.3f}) was loaded within {self.rules.wait_s:g} s",
-                hint="`shmmap status` tells whether the daemon still loads, or has no memory left",
+                hint="`shmmap status` shows whether the daemon still loads, or has no memory left",
             )
         raise NoMapHere(
             f"no map within {self.rules.map_radius:g} m of the rough pose:"

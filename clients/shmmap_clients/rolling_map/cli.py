@@ -109,6 +109,13 @@ def _add_run(subparsers: Any) -> None:
         " map's)",
     )
     _add_filter_options(parser)
+    _add_output_options(parser)
+    add_allow_empty(parser)
+    add_json_option(parser)
+    add_daemon_options(parser, json=False)
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
     out = parser.add_argument_group("output")
     out.add_argument(
         "--picture",
@@ -132,9 +139,6 @@ def _add_run(subparsers: Any) -> None:
         help="how long to wait at the end until all scans are on the disk; 0: not at all (default: 30)",
     )
     add_quiet_option(out)
-    add_allow_empty(parser)
-    add_json_option(parser)
-    add_daemon_options(parser, json=False)
 
 
 def _add_filter_options(parser: argparse.ArgumentParser) -> None:

@@ -13,17 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap import (
-    Box,
-    ChunkInfo,
-    DaemonUnreachable,
-    LiveInterrupted,
-    LiveMap,
-    LiveMapper,
-    LiveMapRow,
-    ScanCounts,
-)
-from shmmap.errors import OverBudget
+from shmmap import Box, DaemonUnreachable
+from shmmap.errors import LiveInterrupted, OverBudget
+from shmmap.live import ChunkInfo, LiveMap, LiveMapper, LiveMapRow, ScanCounts
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import Decimated, RunningSpread
 

@@ -236,8 +236,9 @@ class Parameters(msgspec.Struct, frozen=True):
         """
         has: dict[str, float | str] = {"m_resolution": live.resolution, "map_frame": live.frame_id}
         wants: dict[str, float | str] = {
-            "m_resolution": self.live.resolution, "map_frame": self.live.frame_id,
-        }  # fmt: skip
+            "m_resolution": self.live.resolution,
+            "map_frame": self.live.frame_id,
+        }
         for theirs, ours in _OCCUPANCY.items():
             wants[theirs] = getattr(self.live.occupancy, ours)
             has[theirs] = getattr(live.occupancy, ours)
@@ -322,9 +323,12 @@ def _checked(name: str, entry: Entry) -> Value:
 
 
 def _made(
-    kind: Any, names: Mapping[str, str], values: Mapping[str, Value], entries: Mapping[str, Entry],
+    kind: Any,
+    names: Mapping[str, str],
+    values: Mapping[str, Value],
+    entries: Mapping[str, Entry],
     **others: Any,
-) -> Any:  # fmt: skip
+) -> Any:
     """Make a structure of the values; what it refuses is named as in the file, with the line."""
     given = {ours: values[name] for name, ours in names.items() if name in values}
     try:

@@ -25,8 +25,14 @@ SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
 MIN_RANGE_M: Final = 0.5
 """Programs leave out nearer points: no-returns at (0, 0, 0), and the vehicle's own parts."""
 _NO_ARCHIVE: Final = (
-    ValueError, KeyError, EOFError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
+    ValueError,
+    KeyError,
+    EOFError,
+    MemoryError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 _METRES: Final = {"xyz": 1.0, "xyz_4mm": 0.004}
 Columns = dict[str, NDArray[Any]]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A street of walls, ground and poles, cut into cells; and scans of it with known poses."""
+"""A street of walls, ground and poles, cut into cells; scans of it with known poses; frames of a drive."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 from shmmap_clients.ndt_scan_matcher import (
     Backend,
     Evaluation,
+    NdtMatcher,
     Scoring,
     VoxelCell,
     VoxelMap,
     matrix_from_pose,
     voxel_cell,
 )
+from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 
 Points = NDArray[np.float64]
 
@@ -64,3 +66,25 @@ def worth(backend: Backend, pose: NDArray[np.float64], scoring: Scoring) -> Eval
     """The evaluation of one pose."""
     (at,) = backend.evaluate(pose[None], scoring)
     return at
+
+
+def frame(number: int, T: NDArray[np.float64], truth: NDArray[np.float64] | None) -> Frame:
+    """Return a frame of a drive without a map."""
+    with NdtMatcher(backend="numpy") as matcher:
+        matcher.set_map(VoxelMap({}))
+        result = matcher.align(np.zeros((1, 3)), T)
+    return Frame(
+        name=f"scan_{number}",
+        stamp_s=0.1 * number,
+        result=result,
+        T_guess=T,
+        T_truth=truth,
+        state="lost",
+        relocalized=False,
+        clock_jumped=False,
+        thin_s=0.001,
+        map_s=0.0,
+        align_s=0.01 + number * 1e-3,
+        relocalize_s=0.0,
+        waited=number == 0,
+    )

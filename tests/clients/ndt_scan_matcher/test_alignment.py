@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
+import re
+import sys
+from pathlib import Path
+from types import FrameType
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from shmmap_clients import ndt_scan_matcher
 from shmmap_clients.ndt_scan_matcher import (
     Evaluation,
     Limits,
@@ -25,11 +31,6 @@ from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, st
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
-
-
-@pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +71,28 @@ def test_backends_take_the_same_way(
     np.testing.assert_allclose(a.transforms, b.transforms, atol=1e-8)
     np.testing.assert_allclose(a.nvtls, b.nvtls, rtol=1e-8)
     assert a.transform_probability == pytest.approx(b.transform_probability, rel=1e-8)
+
+
+def test_a_reader_follows_one_alignment_through_few_files(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
+    """The package's docstring lists them."""
+    folder, entered = Path(str(ndt_scan_matcher.__file__)).parent, set[str]()
+
+    def enter(frame: FrameType, event: str, _argument: object) -> None:
+        path = Path(frame.f_code.co_filename)
+        if event == "call" and folder in path.parents:
+            entered.add(str(path.relative_to(folder)))
+
+    with NdtMatcher() as matcher:
+        matcher.set_map(matcher.prepare(map_of(points, 2.0)))
+        sys.setprofile(enter)
+        try:
+            matcher.align(scan, GUESS)
+        finally:
+            sys.setprofile(None)
+    assert entered == set(re.findall(r"``(\w+/\w+\.py)``", str(ndt_scan_matcher.__doc__)))
+    assert len(entered) <= 8
 
 
 def test_autoware_and_fine_arrive(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:

@@ -128,15 +128,15 @@ def test_odometry_that_begins_again_is_another_run() -> None:
     assert steps[21:] == pytest.approx([0.3] * 19)
 
 
-def test_a_listener_forgets_odometry_of_before_the_clock_was_set_back(
+def test_a_subscriber_drops_odometry_from_before_the_clock_was_set_back(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
-    listener = OdometrySubscriber(f"ipc://{tmp_path_factory.mktemp('s')}/none")
+    subscriber = OdometrySubscriber(f"ipc://{tmp_path_factory.mktemp('s')}/none")
     try:
         for stamp in (100.0, 100.2, 100.1, 0.0, 0.1):
-            listener._take(pose_stream.PoseMessage(stamp, np.eye(4).ravel().tolist()))
-        assert listener.trajectory.stamps_s.tolist() == [0.0, 0.1]
-        assert not listener.wait_until(50.0, 0.0)
-        assert listener.wait_until(0.1, 0.0)
+            subscriber._take(pose_stream.PoseMessage(stamp, np.eye(4).ravel().tolist()))
+        assert subscriber.trajectory.stamps_s.tolist() == [0.0, 0.1]
+        assert not subscriber.wait_until(50.0, 0.0)
+        assert subscriber.wait_until(0.1, 0.0)
     finally:
-        listener.close()
+        subscriber.close()

@@ -51,12 +51,32 @@ def test_align_prints_json(files: dict[str, Path], scan: str, capsys: pytest.Cap
 def test_align_prints_text(files: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     code = main(
         [
-            "align", "--map", str(files["map.npz"]), "--scan", str(files["scan.npz"]), "--guess", GUESS,
-            "--leaf", "2", "--epsilon", "0.05", "--max-iterations", "20", "--step-size", "0.2",
-            "--variant", "pclomp", "--neighbors", "direct7", "--line-search", "--max-points", "700",
-            "--backend", "numpy",
+            "align",
+            "--map",
+            str(files["map.npz"]),
+            "--scan",
+            str(files["scan.npz"]),
+            "--guess",
+            GUESS,
+            "--leaf",
+            "2",
+            "--epsilon",
+            "0.05",
+            "--max-iterations",
+            "20",
+            "--step-size",
+            "0.2",
+            "--variant",
+            "pclomp",
+            "--neighbors",
+            "direct7",
+            "--line-search",
+            "--max-points",
+            "700",
+            "--backend",
+            "numpy",
         ]
-    )  # fmt: skip
+    )
     out = capsys.readouterr().out
     assert code == 0
     assert "T_map_base" in out
@@ -106,27 +126,15 @@ def test_a_pose_that_rests_on_little_is_not_trusted(
     assert set(json.loads(capsys.readouterr().out)["failed_limits"]) <= {"converged"}
 
 
-def test_the_help_has_the_limits_of_trust(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["align", "--help"])
-    said = dict(re.findall(r"--trust-(\w+) \w+\s[^(]*\(default:\s+([\d.]+)", capsys.readouterr().out))
-    limits = TrustLimits().for_leaf(2.0)
-    for name in ("points", "distance", "angle", "sharpness", "spread", "oscillations"):
-        assert float(said[name]) == getattr(limits, name)
-
-
 def test_the_help_has_the_limits_that_hold(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["align", "--help"])
-    said = re.findall(
-        r"--max-(points|neighbors|voxels) N\s[^(]*\(default:\s+(\d+)\)", capsys.readouterr().out
-    )
-    limits = Limits()
-    assert said == [
-        ("points", str(limits.source_points)),
-        ("neighbors", str(limits.neighbors)),
-        ("voxels", str(limits.voxels)),
-    ]
+    said = dict(re.findall(r"--((?:max|trust)-\w+) \w+\s[^(]*\(default:\s+([\d.]+)", capsys.readouterr().out))
+    limits, trust = Limits(), TrustLimits().for_leaf(2.0)
+    for name in ("points", "distance", "angle", "sharpness", "spread", "oscillations"):
+        assert float(said[f"trust-{name}"]) == getattr(trust, name)
+    most = {"points": limits.source_points, "neighbors": limits.neighbors, "voxels": limits.voxels}
+    assert {name: int(said[f"max-{name}"]) for name in most} == most
 
 
 def test_align_far_from_the_map_is_a_negative_answer(

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from shmmap_clients.command_line import complain
-from shmmap_clients.ndt_scan_matcher import NdtMatcher, TrustLimits, VoxelMap, matrix_from_pose
+from shmmap_clients.ndt_scan_matcher import TrustLimits, matrix_from_pose
 from shmmap_clients.ndt_scan_matcher.backends.backend import UploadStatistics
 from shmmap_clients.ndt_scan_matcher.cli.follow_report import FollowReport, print_summary
 from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
@@ -29,7 +29,6 @@ from shmmap_clients.ndt_scan_matcher.drive.drive_summary import (
     frame_document,
     pose_errors,
 )
-from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import ConstantVelocity, Odometry, interpolate
 from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher, decode_pose
 from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
@@ -38,6 +37,7 @@ from shmmap_clients.scans.trajectory import Trajectory
 from shmmap_clients.spread import KEPT
 
 import shmmap
+from tests.clients.ndt_scan_matcher.scene import frame
 
 
 def arc(count: int, step_s: float = 0.1) -> Trajectory:
@@ -47,27 +47,6 @@ def arc(count: int, step_s: float = 0.1) -> Trajectory:
     while len(poses) < count:
         poses.append(poses[-1] @ motion)
     return Trajectory(np.arange(count, dtype=np.float64) * step_s, np.array(poses))
-
-
-def frame(number: int, T: NDArray[np.float64], truth: NDArray[np.float64] | None) -> Frame:
-    with NdtMatcher(backend="numpy") as matcher:
-        matcher.set_map(VoxelMap({}))
-        result = matcher.align(np.zeros((1, 3)), T)
-    return Frame(
-        name=f"scan_{number}",
-        stamp_s=0.1 * number,
-        result=result,
-        T_guess=T,
-        T_truth=truth,
-        state="lost",
-        relocalized=False,
-        clock_jumped=False,
-        thin_s=0.001,
-        map_s=0.0,
-        align_s=0.01 + number * 1e-3,
-        relocalize_s=0.0,
-        waited=number == 0,
-    )
 
 
 def test_constant_velocity_continues_a_screw() -> None:
@@ -163,7 +142,7 @@ def test_summary_and_picture_of_a_drive(tmp_path: Path) -> None:
     uploads = UploadStatistics()
     updates = UpdateStatistics(uploads)
     updates.add(added=5, removed=2, request_s=0.1, build_s=0.01, prepare_s=0.004, private_bytes=1000)
-    uploads.written_bytes, uploads.writes, uploads.laid_out_anew = 123_456, 7, 1
+    uploads.written_bytes, uploads.writes, uploads.laid_out_again = 123_456, 7, 1
     statistics = DriveStatistics()
     for one in frames:
         statistics.add(one)
@@ -172,7 +151,7 @@ def test_summary_and_picture_of_a_drive(tmp_path: Path) -> None:
     assert summary.errors.ate_rmse_m < 1e-9
     assert (summary.frames, summary.waited, summary.too_slow) == (30, 1, 1)
     assert (summary.cells_added, summary.cells_removed, summary.map_private_bytes) == (5, 2, 1000)
-    assert (summary.map_written_bytes, summary.map_writes, summary.map_laid_out_anew) == (123_456, 7, 1)
+    assert (summary.map_written_bytes, summary.map_writes, summary.map_laid_out_again) == (123_456, 7, 1)
     assert summary.map_build_ms.max == pytest.approx(10.0)
     assert summary.map_prepare_ms.max == pytest.approx(4.0)
     assert summary.latency_ms.max == pytest.approx(11.0 + 29.0)
@@ -201,9 +180,9 @@ def test_the_summary_in_words_leaves_out_what_has_no_data(capsys: pytest.Capture
     updates.uploads.written_bytes, updates.uploads.writes = 5_360_000, 2
     print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
     assert "5.36 MB written in 2 writes\n" in capsys.readouterr().out
-    updates.uploads.laid_out_anew = 3
+    updates.uploads.laid_out_again = 3
     print_summary(statistics.summary(updates, 0, TrustLimits(nvtl=2.3)))
-    assert "5.36 MB written in 2 writes, laid out anew 3 times\n" in capsys.readouterr().out
+    assert "5.36 MB written in 2 writes, laid out again 3 times\n" in capsys.readouterr().out
     assert "updates: 1, cells added: 64, cells removed: 0" in out
     assert "0.06 MB at most, beside the shared memory" in out
     rows = [line.split("  ")[0] for line in out.splitlines() if " variance " in line]
@@ -256,16 +235,16 @@ def test_poses_and_odometry_travel(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/poses"
     drive = arc(5)
     with PosePublisher(address) as publisher:
-        listener = OdometrySubscriber(address)
+        odometry = OdometrySubscriber(address)
         try:
             assert publisher.wait_for_subscriber(60.0)
             for index, T in enumerate(drive.T_map_sensor):
                 publisher.send(frame(index, T, None))
-            assert listener.wait_until(float(drive.stamps_s[-1]), 60.0)
-            assert not listener.wait_until(float(drive.stamps_s[-1]) + 0.1, 0.0)
-            received = listener.trajectory
+            assert odometry.wait_until(float(drive.stamps_s[-1]), 60.0)
+            assert not odometry.wait_until(float(drive.stamps_s[-1]) + 0.1, 0.0)
+            received = odometry.trajectory
         finally:
-            listener.close()
+            odometry.close()
     np.testing.assert_allclose(received.T_map_sensor, drive.T_map_sensor)
     np.testing.assert_allclose(received.stamps_s, drive.stamps_s)
 

@@ -22,18 +22,13 @@ from shmmap_clients.ndt_scan_matcher.map.voxel_map import Covariance
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import Neighbors
 
 from tests.clients.ndt_scan_matcher.brute_force import rotation, score
-from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street
+from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from
 from tests.clients.ndt_scan_matcher.textbook import Textbook
 
 NEIGHBORS = ("direct1", "direct7", "radius")
 COVARIANCES = ("autoware", "pclomp", "pcl")
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 NEAR = TRUTH + np.array([0.2, -0.15, 0.1, 0.01, 0.02, -0.03])
-
-
-@pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
 
 
 def evaluated(

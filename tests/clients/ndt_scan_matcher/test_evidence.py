@@ -32,11 +32,6 @@ NO_EVIDENCE = TrustLimits(points=0, distance=0.0, angle=0.0, sharpness=0.0, spre
 
 
 @pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
-
-
-@pytest.fixture(scope="module")
 def scan() -> NDArray[np.float64]:
     """A scan of 8000 points, with a known pose."""
     return scan_from(street(5), TRUTH, 8000)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import math
@@ -23,28 +24,22 @@ from shmmap_clients.ndt_scan_matcher import (
     VoxelMap,
     matrix_from_pose,
 )
-from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import derive
+from shmmap_clients.ndt_scan_matcher.backends.kernels import derive
 from shmmap_clients.ndt_scan_matcher.backends.registry import backend_named
 from shmmap_clients.ndt_scan_matcher.cli import main
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import DriveStatistics
-from shmmap_clients.ndt_scan_matcher.drive.follower import Frame
 from shmmap_clients.ndt_scan_matcher.map.map_updater import UpdateStatistics
 from shmmap_clients.ndt_scan_matcher.matching import matcher as matcher_module
 from shmmap_clients.ndt_scan_matcher.matching import newton
 from shmmap_clients.ndt_scan_matcher.matching.pose_batch import derivatives_of_poses, matrices_from_poses
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import cells_of, map_of, scan_from, street, worth
+from tests.clients.ndt_scan_matcher.scene import cells_of, frame, map_of, scan_from, street, worth
 from tests.support.opencl_device import need_device
 
 TRUTH = np.array([1.3, 0.4, 1.8, 0.02, -0.03, 0.4])
 GUESS = matrix_from_pose(TRUTH + np.array([0.4, -0.3, 0.2, 0.01, 0.02, -0.04]))
 HOW = Scoring("radius", "autoware")
-
-
-@pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +138,14 @@ def test_more_poses_than_the_limit_are_refused_at_once_and_split_by_the_matcher(
 
 def test_limits_that_make_no_sense_are_refused() -> None:
     wrong: tuple[dict[str, Any], ...] = (
-        {"map_bytes": 0}, {"poses": 0}, {"poses": 100_000}, {"deadline_s": 0.0}, {"deadline_s": -1.0},
-        {"deadline_s": math.inf}, {"deadline_s": math.nan},
-    )  # fmt: skip
+        {"map_bytes": 0},
+        {"poses": 0},
+        {"poses": 100_000},
+        {"deadline_s": 0.0},
+        {"deadline_s": -1.0},
+        {"deadline_s": math.inf},
+        {"deadline_s": math.nan},
+    )
     for given in wrong:
         with pytest.raises(shmmap.BadRequest):
             Limits(**given)
@@ -175,19 +175,9 @@ def test_the_bound_of_time_is_measured_where_the_work_is_done(
 
 
 def test_a_drive_counts_what_each_limit_left_out() -> None:
-    with NdtMatcher() as matcher:
-        result = matcher.align(np.zeros((1, 3)), np.eye(4))
-    statistics = DriveStatistics()
-    import dataclasses
-
+    plain, statistics = frame(0, np.eye(4), None), DriveStatistics()
     for cut in (Cut(points=3), Cut(points=1, deadline=True), Cut(voxels=5, map_bytes=500), Cut()):
-        statistics.add(
-            Frame(
-                name="scan", stamp_s=0.0, result=dataclasses.replace(result, cut=cut), T_guess=np.eye(4),
-                T_truth=None, state="uncertain", relocalized=False, clock_jumped=False,
-                thin_s=0.0, map_s=0.0, align_s=0.0, relocalize_s=0.0, waited=False,
-            )
-        )  # fmt: skip
+        statistics.add(dataclasses.replace(plain, result=dataclasses.replace(plain.result, cut=cut)))
     summary = statistics.summary(UpdateStatistics(), 0, TrustLimits(nvtl=1.0), backend="opencl")
     assert summary.cut_frames == 3
     assert summary.cut_by == {"points": 2, "deadline": 1, "voxels": 1, "map_bytes": 1}

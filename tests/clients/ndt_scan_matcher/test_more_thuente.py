@@ -21,13 +21,15 @@ def kink(a: float) -> tuple[float, float]:
 def trials(*, by_upper_end: bool, first: float = 0.1) -> list[float]:
     """Step lengths that were looked at, in order."""
     search = line_search(first, 1e-9, 0.1, *kink(0.0), by_upper_end=by_upper_end)
-    seen, found = [next(search)], None
-    while found is None:
-        try:
+    seen = [next(search)]
+
+    def to_the_end() -> None:
+        while True:
             seen.append(search.send(kink(seen[-1])))
-        except StopIteration as ended:
-            found = ended.value
-    assert found == (seen[-1], len(seen) - 1)
+
+    with pytest.raises(StopIteration) as ended:
+        to_the_end()
+    assert ended.value.value == (seen[-1], len(seen) - 1)
     return seen
 
 

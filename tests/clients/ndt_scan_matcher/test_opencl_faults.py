@@ -36,7 +36,7 @@ from shmmap_clients.ndt_scan_matcher.backends.registry import FallbackBackend
 from shmmap_clients.ndt_scan_matcher.cli import main
 
 import shmmap
-from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street, worth
+from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, worth
 from tests.support.opencl_device import need_device
 from tests.support.process_costs import anonymous_bytes, descriptors
 
@@ -49,11 +49,6 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture(scope="module", autouse=True)
 def device() -> None:
     need_device()
-
-
-@pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
 
 
 def program_with(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -204,8 +199,8 @@ def test_kinds_of_covariance_that_do_not_fit_side_by_side_take_turns(points: NDA
     assert backend.uploads.writes == 1
     for how in (*kinds, *kinds):
         assert worth(backend, TRUTH, how).score == worth(free, TRUTH, how).score
-    assert backend.uploads.laid_out_anew == 3
-    assert free.uploads.laid_out_anew == 0
+    assert backend.uploads.laid_out_again == 3
+    assert free.uploads.laid_out_again == 0
     backend.maps = MapBuffers(backend._context, backend.device, free.maps.used_bytes // 4)
     backend.prepare(voxel_map, HOW)
     assert backend.maps.used_bytes == 0
@@ -244,7 +239,7 @@ def test_ten_thousand_evaluations_grow_nothing(points: NDArray[np.float64]) -> N
 
 
 @pytest.mark.parametrize("fallback", [None, "numba"])
-def test_a_device_that_hangs_holds_nobody(fallback: str | None) -> None:
+def test_a_device_that_hangs_holds_up_no_caller(fallback: str | None) -> None:
     words = ["align", "0.5", *([fallback] if fallback else [])]
     done = subprocess.run(
         [sys.executable, "-m", "tests.support.opencl_device", *words],

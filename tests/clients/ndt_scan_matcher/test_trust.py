@@ -18,7 +18,7 @@ from shmmap_clients.ndt_scan_matcher import (
     matrix_from_pose,
 )
 from shmmap_clients.ndt_scan_matcher.drive.follower import Tracking
-from shmmap_clients.ndt_scan_matcher.matching.result import Evidence, default_nvtl, default_sharpness
+from shmmap_clients.ndt_scan_matcher.matching.result import Evidence, default_nvtl
 
 import shmmap
 from tests.clients.ndt_scan_matcher.scene import map_of, scan_from, street
@@ -38,11 +38,6 @@ GOOD = {
 }
 
 
-@pytest.fixture(scope="module")
-def points() -> NDArray[np.float64]:
-    return street()
-
-
 def aligned(
     points: NDArray[np.float64], leaf: float, pose: NDArray[np.float64], trust: TrustLimits | None = None
 ) -> Result:
@@ -57,13 +52,6 @@ def test_the_default_grows_with_the_leaf(leaf: float, nvtl: float) -> None:
     assert default_nvtl(leaf) == pytest.approx(nvtl, abs=0.01)
     assert TrustLimits().for_leaf(leaf).nvtl == default_nvtl(leaf)
     assert TrustLimits(nvtl=0.7).for_leaf(leaf).nvtl == 0.7
-
-
-def test_limits_can_be_lifted() -> None:
-    none = TrustLimits(0.0, 0.0, points=0, distance=0.0, angle=0.0, sharpness=0.0, spread=0.0)
-    nothing: dict[str, Any] = GOOD | {"evidence": Evidence(1, 0.0, 0.0, 0.0, 0.0)}
-    assert none.for_leaf(2.0).failed(**nothing) == ()
-    assert TrustLimits().for_leaf(2.0, fine=True).sharpness == default_sharpness(fine=True)
 
 
 def test_true_covariances_score_lower_at_a_small_leaf() -> None:

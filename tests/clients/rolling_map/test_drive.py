@@ -8,7 +8,7 @@ from shmmap_clients.rolling_map.live_map import DriveStatistics, MappedScan
 from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.spread import KEPT
 
-from shmmap import ScanCounts
+from shmmap.live import ScanCounts
 
 
 def test_the_path_of_a_long_drive_keeps_its_ends() -> None:

@@ -119,9 +119,13 @@ def test_one_warning_names_all_that_has_no_effect(read: Any) -> None:
     found = read(text + "c_chunk_neiborhood: 6\nc_chunk_cache_capacity: 7\n")
     assert "\n" not in found.warning
     for name in (
-        "sensor_frame", "robot_frame", "c_chunk_dim: 32", "use_sor_filter: true", "c_chunk_neiborhood",
+        "sensor_frame",
+        "robot_frame",
+        "c_chunk_dim: 32",
+        "use_sor_filter: true",
+        "c_chunk_neiborhood",
         "c_chunk_cache_capacity",
-    ):  # fmt: skip
+    ):
         assert found.warning.count(name) == 1
     assert (found.live, found.scan_filter) == (LiveSettings(path="/maps/chunks"), ScanFilter())
 
@@ -217,7 +221,7 @@ def test_version_2_is_refused_with_the_names_of_version_1(read: Any) -> None:
         ("#" * (1 << 20) + "\n", "larger than a parameter file"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(read: Any, text: str, said: str) -> None:
+def test_what_is_wrong_is_reported_with_its_place(read: Any, text: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         read(text)
 
@@ -238,12 +242,20 @@ def test_the_section_equals_the_file(read: Any) -> None:
     assert section == {
         "live": {
             "lidar": {
-                "resolution": 0.1, "frame_id": "odom", "hit": 0.8, "miss": 0.3, "clamp_min": 0.2,
-                "clamp_max": 0.9, "occupied_above": 0.5, "free_below": 0.5, "radius": 1,
-                "hysteresis": 0.0, "path": '/maps/a "b" ö😀',
+                "resolution": 0.1,
+                "frame_id": "odom",
+                "hit": 0.8,
+                "miss": 0.3,
+                "clamp_min": 0.2,
+                "clamp_max": 0.9,
+                "occupied_above": 0.5,
+                "free_below": 0.5,
+                "radius": 1,
+                "hysteresis": 0.0,
+                "path": '/maps/a "b" ö😀',
             }
         }
-    }  # fmt: skip
+    }
     assert "path" not in tomllib.loads(live_section("x", LiveSettings()))["live"]["x"], "the daemon chooses"
 
 

@@ -97,8 +97,9 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
             assert waiting.put(request("other"))
     taken = [waiting.get() for _ in range(len(waiting))]
     assert [(one.requester.name, one.message) for one in taken] == [
-        ("other", 0), *(("flood", number) for number in range(3, MOST_OF_ONE + 3)),
-    ]  # fmt: skip
+        ("other", 0),
+        *(("flood", number) for number in range(3, MOST_OF_ONE + 3)),
+    ]
     assert not waiting
     for number in range(MOST_WAITING):
         assert waiting.put(request(f"{number}"))

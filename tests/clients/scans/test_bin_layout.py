@@ -48,8 +48,10 @@ def xyz_of(scan: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("shuffled", [False, True])
 @pytest.mark.parametrize("unit", [1.0, 255.0])
 @pytest.mark.parametrize("kind", ["<f4", "<f8"])
-@pytest.mark.parametrize("names", ["x y z", "x y z intensity", "x y z intensity ring",
-                                   "x y z intensity time", "x y z intensity ring time"])  # fmt: skip
+@pytest.mark.parametrize(
+    "names",
+    ["x y z", "x y z intensity", "x y z intensity ring", "x y z intensity time", "x y z intensity ring time"],
+)
 def test_rows_are_recognised(
     tmp_path: Path, names: str, kind: str, unit: float, shuffled: bool, front: bool
 ) -> None:

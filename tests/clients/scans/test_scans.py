@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,19 +60,16 @@ def test_a_wrong_line_is_named(tmp_path: Path, line: str) -> None:
         read_trajectory(path)
 
 
-def test_trajectory_refusals(tmp_path: Path) -> None:
+@pytest.mark.parametrize("read", [read_trajectory, read_route])
+def test_files_without_poses_or_places(tmp_path: Path, read: Callable[[Path], object]) -> None:
     (tmp_path / "empty").write_text("# nothing but this\n")
-    with pytest.raises(MapDataError, match="no poses"):
-        read_trajectory(tmp_path / "empty")
-    with pytest.raises(MapDataError, match="cannot be read"):
-        read_trajectory(tmp_path)
-    with pytest.raises(MapMissing):
-        read_trajectory(tmp_path / "none.txt")
-    (tmp_path / "binary").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(MapDataError):
-        read_trajectory(tmp_path / "binary")
-    with pytest.raises(BadRequest):
-        matrix_of((0, 0, 0), (0, 0, 0, 0))
+    (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "folder.csv").mkdir()
+    for name, said in (("empty", "no poses"), ("binary.csv", "not a text file"), ("folder.csv", "directory")):
+        with pytest.raises(MapDataError, match=said):
+            read(tmp_path / name)
+    with pytest.raises(MapMissing, match=r"way\.csv"):
+        read(tmp_path / "way.csv")
 
 
 @pytest.mark.parametrize(
@@ -106,17 +104,6 @@ def test_what_is_no_route_is_refused(tmp_path: Path, text: str, said: str) -> No
     with pytest.raises(MapDataError, match=said) as refused:
         read_route(file)
     assert str(file) in str(refused.value)
-
-
-def test_routes_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(MapMissing, match=r"way\.csv"):
-        read_route(tmp_path / "way.csv")
-    (tmp_path / "way.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(MapDataError, match="not a text file"):
-        read_route(tmp_path / "way.csv")
-    (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(MapDataError, match="directory"):
-        read_route(tmp_path / "folder.csv")
 
 
 def write_scans(directory: Path, names: list[str]) -> None:
@@ -233,7 +220,7 @@ def test_scans_over_a_socket(tmp_path: Path) -> None:
         ScanSubscriber("nowhere")
 
 
-def test_a_slow_reader_hears_the_end(tmp_path: Path) -> None:
+def test_a_slow_reader_receives_the_end(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/scans"
     sent = 1000  # more than fit into both queues
     publisher = ScanPublisher(endpoint)
@@ -251,7 +238,9 @@ def test_a_slow_reader_hears_the_end(tmp_path: Path) -> None:
     assert received == sorted(set(received))
 
 
-def test_nobody_who_does_not_read_holds_up_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_subscriber_that_does_not_read_holds_up_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(scan_stream, "_LINGER_MS", 50)
     endpoint = f"ipc://{tmp_path}/scans"
     with ScanPublisher(endpoint) as publisher:

@@ -103,11 +103,11 @@ inline std::string short_text(double number) {
 }
 
 inline std::string variable(const char* name) {
-  const char* value = std::getenv(name);  // NOLINT(concurrency-mt-unsafe): nobody here changes it
+  const char* value = std::getenv(name);  // NOLINT(concurrency-mt-unsafe): nothing here changes it
   return value != nullptr ? value : "";
 }
 
-/// Whether a directory that anybody could have made is this user's own.
+/// Whether a directory that any user could have made is this user's own.
 inline bool is_private(const std::string& directory) {
   struct stat status {};
   return ::lstat(directory.c_str(), &status) == 0 && S_ISDIR(status.st_mode) && status.st_uid == ::geteuid() &&

@@ -92,13 +92,13 @@ class UploadStatistics:
         With the gaps between arrays.
     writes
         One for each map and kind of covariance.
-    laid_out_anew
+    laid_out_again
         Maps that were written again because two kinds of covariance had no room side by side.
     """
 
     written_bytes: int = 0
     writes: int = 0
-    laid_out_anew: int = 0
+    laid_out_again: int = 0
 
 
 class Backend(Protocol):

@@ -63,9 +63,25 @@ def exp_of_negated(x: Any) -> Any:
 
 @compiled(_CROWD, boundscheck=False, fastmath={"contract"})
 def add_nearest(
-    px: Any, py: Any, pz: Any, i: Any, j: Any, k: Any, table: Any, origins: Any, box: Any, column_start: Any,
-    column_cell: Any, columns: Any, radius2: Any, d1: Any, d2: Any, near: Any, near_inverse: Any, crowd: Any,
-) -> None:  # fmt: skip
+    px: Any,
+    py: Any,
+    pz: Any,
+    i: Any,
+    j: Any,
+    k: Any,
+    table: Any,
+    origins: Any,
+    box: Any,
+    column_start: Any,
+    column_cell: Any,
+    columns: Any,
+    radius2: Any,
+    d1: Any,
+    d2: Any,
+    near: Any,
+    near_inverse: Any,
+    crowd: Any,
+) -> None:
     """Sum the nearest neighbours of a point that has more than there is room for; seldom called.
 
     ``crowd`` gets score, best share, g (3), h (6).

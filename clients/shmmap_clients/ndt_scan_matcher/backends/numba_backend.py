@@ -11,8 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap_clients.ndt_scan_matcher.backends.backend import ScanBuffer, UploadStatistics, check_batch
-from shmmap_clients.ndt_scan_matcher.backends.kernels import accumulate
-from shmmap_clients.ndt_scan_matcher.backends.pose_kernels import CONTRACTED, contract, derive, step_into
+from shmmap_clients.ndt_scan_matcher.backends.kernels import (
+    CONTRACTED,
+    accumulate,
+    contract,
+    derive,
+    step_into,
+)
 from shmmap_clients.ndt_scan_matcher.map.voxel_map import VoxelMap
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import (
     CHUNK_POINTS,

@@ -150,8 +150,11 @@ class OpenclBackend:
         self._arguments.clear()
         self.maps.close()
         for buffer in (
-            self._source_buffer, self._poses_buffer, self._places_buffer, self._rows_buffer,
-        ):  # fmt: skip
+            self._source_buffer,
+            self._poses_buffer,
+            self._places_buffer,
+            self._rows_buffer,
+        ):
             buffer.release()
 
     def set_map(self, voxel_map: VoxelMap) -> None:

@@ -119,14 +119,7 @@ def run(args: argparse.Namespace) -> int:
             "failed_limits": list(result.failed_limits),
             "covariance": None if result.covariance is None else result.covariance.tolist(),
             "evidence": asdict(result.evidence),
-            "cut": {
-                "points": result.cut.points,
-                "neighbor_points": result.cut.neighbor_points,
-                "neighbors": result.cut.neighbors,
-                "voxels": result.cut.voxels,
-                "map_bytes": result.cut.map_bytes,
-                "deadline": result.cut.deadline,
-            },
+            "cut": asdict(result.cut),
             "worst_case_ms": bound.total_ms,
             "align_ms": took_ms,
             "points": len(scan) - result.cut.points,
@@ -215,6 +208,11 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         help="steps that do not oscillate between two places, as the originals' can (default: if --fine)",
     )
     add_scoring_options(group)
+    _add_limit_options(parser)
+    add_trust_options(parser)
+
+
+def _add_limit_options(parser: argparse.ArgumentParser) -> None:
     limits = parser.add_argument_group("limits (what exceeds one is left out and counted)")
     limits.add_argument(
         "--max-points", type=at_least(1), metavar="N", help="points of a scan (default: 131072)"
@@ -245,7 +243,6 @@ def add_alignment_options(parser: argparse.ArgumentParser) -> None:
         help="for one alignment: it ends then, not converged; a device that has not answered is not waited"
         " for (default: none)",
     )
-    add_trust_options(parser)
 
 
 def matcher_from(args: argparse.Namespace) -> NdtMatcher:

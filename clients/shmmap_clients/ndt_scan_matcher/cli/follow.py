@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap_clients.command_line import (
@@ -43,8 +43,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from shmmap import Client
     from shmmap_clients.ndt_scan_matcher.drive.motion_prediction import MotionPrediction
     from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
+    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapUpdater
+    from shmmap_clients.ndt_scan_matcher.matching.matcher import NdtMatcher
     from shmmap_clients.pose_initializer import Relocalizer
     from shmmap_clients.scans.scan_sequence import Scan
 
@@ -78,7 +81,7 @@ JSON (fields may be added, none is removed).
    "map_prepare_ms": its part of the backend: spread each,
    "map_updates", "cells_added", "cells_removed", "map_private_bytes",
    "map_written_bytes", "map_writes": to a device,
-   "map_laid_out_anew": maps written again for lack of room}}
+   "map_laid_out_again": maps written again for lack of room}}
   A spread is {{"mean", "variance", "p50", "p99", "max"}}; ate is the distance
   of the poses to the true ones in metres, or degrees.
 --json-lines writes a line for each scan, as soon as it is localized:
@@ -113,21 +116,16 @@ def run(args: argparse.Namespace) -> int:
     from shmmap_clients.ndt_scan_matcher.drive.drive_plot import DrivePlot
     from shmmap_clients.ndt_scan_matcher.drive.drive_summary import frame_document
     from shmmap_clients.ndt_scan_matcher.drive.follower import Follower, Frame, Tracking
-    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber, PosePublisher
-    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import PosePublisher
     from shmmap_clients.scan_drive import ScanDrive
     from shmmap_clients.scans.trajectory import read_route, tum_line
-    from shmmap_clients.streams import is_endpoint
 
     plot = DrivePlot()
     route = read_route(args.route) if args.route is not None else ()
     with contextlib.ExitStack() as stack:
         # all sockets before the first scan: a publisher may wait for this program's subscription
         publisher = stack.enter_context(PosePublisher(args.publish)) if args.publish else None
-        listener = None
-        if args.odometry is not None and is_endpoint(args.odometry):
-            listener = OdometrySubscriber(args.odometry)
-            stack.callback(listener.close)
+        subscriber = _odometry(args, stack)
         drive = ScanDrive(args, "shmmap-ndt", args.truth, stack, one_line=True, rate=args.rate)
         tum = drive.open_text(str(args.tum)) if args.tum else None
         if publisher is not None and args.listener_wait > 0:
@@ -136,24 +134,11 @@ def run(args: argparse.Namespace) -> int:
         if first is None:
             return drive.no_scans()
         T_first, known = _start(args, first)
-        prediction = _prediction(args, T_first, listener, drive.scans)
+        prediction = _prediction(args, T_first, subscriber, drive.scans)
         matcher = stack.enter_context(matcher_from(args))
-        rules = MapRules(
-            args.update_distance,
-            args.map_radius,
-            args.lidar_radius,
-            args.leaf,
-            matcher.limits.voxels,
-            max_bytes=matcher.limits.most_map_bytes,
-        )
         client = stack.enter_context(connect(args, "shmmap-ndt"))
-        maps = stack.enter_context(
-            MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
-        )
-        relocalizer = None
-        by_default = args.rough is not None or not is_endpoint(args.scans)
-        if by_default if args.relocalize is None else args.relocalize:
-            relocalizer = _relocalizer(args, stack)
+        maps = stack.enter_context(_map_updater(args, client, matcher, route))
+        relocalizer = _relocalizer(args, stack)
         follower = Follower(
             matcher,
             maps,
@@ -167,8 +152,8 @@ def run(args: argparse.Namespace) -> int:
         report = FollowReport(drive, client, matcher, maps, relocalizer, hint)
 
         def step(scan: Scan) -> Frame:
-            if listener is not None and args.odometry_wait > 0:
-                listener.wait_until(scan.stamp_s, args.odometry_wait)
+            if subscriber is not None and args.odometry_wait > 0:
+                subscriber.wait_until(scan.stamp_s, args.odometry_wait)
             frame = follower.follow(scan)
             if args.plot:
                 plot.add(frame)
@@ -192,6 +177,38 @@ def run(args: argparse.Namespace) -> int:
     return 0 if summary.trustworthy + allowed == summary.frames and not summary.too_slow else 1
 
 
+def _odometry(args: argparse.Namespace, stack: contextlib.ExitStack) -> OdometrySubscriber | None:
+    """Return the odometry of an endpoint; None where it is in a file, or there is none."""
+    from shmmap_clients.ndt_scan_matcher.drive.pose_stream import OdometrySubscriber
+    from shmmap_clients.streams import is_endpoint
+
+    if args.odometry is None or not is_endpoint(args.odometry):
+        return None
+    subscriber = OdometrySubscriber(args.odometry)
+    stack.callback(subscriber.close)
+    return subscriber
+
+
+def _map_updater(
+    args: argparse.Namespace,
+    client: Client,
+    matcher: NdtMatcher,
+    route: NDArray[np.float64] | Sequence[tuple[float, float]],
+) -> MapUpdater:
+    """Return what keeps the map around the vehicle."""
+    from shmmap_clients.ndt_scan_matcher.map.map_updater import MapRules, MapUpdater
+
+    rules = MapRules(
+        args.update_distance,
+        args.map_radius,
+        args.lidar_radius,
+        args.leaf,
+        matcher.limits.voxels,
+        max_bytes=matcher.limits.most_map_bytes,
+    )
+    return MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
+
+
 def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], bool]:
     """Return the pose where the drive begins, and whether it is known well."""
     from shmmap import BadRequest
@@ -208,7 +225,7 @@ def _start(args: argparse.Namespace, first: Scan) -> tuple[NDArray[np.float64], 
 def _prediction(
     args: argparse.Namespace,
     T_first: NDArray[np.float64],
-    listener: OdometrySubscriber | None,
+    subscriber: OdometrySubscriber | None,
     source: Iterable[Scan],
 ) -> MotionPrediction:
     """Return what predicts the next pose; the first velocity is the truth's, or that of the route's times."""
@@ -217,8 +234,8 @@ def _prediction(
     from shmmap_clients.scans.scan_sequence import ScanSequence
     from shmmap_clients.scans.trajectory import read_trajectory
 
-    if listener is not None:
-        return Odometry(T_first, lambda: listener.trajectory)
+    if subscriber is not None:
+        return Odometry(T_first, lambda: subscriber.trajectory)
     if args.odometry is None:
         truth = source.trajectory if isinstance(source, ScanSequence) else None
         if truth is not None:
@@ -231,10 +248,17 @@ def _prediction(
     return Odometry(T_first, lambda: read)
 
 
-def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer:
-    """Return what searches for a lost vehicle; it has a session of its own from the first search on."""
-    from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
+def _relocalizer(args: argparse.Namespace, stack: contextlib.ExitStack) -> Relocalizer | None:
+    """Return what searches for a lost vehicle, if that is wanted.
 
+    It has a session of its own from the first search on.
+    """
+    from shmmap_clients.pose_initializer import InitializerRules, PoseInitializer, Relocalizer
+    from shmmap_clients.streams import is_endpoint
+
+    by_default = args.rough is not None or not is_endpoint(args.scans)
+    if not (by_default if args.relocalize is None else args.relocalize):
+        return None
     rules = InitializerRules(map_radius=args.map_radius, leaf=args.leaf, height=args.height)
 
     def initializer() -> PoseInitializer:

@@ -123,7 +123,7 @@ def print_summary(summary: DriveSummary, left_out: str = "") -> None:
     )
     print(f"  own memory    {s.map_private_bytes / 1e6:.2f} MB at most, beside the shared memory")
     if s.map_writes:
-        again = f", laid out anew {s.map_laid_out_anew} times" if s.map_laid_out_anew else ""
+        again = f", laid out again {s.map_laid_out_again} times" if s.map_laid_out_again else ""
         print(f"  on the device {s.map_written_bytes / 1e6:.2f} MB written in {s.map_writes} writes{again}")
     if s.errors is not None:
         e = s.errors

@@ -143,7 +143,7 @@ class DriveSummary:
         What they cost, in another thread; the last is a part of the one before, see `UpdateStatistics`.
     map_private_bytes
         This process's own memory for a map, at most.
-    map_written_bytes, map_writes, map_laid_out_anew
+    map_written_bytes, map_writes, map_laid_out_again
         What was written to a device, see `UploadStatistics`.
     """
 
@@ -179,7 +179,7 @@ class DriveSummary:
     map_private_bytes: int
     map_written_bytes: int
     map_writes: int
-    map_laid_out_anew: int
+    map_laid_out_again: int
 
     def as_document(self) -> dict[str, Any]:
         """Return the summary for JSON: numbers that are not there are null."""
@@ -265,7 +265,7 @@ class DriveStatistics:
             map_private_bytes=updates.private_bytes,
             map_written_bytes=updates.uploads.written_bytes,
             map_writes=updates.uploads.writes,
-            map_laid_out_anew=updates.uploads.laid_out_anew,
+            map_laid_out_again=updates.uploads.laid_out_again,
         )
 
 

@@ -275,7 +275,7 @@ class MapUpdater:
             if left_s <= 0:
                 raise NoAnswer(
                     f"the map around ({x:.1f}, {y:.1f}) was not loaded within {rules.wait_s:.0f} s",
-                    hint="`shmmap status` tells whether the daemon still loads, or has no memory left",
+                    hint="`shmmap status` shows whether the daemon still loads, or has no memory left",
                 )
             self._changed.wait(left_s)
 
@@ -322,7 +322,7 @@ class MapUpdater:
         begin_s = time.perf_counter()
         cells = self._loaded(x, y, vx, vy)
         if not cells and not self._window.complete:
-            raise NoAnswer("none of the cells could be loaded", hint="`shmmap status` tells why")
+            raise NoAnswer("none of the cells could be loaded", hint="`shmmap status` shows why")
         request_s = time.perf_counter() - begin_s
         known = {cell.id: self._voxels(cell) for cell in cells}
         before = self._latest

@@ -105,13 +105,18 @@ def extent_of(points: NDArray[np.floating]) -> Extent:
     """
     if not len(points):
         return Extent(0.0, 0.0)
-    x, y = points[:: -(-len(points) // _ANGLE_POINTS), :2].T
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        squared = np.einsum("ij,ij->i", points, points)
+        x, y, z = points.T
+        squared = x * x + y * y + z * z
+        stride = -(-len(points) // _ANGLE_POINTS)
+        x, y = x[::stride], y[::stride]
         level = np.sqrt(x * x + y * y)
         cosine, sine = x / level, y / level
         known = np.isfinite(cosine + sine)
     squared[~np.isfinite(squared)] = 0.0
+    some = squared[::8]  # if enough of these are so far, nearer points need not be put in order
+    if len(some) >= FAR_POINTS:
+        squared = squared[squared >= np.partition(some, -FAR_POINTS)[-FAR_POINTS]]
     place = max(len(squared) - FAR_POINTS, 0)
     squared.partition(place)
     count = max(int(np.count_nonzero(known)), 1)

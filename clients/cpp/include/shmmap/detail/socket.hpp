@@ -123,7 +123,7 @@ class Socket {
         throw Unreachable("no_permission", path_ + ": this user may not connect",
                           "join the group that the daemon was started with (--group), then log in again");
       case EAGAIN:
-        throw Unreachable("no_answer", path_ + ": the daemon accepts nobody just now", "it is hung or overloaded");
+        throw Unreachable("no_answer", path_ + ": the daemon accepts no connection just now", "it is hung or overloaded");
       default: throw Unreachable("no_socket", path_ + ": " + error_text(number));
     }
   }

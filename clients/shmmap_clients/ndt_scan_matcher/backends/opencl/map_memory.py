@@ -210,7 +210,7 @@ class MapBuffers:
             if not fits and half.placed:
                 # another kind of covariance has taken the room
                 half.empty()
-                self.statistics.laid_out_anew += 1
+                self.statistics.laid_out_again += 1
                 fits = self._place(half, voxel_map, covariance)
         if not fits:
             raise DeviceMemory(
