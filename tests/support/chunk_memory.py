@@ -56,8 +56,8 @@ class ChunkMemory:
                 mapper=mapper,
                 scan=scan,
                 now_ns=scan,
-                grow=lambda bricks, key=key: self.grown(key, bricks),
-                known_mappers=known,  # type: ignore[misc]
+                grow=lambda bricks, key=key: self.grown(key, bricks),  # type: ignore[misc]
+                known_mappers=known,
             )
 
     def voxels(self) -> dict[tuple[int, int, int], int]:

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import encode_marks
+from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.client.arguments import checked_seconds
 from shmmap.client.connection import SERVED_PAUSE_S, Connection, until_served
 from shmmap.client.session import Session

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shmmap.chunks import marking
-from shmmap.chunks.marking import Marker, ScanCounts, ScanFilter
+from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
+from shmmap.chunks.occupancy import ScanCounts, ScanFilter
 from shmmap.chunks.voxels import voxels_of
 from shmmap.errors import BadRequest
 from tests.support.live_drive import SlowOccupancy, Voxel
