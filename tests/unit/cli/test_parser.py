@@ -281,11 +281,11 @@ VARIABLES = {
         ([], ["SHMMAP_INSTANCE"], "/x/shmmap/two.sock", "two"),
         ([], ["SHMMAP_INSTANCE", "SHMMAP_RUNTIME_DIR"], "/v/dir/two.sock", "two"),
         (["--endpoint", "/f/three.sock"], [*VARIABLES], "/f/three.sock", "three"),
-        (["--instance_of", "four"], [*VARIABLES], "/v/dir/four.sock", "four"),
-        (["--instance_of", "four"], ["SHMMAP_ENDPOINT"], "/x/shmmap/four.sock", "four"),
-        (["--instance_of", "default"], ["SHMMAP_ENDPOINT"], "/x/shmmap/default.sock", "default"),
+        (["--instance", "four"], [*VARIABLES], "/v/dir/four.sock", "four"),
+        (["--instance", "four"], ["SHMMAP_ENDPOINT"], "/x/shmmap/four.sock", "four"),
+        (["--instance", "default"], ["SHMMAP_ENDPOINT"], "/x/shmmap/default.sock", "default"),
         (["--runtime-dir", "/f"], [*VARIABLES], "/f/two.sock", "two"),
-        (["--endpoint", "/f/three.sock", "--instance_of", "four"], [], "/f/three.sock", "four"),
+        (["--endpoint", "/f/three.sock", "--instance", "four"], [], "/f/three.sock", "four"),
     ],
 )
 def test_flags_count_before_variables(
