@@ -16,7 +16,7 @@ from shmmap.testing.fixtures import judged_daemons
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_daemon import SETTINGS, LiveDaemon
-from tests.support.map_stores import _buckets, buckets, web  # noqa: F401  fixtures
+from tests.support.map_stores import _buckets, buckets, signed_maps, web  # noqa: F401  fixtures
 from tests.support.publishing_verbs import Shmmap
 from tests.support.raw_client import RawClient
 

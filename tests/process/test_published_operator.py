@@ -19,13 +19,13 @@ from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import make_map
 from tests.support.faulty_web import FaultyWeb, faulty_web
 from tests.support.patience import Patience
+from tests.support.published_daemon import ALL, flip, until, until_taken
 from tests.support.publishing import publish
 from tests.support.waiting import counters
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 
-ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 CELLS = PAGES = 4
 
 
@@ -38,11 +38,9 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
         yield one
 
 
-def until(one: DaemonProcess, is_so: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
+def counts_when(one: DaemonProcess, is_so: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
     """Wait for counters of which ``is_so`` is true; returns them."""
-    waiting = Patience()
-    while waiting(not is_so(counters(one))):
-        time.sleep(0.02)
+    until(lambda: is_so(counters(one)))
     return counters(one)
 
 
@@ -54,7 +52,7 @@ def load_all(one: DaemonProcess) -> shmmap.CellSet:
 def evict_all(one: DaemonProcess, client: shmmap.Client) -> None:
     """Evict all cells, and wait until none could be reused."""
     client.evict()
-    until(one, lambda counts: not counts["cells_resident"] and not counts["zombies"])
+    counts_when(one, lambda counts: not counts["cells_resident"] and not counts["zombies"])
 
 
 def objects(web: FaultyWeb) -> list[Path]:
@@ -67,7 +65,7 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
     assert load_all(one).complete
     sizes = [path.stat().st_size for path in objects(web)]
     assert len(sizes) == CELLS + PAGES + 1
-    counts = until(one, lambda counts: counts["objects_fetched"] == len(sizes))
+    counts = counts_when(one, lambda counts: counts["objects_fetched"] == len(sizes))
     assert counts["bytes_fetched"] == sum(sizes)
     assert (counts["objects_from_disk"], counts["fetches_failed"]) == (0, 0)
     assert counts["published_version"] == 1
@@ -79,14 +77,14 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
         CELLS,
     )
     taken_ns = counts["published_taken_unix_ns"]
-    waiting = Patience()
-    while waiting(not list(one.state_dir.rglob("*.taken"))):
-        time.sleep(0.02)
+    until_taken(one)
 
     one.stop()
     one.start()
     assert load_all(one).complete
-    counts = until(one, lambda counts: counts["objects_from_disk"] == CELLS + PAGES)  # the root is state
+    counts = counts_when(
+        one, lambda counts: counts["objects_from_disk"] == CELLS + PAGES
+    )  # the root is state
     assert (counts["objects_fetched"], counts["published_taken_unix_ns"]) == (0, taken_ns)
 
 
@@ -96,50 +94,31 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
     kept = [path for path in Path(one.cache_dir).rglob("objects/cells/*/*") if path.is_file()]
     assert len(kept) == CELLS
     one.stop()
-    content = kept[0].read_bytes()
-    kept[0].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    flip(kept[0])
     kept[1].unlink()
     lost = kept[1].name
     web.fault = lambda path: "corrupt" if path.endswith(lost) else ""
     one.start()
     cells = load_all(one)
     assert len(cells.failed) == 1
-    counts = until(one, lambda counts: counts["objects_damaged_in_store"] == 2)  # it is asked twice
+    counts = counts_when(one, lambda counts: counts["objects_damaged_in_store"] == 2)  # it is asked twice
     assert (counts["objects_damaged_on_disk"], counts["fetches_failed"]) == (1, 2)
 
     before_ns = time.time_ns()
     web.refuse()
     with shmmap.connect(one.endpoint) as client:
-        waiting = Patience()
-        while waiting([failure.code for failure in client.area(ALL, wait=5.0).failed] != ["offline"]):
-            time.sleep(0.05)
-    counts = until(one, lambda counts: counts["origin_out"] == 1 and counts["fetches_failed"] > 2)
+        until(lambda: [failure.code for failure in client.area(ALL, wait=5.0).failed] == ["offline"])
+    counts = counts_when(one, lambda counts: counts["origin_out"] == 1 and counts["fetches_failed"] > 2)
     assert before_ns < counts["origin_out_since_unix_ns"] < time.time_ns()
     web.listen()
-    counts = until(one, lambda counts: counts["origin_out"] == 0)
+    counts = counts_when(one, lambda counts: counts["origin_out"] == 0)
     assert counts["origin_out_since_unix_ns"] == 0
-
-
-def test_a_refused_offer_is_shown_until_another_one_comes(
-    daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path
-) -> None:
-    first = (web.folder / "CURRENT").read_bytes()
-    other = make_map(tmp_path / "other", columns=2, rows=2, points=200)
-    publish(other.root, web.folder)
-    second = (web.folder / "CURRENT").read_bytes()
-    one = daemon(web.url, "--poll", "1")
-    until(one, lambda counts: counts["published_version"] == 2)
-    (web.folder / "CURRENT").write_bytes(first)
-    until(one, lambda counts: counts["published_refused"] == 1)
-    assert "version 1, which is offered, is refused, older" in Shmmap(one, tmp_path)("status")
-    (web.folder / "CURRENT").write_bytes(second)
-    until(one, lambda counts: counts["published_refused"] == 0)
 
 
 def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -> None:
     one = daemon(web.url, "--poll", "0")
     assert load_all(one).complete
-    until(one, lambda counts: counts["objects_fetched"] == CELLS + PAGES + 1)
+    counts_when(one, lambda counts: counts["objects_fetched"] == CELLS + PAGES + 1)
     shmmap_ = Shmmap(one, tmp_path)
     shown: dict[str, Any] = shmmap_.json("status")["published"]
     assert shmmap_.json("top")["published"].keys() == shown.keys()
@@ -172,7 +151,7 @@ def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
         waiting = Patience()
         while waiting(len(client.area(ALL, wait=5.0).failed) != CELLS):
             evict_all(one, client)  # the counters were of before, and what was evicted was used again
-    until(one, lambda counts: counts["origin_out"] == 1)
+    counts_when(one, lambda counts: counts["origin_out"] == 1)
     assert re.search(
         r"^origin +out of reach for .* \(since .* UTC\): what is in memory and on", shmmap_("status"), re.M
     )

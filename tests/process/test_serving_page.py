@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import time
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from tests.support.divided_map import make_map
 from tests.support.faulty_web import faulty_web
 from tests.support.forked_programs import run_verb
 from tests.support.pages import read_page
-from tests.support.patience import Patience
+from tests.support.published_daemon import ALL, all_cells, until, until_taken
 from tests.support.publishing import publish
 
 PAGE = read_page("shmmap/publishing/SERVING_FROM_A_BUCKET.md")
@@ -103,16 +102,13 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
     (serve,) = PAGE.commands("serve")
     with faulty_web(tmp_path / "www") as web:
         one = daemon(serve.split()[2], "--poll", "1", environment={**KEYS, "AWS_ENDPOINT_URL": web.url})
-        waiting = Patience()
         with shmmap.connect(one.endpoint) as client:
             near = client.around(-15.0, -15.0, 2.0, wait=60.0)
             assert near.complete
-            while waiting(not list(one.state_dir.rglob("*.taken"))):
-                time.sleep(0.02)
+            until_taken(one)
             web.refuse()
-            while waiting(verb(one, "shmmap health --strict")[0] != 1):
-                pass
-            cells = client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=60.0)
+            until(lambda: verb(one, "shmmap health --strict")[0] == 1)
+            cells = client.area(ALL, wait=60.0)
             assert {failure.code for failure in cells.failed} == {"offline"}
             assert {cell.id for cell in cells} == {cell.id for cell in near}
             commands = dict(zip(("health", "status", "doctor", "tail"), PAGE.commands("down"), strict=True))
@@ -130,16 +126,12 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
         with shmmap.connect(one.endpoint) as client:
             again = client.around(-15.0, -15.0, 2.0, wait=60.0)
             assert {cell.version for cell in again} == {cell.version for cell in near}
-            while waiting(one.log.count("the map's origin is out of reach") < 2):  # in each run once
-                time.sleep(0.02)
+            until(lambda: one.log.count("the map's origin is out of reach") >= 2)
             web.listen()
-            while waiting(not client.area(shmmap.Box(-1e6, -1e6, 1e6, 1e6), wait=5.0).complete):
-                time.sleep(0.02)
+            all_cells(client)
         for line in PAGE.blocks["log"]:
-            while waiting(not is_shown(line, one.log)):
-                time.sleep(0.02)
-        while waiting(verb(one, "shmmap health --strict")[0] != 0):
-            pass
+            until(lambda line: is_shown(line, one.log), line)
+        until(lambda: verb(one, "shmmap health --strict")[0] == 0)
 
 
 def test_a_signed_map_is_served(buckets: BucketServer, daemon: DaemonFactory, tmp_path: Path) -> None:

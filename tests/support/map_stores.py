@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import http.server
 import os
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +15,10 @@ import pytest
 
 from tests.support.bucket_server import BucketServer, bucket_server
 from tests.support.ceph import ceph_server
+from tests.support.divided_map import make_map
+from tests.support.publishing_verbs import Shmmap
 
-__all__ = ["_buckets", "buckets", "web"]
+__all__ = ["_buckets", "buckets", "signed_maps", "web"]
 
 
 @pytest.fixture(scope="session")
@@ -61,3 +64,26 @@ def web(tmp_path: Path) -> Iterator[tuple[str, Path]]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+@pytest.fixture(scope="session")
+def signed_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One map of two cells, signed: with versions 1 and 2, another version 2, and signed by others.
+
+    Directories ``one``, ``two``, ``equal``, ``other``; their ``keys`` and ``others``; ``town`` has the files.
+    """
+    from tests.support.signed_map import Signed
+
+    folder = tmp_path_factory.mktemp("signed")
+    made = make_map(folder / "town", columns=2, rows=1, points=100)
+    run = Shmmap(folder)
+    run("publish", made.root, folder / "one", "--sign", folder / "keys", "--id-prefix", "/town/")
+    shutil.copytree(folder / "one", folder / "two")
+    shutil.copytree(folder / "one", folder / "equal")
+    made.change("0_0.pcd", seed=1)
+    run("publish", made.root, folder / "two", "--sign", folder / "keys")
+    run("publish", made.root, folder / "other", "--sign", folder / "others", "--id-prefix", "/town/")
+    made.change("0_0.pcd", seed=2)
+    run("publish", made.root, folder / "equal", "--sign", folder / "keys")
+    Signed(folder / "equal", folder / "keys").write_all(3)  # newer than the other version 2
+    return folder
