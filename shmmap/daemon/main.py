@@ -137,7 +137,7 @@ def run(config: DaemonConfig) -> int:
         elif config.map_path:
             origin = find_origin(
                 config.map_path, metadata=config.metadata, strict=config.strict, cache_dir=config.cache_dir,
-                unit=config.unit, vertical_unit=config.vertical_unit, tell=notify,
+                unit=config.unit, vertical_unit=config.vertical_unit, notify=notify,
             )  # fmt: skip
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere
