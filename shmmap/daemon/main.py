@@ -143,7 +143,7 @@ def run(config: DaemonConfig) -> int:
                 cache_dir=config.cache_dir,
                 unit=config.unit,
                 vertical_unit=config.vertical_unit,
-                tell=notify,
+                notify=notify,
             )
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere

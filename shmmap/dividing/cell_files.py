@@ -11,22 +11,24 @@ from __future__ import annotations
 import os
 import resource
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.dividing.lattice import CellLattice
 from shmmap.errors import BadRequest
 from shmmap.formats.pcd.writer import pcd_header
+from shmmap.origin.metadata import METADATA_NAME, metadata_text
 
-__all__ = ["CellFiles", "Slot", "raise_open_files_limit"]
+__all__ = ["CellFiles", "pcd_fields", "raise_open_files_limit", "write_at", "write_metadata"]
 
 _ALIGNMENT: Final = 64
 _SPARE_DESCRIPTORS: Final = 128
-_MOST_POINTS: Final = (1 << 32) - 1
+_MAX_POINTS: Final = (1 << 32) - 1
 
-Slot = tuple[int, str, int]
-"""(descriptor or -1, path, offset): where the next rows of a cell go."""
+_Slot = tuple[int, str, int]  # (descriptor or -1, path, offset): where the next rows of a cell go
 
 
 class CellFiles:
@@ -52,18 +54,18 @@ class CellFiles:
         self.row = row
         self.counts: dict[tuple[int, int], int] = {}
         self.name = name
-        self._fields = [_field(field, row[field]) for field in row.names or ()]
-        longest = len(pcd_header(self._fields, _MOST_POINTS, "binary"))
+        self._fields = pcd_fields(row)
+        longest = len(pcd_header(self._fields, _MAX_POINTS, "binary"))
         self.header_bytes = -(-longest // _ALIGNMENT) * _ALIGNMENT
         self._descriptors: dict[tuple[int, int], int] = {}
         soft, _hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        self._most_open = max(16, soft - _SPARE_DESCRIPTORS)
+        self._max_open = max(16, soft - _SPARE_DESCRIPTORS)
 
     def path(self, where: tuple[int, int]) -> str:
         """Path of a cell's file."""
         return os.path.join(self.directory, self.name(*where))
 
-    def reserve(self, where: tuple[int, int], rows: int) -> Slot:
+    def reserve(self, where: tuple[int, int], rows: int) -> _Slot:
         """Make room for ``rows`` after what the cell has.
 
         Raises
@@ -72,13 +74,13 @@ class CellFiles:
             The cell would have more points than a PCD file can.
         """
         have = self.counts.get(where, 0)
-        if have + rows > _MOST_POINTS:
+        if have + rows > _MAX_POINTS:
             raise BadRequest(
                 f"the cell {self.name(*where)} has more points than a PCD file can", hint="smaller cells"
             )
         path = self.path(where)
         fd = self._descriptors.get(where, -1)
-        if fd < 0 and len(self._descriptors) < self._most_open:
+        if fd < 0 and len(self._descriptors) < self._max_open:
             fd = self._descriptors[where] = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
         self.counts[where] = have + rows
         return fd, path, self.header_bytes + have * self.row.itemsize
@@ -130,7 +132,7 @@ class CellFiles:
             os.close(self._descriptors.popitem()[1])
 
 
-def write_at(slot: Slot, data: Any) -> None:
+def write_at(slot: _Slot, data: Any) -> None:
     """Write ``data`` where ``slot`` says."""
     fd, path, offset = slot
     own = fd < 0
@@ -147,10 +149,19 @@ def write_at(slot: Slot, data: Any) -> None:
 
 
 def raise_open_files_limit() -> None:
-    """Let this process hold as many files open as it may; 1024 cells are few."""
+    """Raise the limit of open files as far as allowed: a map has more cells than the usual 1024."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def _field(name: str, dtype: np.dtype[Any]) -> tuple[str, np.dtype[Any], int]:
-    return name, dtype.base, int(np.prod(dtype.shape, dtype=int))
+def pcd_fields(row: np.dtype[np.void]) -> list[tuple[str, np.dtype[Any], int]]:
+    """Return name, dtype and count of each field of a row, as a PCD header has them."""
+    return [(name, row[name].base, int(np.prod(row[name].shape, dtype=int))) for name in row.names or ()]
+
+
+def write_metadata(
+    directory: str, lattice: CellLattice, prefix: str, wheres: Iterable[tuple[int, int]]
+) -> None:
+    """Write the metadata of a divided map's cells, as Autoware's loader reads them."""
+    entries = ((lattice.file_name(prefix, *where), lattice.corner_text(*where)) for where in wheres)
+    Path(directory, METADATA_NAME).write_text(metadata_text(lattice.size_text, entries), encoding="utf-8")

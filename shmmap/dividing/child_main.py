@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The process that divides a cloud for the daemon: ``python -m shmmap.dividing.child_main``.
 
-It says what it does in packets of JSON: ``{"stage", "done", "total"}`` now and then, and
-``{"error", "message", "hint"}`` before it ends with that error.  It dies with the daemon, and a later one
-continues where it stopped.
+It reports in packets of JSON: ``{"stage", "done", "total"}`` once a second, and ``{"error", "message",
+"hint"}`` before it ends with that error.  It dies with the daemon; the next one continues where it stopped.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["main"]
 
-_NICENESS: Final = 10  # whoever is being served goes first
-_TELL_EVERY_S: Final = 1.0
+_NICENESS: Final = 10  # clients of the daemon go first
+_REPORT_EVERY_S: Final = 1.0
 
 
 class _Channel:
@@ -35,26 +34,26 @@ class _Channel:
         self._channel = channel
         self._name = ""
         self._done = self._total = 0
-        self._told_s = 0.0
+        self._reported_s = 0.0
 
     def stage(self, name: str, total: int) -> None:
         self._name, self._total, self._done = name, total, 0
-        self._tell()
+        self._report()
 
     def advance(self, points: int) -> None:
         self._done += points
-        if time.monotonic() - self._told_s >= _TELL_EVERY_S:
-            self._tell()
+        if time.monotonic() - self._reported_s >= _REPORT_EVERY_S:
+            self._report()
 
     def done(self, points: int) -> None:
         del points
 
-    def say(self, **words: object) -> None:
-        self._channel.send(json.dumps(words).encode())
+    def send(self, **fields: object) -> None:
+        self._channel.send(json.dumps(fields).encode())
 
-    def _tell(self) -> None:
-        self._told_s = time.monotonic()
-        self.say(stage=self._name, done=self._done, total=self._total)
+    def _report(self) -> None:
+        self._reported_s = time.monotonic()
+        self.send(stage=self._name, done=self._done, total=self._total)
 
 
 def _frame_before(out: str) -> tuple[float, float, float] | None:
@@ -62,7 +61,7 @@ def _frame_before(out: str) -> tuple[float, float, float] | None:
     try:
         report = read_report(os.path.join(os.path.dirname(out), LINK_NAME))
     except MapDataError:
-        return None  # of another version: divided anew
+        return None  # of another version: divided again
     if report is None:
         return None
     x, y, z = (0.0 - float(part) for part in report["origin"])
@@ -82,7 +81,7 @@ def main(arguments: list[str]) -> int:
     try:
         divide([arguments[2]], arguments[3], settings, progress=channel)
     except ShmmapError as error:
-        channel.say(error=error.code, message=error.message, hint=error.hint)
+        channel.send(error=error.code, message=error.message, hint=error.hint)
         return error.exit_code
     return 0
 

@@ -9,34 +9,32 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit
+from shmmap.dividing.cell_files import CellFiles, raise_open_files_limit, write_metadata
 from shmmap.dividing.finishing import thin_out, write_encoded
 from shmmap.dividing.frame import choose_frame, choose_units
 from shmmap.dividing.inputs import (
     InputFile,
     check_output_directory,
     check_output_place,
+    check_space,
     check_unchanged,
     find_inputs,
 )
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.partition import Partition, block_points_for, worker_count
 from shmmap.dividing.settings import DivideSettings, NoProgress, Progress, lattice_of, memory_left
-from shmmap.dividing.sources import AXES, RowLayout, Source, common_rows, open_source
+from shmmap.dividing.sources import RowLayout, Source, common_rows, field_types, open_source, with_axes
 from shmmap.dividing.workspace import Workspace
-from shmmap.errors import BadRequest, CannotWrite, MapDataError
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, degrees_warning
 from shmmap.formats.durable_file import writing_errors
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.formats.source_file import refusal
 from shmmap.origin.map_report import DividedMap, far_cells_notes, write_report
-from shmmap.origin.metadata import METADATA_NAME, metadata_text
-from shmmap.quantities import format_bytes
 
 __all__ = ["divide"]
 
@@ -125,46 +123,46 @@ class _Run:
         )
         progress.stage("looking at coordinates", 0)
         self._frame = choose_frame(self._sources, row, lattice, settings.translate, settings.frame_before)
-        self._row = np.dtype(
-            [(name, self._frame.axis if name in AXES else row[name]) for name in row.names or ()]
-        )
+        self._row = with_axes(row, self._frame.axis)
         origin_x, origin_y, _ = self._frame.origin
         self._lattice = lattice.moved(origin_x, origin_y)
         self._points = sum(source.points for source in self._sources)
 
     def run(self) -> DividedMap:
-        """Divide, and let the map appear; return what was made."""
+        """Divide and publish the map; return what was made."""
         settings, space = self._settings, self._space
-        self._check_space()
+        if self._state is None:  # else much of it exists
+            needed = self._points * self._row.itemsize
+            if settings.encoding != "binary":
+                needed *= 2  # cells as they were read, and in their final form
+            check_space("the map", needed, space.path, place=f" in {os.path.dirname(space.out)}")
         final = space.directory("map/" + _CELLS)
+        self._buckets = self._bucket_lattice() if settings.leaf else self._lattice
         if settings.leaf:
-            self._buckets = self._bucket_lattice()
             stage = self._cell_files(space.directory("buckets"), lambda x, y: f"{x}_{y}")
-        elif settings.encoding != "binary":
-            self._buckets = self._lattice
-            stage = self._cell_files(space.directory("buckets"), self._name)
         else:
-            self._buckets = self._lattice
-            stage = self._cell_files(final, self._name)
+            encoded = settings.encoding != "binary"
+            stage = self._cell_files(space.directory("buckets") if encoded else final, self._name)
         stream = self._read_into(stage)
         check_unchanged(self._files)
         self._frame.check(stream.extremes)
         if not stream.kept:
+            alone = len(self._files) == 1
             raise MapDataError(
-                "no finite point in it" if len(self._files) == 1 else "no finite point in any of them",
-                path=self._files[0].path if len(self._files) == 1 else "",
+                f"no finite point in {'it' if alone else 'any of them'}",
+                path=self._files[0].path if alone else "",
                 cause="no_points",
             )
         cells = self._finish(stage, final)
-        points = sum(cells.counts.values())
         report = self._report(stream, cells)
-        self._write_texts(cells, report)
+        write_metadata(space.content, self._lattice, settings.prefix, cells.counts)
+        write_report(space.content, report)
         if settings.check:
             _check_cells(final, cells.counts, self._name, self._lattice, self._row, self._progress)
         self._progress.stage("forcing to the disk" if settings.durable else "publishing", 0)
         check_output_directory(space.out, force=settings.force)
         space.publish(replace=settings.force, durable=settings.durable)
-        self._progress.done(points)
+        self._progress.done(report.points)
         return report
 
     # --- parts ----------------------------------------------------------------------------------
@@ -183,24 +181,18 @@ class _Run:
         job = self._job()
         if self._state is not None and not self._restore(self._state, job, stream, files):
             self._space.empty()
-            os.makedirs(self._space.directory("map/" + _CELLS), exist_ok=True)
+            self._space.directory("map/" + _CELLS)
             os.makedirs(files.directory, exist_ok=True)
         self.resumed = stream.position
         points = block_points_for(room, self._row.itemsize, threads)
         points = max(1, min(points, -(-self._points // (2 * threads)) or 1))
+
+        def save(state: dict[str, Any]) -> None:
+            cells = [(ix, iy, rows) for (ix, iy), rows in files.counts.items()]
+            self._space.save({**state, "job": job, "cells": cells})
+
         with Partition(files, self._buckets, block_points=points, threads=threads) as partition:
-            stream.run(
-                partition,
-                self._progress,
-                save=lambda state: self._space.save(
-                    {
-                        **state,
-                        "job": job,
-                        "cells": [(ix, iy, rows) for (ix, iy), rows in files.counts.items()],
-                    }
-                ),
-                every_s=settings.checkpoint_s,
-            )
+            stream.run(partition, self._progress, save=save, every_s=settings.checkpoint_s)
         return stream
 
     def _restore(self, state: dict[str, Any], job: dict[str, Any], stream: _Stream, files: CellFiles) -> bool:
@@ -224,7 +216,7 @@ class _Run:
             _empty_directory(thinned)
             cells = self._cell_files(thinned, self._name)
             stage.close()
-            voxels = CellLattice.of(settings.leaf, self._settings.origin).moved(*self._frame.origin[:2])
+            voxels = CellLattice.of(settings.leaf, settings.origin).moved(*self._frame.origin[:2])
             thin_out(stage, cells, voxels, self._lattice, room, self._progress)
             stage = cells
         if settings.encoding != "binary":
@@ -242,8 +234,7 @@ class _Run:
         return bucket.moved(*self._frame.origin[:2])
 
     def _name(self, ix: int, iy: int) -> str:
-        x, y = self._lattice.corner_text(ix, iy)
-        return f"{self._settings.prefix}_{x}_{y}.pcd"
+        return self._lattice.file_name(self._settings.prefix, ix, iy)
 
     def _job(self) -> dict[str, Any]:
         """What must be the same for a run to be resumed; as JSON would give it back."""
@@ -260,22 +251,6 @@ class _Run:
         }
         loaded: dict[str, Any] = json.loads(json.dumps(job))
         return loaded
-
-    def _check_space(self) -> None:
-        """Refuse what cannot fit, before anything is read."""
-        needed = self._points * self._row.itemsize
-        if self._settings.encoding != "binary":
-            needed *= 2  # cells as they were read, and in their final form
-        have = os.statvfs(self._space.path)
-        free = have.f_bavail * have.f_frsize
-        if self._state is not None:
-            return  # much of it exists
-        if needed > free:
-            raise CannotWrite(
-                f"the map needs about {format_bytes(needed)} in {os.path.dirname(self._space.out)}, "
-                f"{format_bytes(free)} are free",
-                hint="free some space, or choose another disk",
-            )
 
     def _report(self, stream: _Stream, cells: CellFiles) -> DividedMap:
         notes = [*self._units.notes, *self._frame.notes]
@@ -296,7 +271,6 @@ class _Run:
                 "cells have fractional corners: Autoware's loader, which reads whole metres, refuses them"
             )
         settings = self._settings
-        bounds = stream.extremes.tolist() if stream.kept else None
         return DividedMap(
             path=self._space.out,
             cells=len(cells.counts),
@@ -307,8 +281,8 @@ class _Run:
             cell_size=settings.cell_size,
             leaf=settings.leaf,
             encoding=settings.encoding,
-            fields=[(name, self._row[name].str) for name in self._row.names or ()],
-            bounds=bounds,
+            fields=field_types(self._row),
+            bounds=stream.extremes.tolist() if stream.kept else None,
             sources=[
                 {**asdict(file), "points": source.points}
                 for file, source in zip(self._files, self._sources, strict=True)
@@ -318,12 +292,6 @@ class _Run:
             crs=self._units.crs,
             unit_m=self._units.unit_m,
         )
-
-    def _write_texts(self, cells: CellFiles, report: DividedMap) -> None:
-        entries = ((self._name(*where), self._lattice.corner_text(*where)) for where in cells.counts)
-        text = metadata_text(self._lattice.size_text, entries)
-        Path(self._space.content, METADATA_NAME).write_text(text, encoding="utf-8")
-        write_report(self._space.content, report)
 
 
 def _empty_directory(path: str) -> None:
@@ -339,7 +307,7 @@ class _Stream:
     position
         Points read, of all sources together.
     kept, dropped, extremes
-        As in `Partition`, with what an earlier run did.
+        As in `Partition`, those of an interrupted run included.
     """
 
     def __init__(self, sources: Sequence[Source], layout: RowLayout) -> None:
@@ -364,7 +332,7 @@ class _Stream:
         save: Callable[[dict[str, Any]], None],
         every_s: float,
     ) -> None:
-        """Read everything from the present position on; call ``save`` with the state now and then."""
+        """Read everything from the present position on; call ``save`` with the state every ``every_s``."""
         progress.stage("dividing", sum(source.points for source in self._sources))
         progress.advance(self.position)
         before = self.kept, self.dropped, self.extremes

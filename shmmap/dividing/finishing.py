@@ -8,7 +8,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ __all__ = ["reduce_voxels", "thin_out", "write_encoded"]
 _BYTES_PER_POINT: Final = 96
 """What reducing takes for each point, beside two copies of the points."""
 
-_MOST_KEYS: Final = (1 << 63) - 1
+_MAX_KEYS: Final = (1 << 63) - 1
 _PACKED_COLOURS: Final = frozenset({"rgb", "rgba"})  # PCL keeps four bytes in a float32
 _AMOUNTS: Final = frozenset({"intensity", "red", "green", "blue", "nir"})  # integers that have a mean
 
@@ -170,11 +170,11 @@ def _keys(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.int64]:
     ix, iy, iz = (np.empty(len(rows), np.int32) for _ in AXES)
     extremes = np.zeros((2, 3))
     x, y, z = (rows[axis] for axis in AXES)
-    level, low_x, high_x, low_y, high_y = assign_cells(x, y, z, _numbers(voxels), ix, iy, extremes)
+    level, low_x, high_x, low_y, high_y = assign_cells(x, y, z, voxels.numbers, ix, iy, extremes)
     spare = np.empty(len(rows), np.int32)
-    upright, low_z, high_z, _, _ = assign_cells(z, z, z, _numbers(flat), iz, spare, extremes)
+    upright, low_z, high_z, _, _ = assign_cells(z, z, z, flat.numbers, iz, spare, extremes)
     spans = (high_x - low_x + 1, high_y - low_y + 1, high_z - low_z + 1)
-    if level < 0 or upright < 0 or math.prod(spans) > _MOST_KEYS:
+    if level < 0 or upright < 0 or math.prod(spans) > _MAX_KEYS:
         raise BadRequest(
             f"the points span too many voxels of {voxels.size:g} m to number them",
             hint="larger --leaf, or look for a damaged coordinate with `shmmap inspect`",
@@ -185,9 +185,3 @@ def _keys(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.int64]:
         keys += index
         keys -= low
     return keys
-
-
-def _numbers(lattice: CellLattice) -> Any:
-    return (
-        lattice.size, *lattice.origin, lattice.step, lattice.origin_x, lattice.origin_y, lattice.scale,
-    )  # fmt: skip

@@ -263,9 +263,11 @@ def _scale(source: Source, unit: str, vertical_unit: str, notes: list[str]) -> t
     )
     if not plane.metres or not height.metres:
         raise refusal(
-            "not_metres", units_text(plane, height), path=source.path,
+            "not_metres",
+            units_text(plane, height),
+            path=source.path,
             hint=f"say it by --unit and --vertical-unit: {', '.join(_BY_NAME)}",
-        )  # fmt: skip
+        )
     if (not unit and plane != METRE) or (not unit and not vertical_unit and height != METRE):
         raise _not_metres(source.path, plane, height)
     if (plane, height) != (METRE, METRE):
@@ -297,9 +299,11 @@ def _common_system(sources: Sequence[Source], notes: list[str]) -> str:
     if len(codes) > 1:
         (one, first), (other, second) = list(codes.items())[:2]
         raise MapDataError(
-            f"its coordinate system is EPSG:{other}, that of {first.path} EPSG:{one}", path=second.path,
-            cause="different_systems", hint="convert them to the same system, or divide them apart",
-        )  # fmt: skip
+            f"its coordinate system is EPSG:{other}, that of {first.path} EPSG:{one}",
+            path=second.path,
+            cause="different_systems",
+            hint="convert them to the same system, or divide them apart",
+        )
     if len(systems) > 1:
         notes.append(f"the inputs name their coordinate systems differently: {', '.join(list(systems)[:4])}")
     return next(iter(systems), "")

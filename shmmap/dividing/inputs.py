@@ -8,13 +8,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
-from shmmap.errors import BadRequest, MapMissing
+from shmmap.errors import BadRequest, CannotWrite, MapMissing
 from shmmap.formats.cloud import CLOUD_SUFFIXES
 from shmmap.formats.source_file import refusal
 from shmmap.origin.map_report import REPORT_NAME
 from shmmap.origin.metadata import METADATA_NAME
+from shmmap.quantities import format_bytes
 
-__all__ = ["InputFile", "check_output_directory", "check_output_place", "check_unchanged", "find_inputs"]
+__all__ = [
+    "InputFile",
+    "check_output_directory",
+    "check_output_place",
+    "check_space",
+    "check_unchanged",
+    "find_inputs",
+]
 
 _MAP_PARTS = frozenset({"pointcloud_map.pcd", METADATA_NAME, REPORT_NAME})
 
@@ -127,6 +135,23 @@ def check_output_directory(out: str, *, force: bool) -> None:
         )
     if not force:
         raise BadRequest(f"{out} is a map already", hint="--force replaces it, once the new one is complete")
+
+
+def check_space(what: str, needed: int, directory: str, *, place: str = "") -> None:
+    """Refuse what cannot fit on the disk of ``directory``, before anything is written.
+
+    Raises
+    ------
+    CannotWrite
+        Fewer than ``needed`` bytes are free.
+    """
+    have = os.statvfs(directory)
+    free = have.f_bavail * have.f_frsize
+    if needed > free:
+        raise CannotWrite(
+            f"{what} needs about {format_bytes(needed)}{place}, {format_bytes(free)} are free",
+            hint="free some space, or choose another disk",
+        )
 
 
 def _is_within(path: str, directory: str) -> bool:

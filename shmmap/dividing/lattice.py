@@ -64,6 +64,11 @@ class CellLattice:
         return cls(step, x, y, 10**places)
 
     @property
+    def numbers(self) -> tuple[float, float, float, int, int, int, int]:
+        """The lattice as `shmmap.dividing.kernels.assign_cells` takes it."""
+        return (self.size, *self.origin, self.step, self.origin_x, self.origin_y, self.scale)
+
+    @property
     def size(self) -> float:
         """Side of a cell, metres."""
         return self.step / self.scale
@@ -84,10 +89,12 @@ class CellLattice:
 
     def corner_text(self, ix: int, iy: int) -> tuple[str, str]:
         """The corner in decimals, exact; an integer whenever it is whole."""
-        return (
-            self._text(self.origin_x + ix * self.step),
-            self._text(self.origin_y + iy * self.step),
-        )
+        return self._text(self.origin_x + ix * self.step), self._text(self.origin_y + iy * self.step)
+
+    def file_name(self, prefix: str, ix: int, iy: int) -> str:
+        """The name of a cell's file, which says its corner."""
+        x, y = self.corner_text(ix, iy)
+        return f"{prefix}_{x}_{y}.pcd"
 
     @property
     def size_text(self) -> str:

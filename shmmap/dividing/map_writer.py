@@ -8,25 +8,24 @@ import itertools
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.dividing.cell_files import CellFiles, write_at
+from shmmap.dividing.cell_files import CellFiles, write_at, write_metadata
 from shmmap.dividing.inputs import check_output_directory
 from shmmap.dividing.settings import DivideSettings, lattice_of
 from shmmap.dividing.workspace import Workspace
 from shmmap.errors import BadRequest
-from shmmap.origin.metadata import METADATA_NAME, metadata_text
 
 __all__ = ["MapWriter", "WrittenMap"]
 
 Columns = Mapping[str, NDArray[Any]]
 
-_MOST_INDEX: Final = 1 << 30
+_MAX_INDEX: Final = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +110,9 @@ class MapWriter:
         self._require_open()
         rows = _rows(columns)
         if self._files is None:
-            self._files = CellFiles(self._cells_dir, rows.dtype, self._name)
+            self._files = CellFiles(
+                self._cells_dir, rows.dtype, partial(self._lattice.file_name, self._prefix)
+            )
             self._open.callback(self._files.close)
         elif self._files.row != rows.dtype:
             raise BadRequest(f"the columns changed from {self._files.row} to {rows.dtype}")
@@ -123,7 +124,7 @@ class MapWriter:
         if not len(rows):
             return
         index = [np.floor(rows[axis].astype(np.float64) / self._lattice.size) for axis in "xy"]
-        if np.abs(index).max() >= _MOST_INDEX:
+        if np.abs(index).max() >= _MAX_INDEX:
             raise BadRequest("a point is more than 2**30 cells from the origin of the map")
         ix, iy = (one.astype(np.int64) for one in index)
         key = (iy - iy.min()) * (np.ptp(ix) + 1) + (ix - ix.min())
@@ -136,7 +137,7 @@ class MapWriter:
             write_at(slot, rows[order[start:stop]].view(np.uint8).data)
 
     def finish(self) -> WrittenMap:
-        """Write the metadata, and let the map appear.
+        """Write the metadata and publish the map.
 
         Raises
         ------
@@ -148,9 +149,7 @@ class MapWriter:
             raise BadRequest(f"no points to write to {self._out_dir}")
         self._files.finish()
         cells = self._files.counts
-        entries = ((self._name(*where), self._lattice.corner_text(*where)) for where in cells)
-        text = metadata_text(self._lattice.size_text, entries)
-        Path(space.content, METADATA_NAME).write_text(text, encoding="utf-8")
+        write_metadata(space.content, self._lattice, self._prefix, cells)
         check_output_directory(self._out_dir, force=False)
         space.publish(replace=False, durable=self._durable)
         self.discard()
@@ -165,10 +164,6 @@ class MapWriter:
         if self._space is None:
             raise BadRequest(f"the map writer for {self._out_dir} is closed")
         return self._space
-
-    def _name(self, ix: int, iy: int) -> str:
-        x, y = self._lattice.corner_text(ix, iy)
-        return f"{self._prefix}_{x}_{y}.pcd"
 
 
 def _rows(columns: Columns) -> NDArray[np.void]:

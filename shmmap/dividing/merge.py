@@ -7,19 +7,27 @@ import contextlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import IO, Any, Final
+from typing import IO, Final
 
 import numpy as np
 
+from shmmap.dividing.cell_files import pcd_fields
 from shmmap.dividing.frame import choose_units
-from shmmap.dividing.inputs import InputFile, check_output_place, check_unchanged, find_inputs
+from shmmap.dividing.inputs import InputFile, check_output_place, check_space, check_unchanged, find_inputs
 from shmmap.dividing.settings import NoProgress, Progress, memory_left
-from shmmap.dividing.sources import AXES, NO_MOVE, RowLayout, Source, common_rows, open_source
-from shmmap.errors import BadRequest, CannotWrite, MapDataError
+from shmmap.dividing.sources import (
+    NO_MOVE,
+    RowLayout,
+    Source,
+    common_rows,
+    field_types,
+    open_source,
+    with_axes,
+)
+from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.durable_file import appearing_file, writing_errors
 from shmmap.formats.pcd.writer import pcd_header, pcd_rows
 from shmmap.origin.map_report import read_report
-from shmmap.quantities import format_bytes
 
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
 
@@ -32,21 +40,7 @@ _Move = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class MergedCloud:
-    """What was made.
-
-    Attributes
-    ----------
-    path
-        The file.
-    points, bytes
-        Its size.
-    files
-        How many files it was made of.
-    fields
-        Names and dtypes of what each point has.
-    origin
-        What was added to the points of divided maps, one entry per map that had an origin of its own.
-    """
+    """What `merge` wrote; ``origin`` is what it added to the points of each map that has an origin."""
 
     path: str
     points: int
@@ -97,56 +91,60 @@ def merge(
     if os.path.isdir(out) or (os.path.lexists(out) and not force):
         raise BadRequest(f"{out} exists", hint="--force replaces a file")
     with contextlib.ExitStack() as stack:
-        sources: list[Source] = []
-        read: list[InputFile] = []
-        moves: list[_Move] = []
-        origins: dict[str, list[float]] = {}
-        for path in [os.fspath(path) for path in inputs]:
-            files = find_inputs([path])
-            report = read_report(path) if os.path.isdir(path) and not keep_frame else None
-            x, y, z = report["origin"] if report is not None else NO_MOVE
-            if (x, y, z) != NO_MOVE:
-                origins[os.path.abspath(path)] = [x, y, z]
-            check_output_place([path], files, out)
-            read += files
-            for file in files:
+        names = [os.fspath(path) for path in inputs]
+        moves = {path: NO_MOVE if keep_frame else _origin_of(path) for path in names}
+        opened: list[tuple[InputFile, Source, _Move]] = []
+        for path in names:
+            for file in _checked_inputs(path, out):
                 source = open_source(
                     file.path, memory_bytes=memory_left(memory_bytes) // 2, scratch_dir=os.path.dirname(out)
                 )
                 stack.callback(source.close)
                 choose_units([source], "", "")  # refuses feet: a PCD file cannot say so
-                sources.append(source)
-                moves.append((x, y, z))
-        if not sources:
+                opened.append((file, source, moves[path]))
+        if not opened:
             raise BadRequest("nothing to merge")
+        sources = [source for _, source, _ in opened]
+        origins = {os.path.abspath(path): list(move) for path, move in moves.items() if move != NO_MOVE}
         row = common_rows(
             [source.row for source in sources], [source.path for source in sources], common_only=common_fields
         )
         if origins:
-            row = np.dtype(
-                [(name, np.dtype("<f8") if name in AXES else row[name]) for name in row.names or ()]
-            )
+            row = with_axes(row, np.dtype("<f8"))
         points = sum(source.points for source in sources)
         if not points:
             raise MapDataError("there is no point in any of the inputs", cause="no_points")
-        header = pcd_header(_fields(row), points, encoding)
+        header = pcd_header(pcd_fields(row), points, encoding)
         stack.enter_context(writing_errors(out))
-        _check_space(out, len(header) + points * row.itemsize)
+        check_space(out, len(header) + points * row.itemsize, os.path.dirname(out))
         progress.stage("merging", points)
         with appearing_file(out) as target:
             target.write(header)
-            for source, move in zip(sources, moves, strict=True):
+            for _, source, move in opened:
                 _append(target, source, RowLayout(row, move), encoding, progress)
-            check_unchanged(read)
+            check_unchanged([file for file, _, _ in opened])
         progress.done(points)
     return MergedCloud(
         path=out,
         points=points,
         bytes=os.stat(out).st_size,
         files=len(sources),
-        fields=[(name, row[name].str) for name in row.names or ()],
+        fields=field_types(row),
         origin=origins,
     )
+
+
+def _checked_inputs(path: str, out: str) -> list[InputFile]:
+    files = find_inputs([path])
+    check_output_place([path], files, out)
+    return files
+
+
+def _origin_of(path: str) -> _Move:
+    """Return what must be added to the points of an input: the origin of a divided map that has one."""
+    report = read_report(path) if os.path.isdir(path) else None
+    x, y, z = report["origin"] if report is not None else NO_MOVE
+    return x, y, z
 
 
 def _append(file: IO[bytes], source: Source, layout: RowLayout, encoding: str, progress: Progress) -> None:
@@ -159,17 +157,3 @@ def _append(file: IO[bytes], source: Source, layout: RowLayout, encoding: str, p
         left -= count
         progress.advance(count)
     source.close()  # a map has more cells than a process may have open files
-
-
-def _check_space(out: str, needed: int) -> None:
-    have = os.statvfs(os.path.dirname(out))
-    free = have.f_bavail * have.f_frsize
-    if needed > free:
-        raise CannotWrite(
-            f"{out} needs about {format_bytes(needed)}, {format_bytes(free)} are free",
-            hint="free some space, or choose another disk",
-        )
-
-
-def _fields(row: np.dtype[np.void]) -> list[tuple[str, np.dtype[Any], int]]:
-    return [(name, row[name].base, int(np.prod(row[name].shape, dtype=int))) for name in row.names or ()]

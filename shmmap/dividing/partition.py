@@ -7,8 +7,10 @@ file, and the rows, sorted by cell, written there.  Only the second is done in t
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from queue import SimpleQueue
 from types import TracebackType
@@ -17,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.dividing.cell_files import CellFiles, Slot, write_at
+from shmmap.dividing.cell_files import CellFiles, write_at
 from shmmap.dividing.kernels import assign_cells, count_cells, scatter_rows
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.sources import word_view
@@ -26,8 +28,8 @@ from shmmap.errors import BadRequest
 __all__ = ["Partition", "block_points_for", "worker_count"]
 
 _WINDOW_CELLS: Final = 1 << 22  # cells between the extremes of a block that are counted in a plain table
-_MOST_POINTS: Final = 1 << 23
-_FEWEST_POINTS: Final = 1 << 14
+_MAX_BLOCK_POINTS: Final = 1 << 23
+_MIN_BLOCK_POINTS: Final = 1 << 14
 
 Rows = NDArray[np.void]
 
@@ -41,11 +43,11 @@ def block_points_for(memory_bytes: int, row_bytes: int, threads: int) -> int:
     """Points of a block such that all buffers together take at most ``memory_bytes``."""
     per_point = (threads + 1) * row_bytes + threads * (row_bytes + 8)
     room = memory_bytes - threads * _WINDOW_CELLS * 16
-    return max(_FEWEST_POINTS, min(_MOST_POINTS, room // per_point))
+    return max(_MIN_BLOCK_POINTS, min(_MAX_BLOCK_POINTS, room // per_point))
 
 
 class Partition:
-    """Takes blocks of rows, puts them into `CellFiles`.
+    """Writes blocks of rows to `CellFiles`.
 
     Parameters
     ----------
@@ -68,9 +70,7 @@ class Partition:
 
     def __init__(self, files: CellFiles, lattice: CellLattice, *, block_points: int, threads: int) -> None:
         self._files = files
-        self._lattice = (
-            lattice.size, *lattice.origin, lattice.step, lattice.origin_x, lattice.origin_y, lattice.scale,
-        )  # fmt: skip
+        self._lattice = lattice.numbers
         self.kept = self.dropped = 0
         self.extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._block_points = block_points
@@ -105,7 +105,7 @@ class Partition:
         return self._free.get()
 
     def submit(self, buffer: Rows, count: int) -> None:
-        """Divide the first ``count`` rows of a buffer; errors of this and others come out here or later."""
+        """Divide the first ``count`` rows of a buffer; raises the errors of blocks before it."""
         done = {one for one in self._running if one.done()}
         self._running -= done
         self._see(done)
@@ -157,7 +157,7 @@ class Partition:
             wheres = np.column_stack((cells % width + low_x, cells // width + low_y))
             places = np.cumsum(counts) - counts
         elif kept:
-            # points far apart: give the cells that there are numbers of their own, in one row
+            # points far apart: number the cells that have points, in one row
             finite = ix != np.iinfo(np.int32).min
             keys = (iy[finite].astype(np.int64) << 32) + ix[finite]
             found, inverse, numbers = np.unique(keys, return_inverse=True, return_counts=True)
@@ -165,8 +165,11 @@ class Partition:
             ix[finite], iy[finite] = inverse, 0
             low_x, low_y, width = 0, 0, len(found)
             places = np.cumsum(numbers) - numbers
-        with self._my_turn(ticket):
-            slots = self._reserve(wheres, numbers)
+        with self._in_order(ticket):
+            slots = [
+                self._files.reserve((ix, iy), number)
+                for (ix, iy), number in zip(wheres.tolist(), numbers.tolist(), strict=True)
+            ]
             self.kept += kept
             self.dropped += count - kept
             np.minimum(self.extremes[0], extremes[0], out=self.extremes[0])
@@ -181,28 +184,20 @@ class Partition:
             write_at(slot, view[start * size : (start + number) * size])
             start += number
 
-    def _reserve(self, wheres: NDArray[np.int64], numbers: NDArray[np.int64]) -> list[Slot]:
-        return [
-            self._files.reserve((ix, iy), number)
-            for (ix, iy), number in zip(wheres.tolist(), numbers.tolist(), strict=True)
-        ]
-
-    def _my_turn(self, ticket: int) -> _Turn:
-        return _Turn(self, ticket)
-
     def _fail(self, error: BaseException | None = None) -> None:
         with self._turn:
             self._failed = True
             self._error = self._error or error  # the first is the cause, the others only stopped for it
             self._turn.notify_all()
 
-    def _wait_for(self, ticket: int) -> None:
+    @contextlib.contextmanager
+    def _in_order(self, ticket: int) -> Iterator[None]:
+        """Run the part of a block's work that happens in the order of the blocks."""
         with self._turn:
             self._turn.wait_for(lambda: self._failed or self._next == ticket)
             if self._failed:
                 raise _AbandonedError
-
-    def _pass_on(self) -> None:
+        yield
         with self._turn:
             self._next += 1
             self._turn.notify_all()
@@ -210,20 +205,6 @@ class Partition:
 
 class _AbandonedError(Exception):
     """Another block failed; its error is the one that counts."""
-
-
-class _Turn:
-    """The part of a block's work that happens in the order of the blocks."""
-
-    def __init__(self, partition: Partition, ticket: int) -> None:
-        self._partition, self._ticket = partition, ticket
-
-    def __enter__(self) -> None:
-        self._partition._wait_for(self._ticket)
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self._partition._pass_on()
 
 
 class _Buffers:

@@ -8,7 +8,7 @@
 
 A cloud that did not change is served at once.  Cells are named through the link, so that after a change
 they are new versions of the same cells, not other cells.  A process of its own divides: a hostile file
-costs no daemon, and a stop ends it at once; what was done until then is kept, and gone on from.  The cache
+costs no daemon, and a stop ends it at once; what was done until then is kept, and continued from.  The cache
 keeps one division of each cloud, and the clouds used last; those that a daemon serves are not touched.
 """
 
@@ -19,7 +19,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final
 
 from xxhash import xxh3_64_hexdigest
@@ -27,6 +27,7 @@ from xxhash import xxh3_64_hexdigest
 from shmmap.errors import BadRequest, CannotWrite, InternalError, MapMissing, error_from_wire
 from shmmap.formats.cloud import READABLE_SUFFIXES
 from shmmap.formats.coordinate_system import FEET
+from shmmap.formats.durable_file import locked_file
 from shmmap.logfmt import log
 from shmmap.origin.catalogue import Catalogue, MapOrigin
 from shmmap.origin.catalogue_bytes import default_cache_directory
@@ -44,7 +45,7 @@ _USE_LOCK: Final = ".use"  # held shared by every daemon that serves the cloud
 _MAKING_LOCK: Final = ".making"  # held by the one that divides it
 
 
-def _tell_nobody(*lines: str) -> None:
+def _notify_no_one(*lines: str) -> None:
     del lines
 
 
@@ -56,9 +57,9 @@ def find_origin(
     cache_dir: str = "",
     unit: str = "",
     vertical_unit: str = "",
-    tell: Callable[..., None] = _tell_nobody,
+    notify: Callable[..., None] = _notify_no_one,
 ) -> MapOrigin:
-    """Return the origin of the map at a path, be it a map or a cloud that has to be divided first.
+    """Return the origin of the map at a path, be it a map or a cloud to be divided first.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def find_origin(
         As in `open_map`; empty ones are looked for, or the user's.
     unit, vertical_unit
         Of a cloud's coordinates, as in `shmmap.dividing.frame.choose_units`.
-    tell
+    notify
         Sends ``KEY=value`` lines of progress to the service manager, see `DividedCloud`.
 
     Raises
@@ -82,7 +83,7 @@ def find_origin(
     in_feet = unit in FEET or vertical_unit in FEET
     if is_cloud and (in_feet or not (suffix == ".pcd" and is_served_whole(path))):
         cache_dir = absolute_path(cache_dir or default_cache_directory())
-        return DividedCloud(path, cache_dir, strict=strict, units=(unit, vertical_unit), tell=tell)
+        return DividedCloud(path, cache_dir, strict=strict, units=(unit, vertical_unit), notify=notify)
     if in_feet:
         raise BadRequest(
             f"{path} is a divided map, not a cloud: it is not converted",
@@ -104,7 +105,7 @@ class DividedCloud:
         As in `open_map`.
     units
         Of the cloud's coordinates, in the plane and in height, as in `find_origin`.
-    tell
+    notify
         Sends ``KEY=value`` lines to the service manager.
     """
 
@@ -115,7 +116,7 @@ class DividedCloud:
         *,
         strict: bool = False,
         units: tuple[str, str] = ("", ""),
-        tell: Callable[..., None] = _tell_nobody,
+        notify: Callable[..., None] = _notify_no_one,
     ) -> None:
         self.path = path
         self._units = units
@@ -124,7 +125,7 @@ class DividedCloud:
         self._clouds = os.path.join(cache_dir, "divided")
         self._directory = os.path.join(self._clouds, f"{stem}-{xxh3_64_hexdigest(os.fsencode(path))}")
         self._strict = strict
-        self._tell = tell
+        self._notify = notify
         self._use_lock = -1
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
@@ -173,15 +174,17 @@ class DividedCloud:
         with process, channel:
             try:
                 while packet := channel.recv(MAX_PACKET_BYTES):
-                    told = json.loads(packet)
-                    if "error" in told:
-                        failure = told
+                    report = json.loads(packet)
+                    if "error" in report:
+                        failure = report
                         continue
-                    if told["stage"] != stage:
-                        stage = told["stage"]
+                    if report["stage"] != stage:
+                        stage = report["stage"]
                         log.info("dividing", cloud=self.path, stage=stage)
-                    part = f" {told['done'] / told['total']:.0%}" if told["total"] else ""
-                    self._tell(f"STATUS={stage} {self.path}{part}", f"EXTEND_TIMEOUT_USEC={_MORE_TIME_USEC}")
+                    part = f" {report['done'] / report['total']:.0%}" if report["total"] else ""
+                    self._notify(
+                        f"STATUS={stage} {self.path}{part}", f"EXTEND_TIMEOUT_USEC={_MORE_TIME_USEC}"
+                    )
             except BaseException:
                 process.kill()
                 raise
@@ -194,7 +197,7 @@ class DividedCloud:
     # --- the cache ------------------------------------------------------------------------------
 
     def _hold(self) -> None:
-        """Say that this process serves the cloud, for as long as it lives."""
+        """Mark the cloud as served by this process, for as long as it lives."""
         if self._use_lock >= 0:
             return
         while True:
@@ -209,25 +212,18 @@ class DividedCloud:
                     return
             os.close(fd)  # another daemon has just removed it
 
-    @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _alone(self) -> contextlib.AbstractContextManager[None]:
         """Wait until no other daemon is dividing the cloud."""
-        path = os.path.join(self._directory, _MAKING_LOCK)
-        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(fd)
+        return locked_file(os.path.join(self._directory, _MAKING_LOCK))
 
     def _remove_others(self, present: str) -> None:
-        """Remove divisions of what the cloud was before, and what was begun of them."""
+        """Remove divisions of earlier states of the cloud, finished or not."""
         for entry in os.scandir(self._directory):
             if entry.is_dir(follow_symlinks=False) and entry.name != present:
                 shutil.rmtree(entry.path, ignore_errors=True)
 
     def _sweep(self) -> None:
-        """Remove the clouds that were used longest ago, if there are too many and nobody serves them."""
+        """Remove the least recently used clouds beyond those kept, unless a daemon serves them."""
         used: list[tuple[int, str]] = []
         for entry in os.scandir(self._clouds):
             with contextlib.suppress(OSError):
@@ -244,7 +240,7 @@ class DividedCloud:
 
 
 def _point(link: str, name: str) -> None:
-    """Let ``link`` lead to ``name``, in one step."""
+    """Point ``link`` to ``name``, in one step."""
     if os.path.islink(link) and os.readlink(link) == name:
         return
     interim = f"{link}.{os.getpid()}"

@@ -100,7 +100,7 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
         CellLattice.of(settings.leaf, settings.origin)
         if settings.leaf > settings.cell_size:
             raise BadRequest(f"voxels of {settings.leaf} m are larger than cells of {settings.cell_size} m")
-    # hidden files would be no cells for whoever looks for clouds in a directory
+    # hidden files are not found as clouds of a directory
     if "/" in settings.prefix or settings.prefix.startswith(".") or not settings.prefix.isprintable():
         raise BadRequest(f"{settings.prefix!r} cannot start a file name")
     if settings.encoding not in ENCODINGS:
@@ -137,7 +137,7 @@ def memory_left(limit_bytes: int) -> int:
 def peak_memory_bytes() -> int:
     """Most memory that this program ever had resident.
 
-    From ``VmHWM``: ``ru_maxrss`` would begin with the memory of whoever started the process.
+    From ``VmHWM``: ``ru_maxrss`` would begin with the memory of the process that started it.
     """
     with open("/proc/self/status", "rb") as file:
         for line in file:
@@ -147,26 +147,26 @@ def peak_memory_bytes() -> int:
 
 
 class Progress(Protocol):
-    """Hears what a run is doing; called from one thread, a few times a second at least."""
+    """Follows a run; called from one thread, at least a few times a second."""
 
     def stage(self, name: str, total: int) -> None:
-        """A stage begins, of ``total`` points; 0 where that is not known."""
+        """Begin a stage of ``total`` points; 0 where that is not known."""
 
     def advance(self, points: int) -> None:
-        """So many more points are done."""
+        """Count ``points`` more as done."""
 
     def done(self, points: int) -> None:
-        """Everything is done."""
+        """End the run."""
 
 
 class NoProgress:
-    """Tells nobody."""
+    """Shows nothing."""
 
     def stage(self, name: str, total: int) -> None:
-        """A stage begins."""
+        """Ignore a stage."""
 
     def advance(self, points: int) -> None:
-        """So many more points are done."""
+        """Ignore points."""
 
     def done(self, points: int) -> None:
-        """Everything is done."""
+        """Ignore the end."""

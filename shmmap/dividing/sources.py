@@ -27,7 +27,9 @@ __all__ = [
     "RowLayout",
     "Source",
     "common_rows",
+    "field_types",
     "open_source",
+    "with_axes",
     "word_view",
 ]
 
@@ -106,7 +108,7 @@ def common_rows(
             raise BadRequest(
                 f"no input has a field {', '.join(missing)}", hint=f"there are: {', '.join(known)}"
             )
-        rows = [_chosen(row, wanted) for row in rows]
+        rows = [np.dtype([(name, row[name]) for name in row.names or () if name in wanted]) for row in rows]
     fields: list[tuple[str, Any]] = []
     for name in rows[0].names or ():
         if name in AXES:
@@ -128,8 +130,14 @@ def common_rows(
     return np.dtype(fields)
 
 
-def _chosen(row: np.dtype[np.void], wanted: Sequence[str]) -> np.dtype[np.void]:
-    return np.dtype([(name, row[name]) for name in row.names or () if name in wanted])
+def with_axes(row: np.dtype[np.void], axis: np.dtype[Any]) -> np.dtype[np.void]:
+    """Return the packed row with x, y and z of another type."""
+    return np.dtype([(name, axis if name in AXES else row[name]) for name in row.names or ()])
+
+
+def field_types(row: np.dtype[np.void]) -> list[tuple[str, str]]:
+    """Return names and dtypes of a row's fields, as reports have them."""
+    return [(name, row[name].str) for name in row.names or ()]
 
 
 def word_view(rows: NDArray[np.void]) -> NDArray[Any]:
@@ -187,7 +195,7 @@ class Source(Protocol):
         """
 
     def close(self) -> None:
-        """Give up the file."""
+        """Close the file."""
 
 
 def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
@@ -242,9 +250,7 @@ class _BinaryPcd:
         self.warnings = reader.warnings
         self._reader: PcdReader | None = None
         self._record = reader.record
-        names = self._record.names or ()
-        axis = reader.columns[0].dtype
-        self.row = np.dtype([(name, axis if name in AXES else self._record[name]) for name in names])
+        self.row = with_axes(self._record, reader.columns[0].dtype)
         self._at = 0
         self._layout = RowLayout(self.row)
         self._direct = False

@@ -95,13 +95,13 @@ class Workspace:
         return state if isinstance(state, dict) and state.get("boot") == _boot_id() else None
 
     def save(self, state: dict[str, Any]) -> None:
-        """Remember how far the run came."""
+        """Save how far the run came."""
         interim = Path(self.path, _STATE + ".new")
         interim.write_text(json.dumps({**state, "boot": _boot_id()}))
         interim.replace(Path(self.path, _STATE))
 
     def empty(self) -> None:
-        """Start anew: remove everything but the lock."""
+        """Remove everything but the lock."""
         for name in os.listdir(self.path):
             path = os.path.join(self.path, name)
             if os.path.isdir(path):
@@ -116,10 +116,10 @@ class Workspace:
         return path
 
     def publish(self, *, replace: bool, durable: bool) -> None:
-        """Let `content` appear as ``out``, in one step; with ``replace`` in the place of what is there."""
+        """Rename `content` to ``out``, in one step; with ``replace`` in the place of what is there."""
         if durable:
             _flush_file_system(self.path)
-        # from here on what lies in the workspace may be the map that was replaced: nobody may resume from it
+        # from here on the workspace may hold the map that was replaced, which no run may resume from
         Path(self.path, _STATE).unlink(missing_ok=True)
         if replace and os.path.isdir(self.out) and os.listdir(self.out):
             _exchange(self.content, self.out, aside=os.path.join(self.path, "replaced"))

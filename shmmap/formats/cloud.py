@@ -4,10 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from types import TracebackType
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,47 +40,8 @@ READABLE_SUFFIXES: Final = (*CLOUD_SUFFIXES, *TABLE_SUFFIXES)
 """Endings of the files that are read where they are named, in lower case."""
 
 
-class BlockReader(Protocol):
-    """A cloud, opened and its header checked.
-
-    Attributes
-    ----------
-    points
-        Points in the file.
-    columns
-        ``xyz`` first, then every other column.
-    bounds
-        (min_xyz, max_xyz) where the header says so, float64.
-    encoding, version
-        Empty where the format has none.
-    crs
-        What the file says of its coordinate system; None where it says nothing.
-    warnings
-        Oddities of the file; of its data, once that was read.
-    """
-
-    path: str
-    points: int
-    columns: tuple[ColumnSpec, ...]
-    bounds: tuple[NDArray[np.float64], NDArray[np.float64]] | None
-    encoding: str
-    version: str
-    crs: CoordinateSystem | None
-
-    @property
-    def warnings(self) -> tuple[str, ...]: ...
-
-    def blocks(self, block_points: int, start: int = 0) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the columns from point ``start`` on, which may be reused by the next block."""
-
-    def __enter__(self) -> BlockReader: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-    def close(self) -> None:
-        """Close the file."""
+BlockReader: TypeAlias = LasReader | PlyReader | TextReader
+"""A cloud that is no PCD, opened and its header checked."""
 
 
 def cloud_suffix(path: str | os.PathLike[str]) -> str:

@@ -13,10 +13,11 @@ import math
 import re
 import struct
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:  # the command line reads its options without numpy
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = [
     "FEET",
@@ -249,10 +250,16 @@ _UNIT_CODES: Final = {
 }
 # State planes of the United States, whose unit follows from the code: NAD27, NAD83, NAD83(HARN).
 _STATE_PLANES: Final = (range(2222, 2290), range(2867, 2931), range(32001, 32059))
-_STATE_PLANES_FT: Final = (
-    *range(2222, 2225), *range(2251, 2254), 2256, 2265, 2266, 2269, 2270, 2273, *range(2280, 2283),
-    *range(2867, 2870), *range(2896, 2899), 2901, 2909, 2910, 2913, 2914, *range(2921, 2924),
-)  # fmt: skip
+_STATE_PLANES_FT: Final = frozenset[int]().union(
+    range(2222, 2225),
+    range(2251, 2254),
+    (2256, 2265, 2266, 2269, 2270, 2273),
+    range(2280, 2283),
+    range(2867, 2870),
+    range(2896, 2899),
+    (2901, 2909, 2910, 2913, 2914),
+    range(2921, 2924),
+)
 
 
 def geokey_system(directory: bytes, doubles: bytes, text: bytes) -> CoordinateSystem | None:
@@ -312,7 +319,7 @@ GEOGRAPHIC_SYSTEM: Final = (
     " such as UTM"
 )
 
-_MOST_DEGREES: Final = 5.0  # of x and of y; larger clouds are divided by other means
+_MAX_DEGREES: Final = 5.0  # of x and of y; larger clouds are divided by other means
 _FLATNESS: Final = 20.0  # heights are in metres, so such a cloud seems to be far higher than wide
 _OFF_ORIGIN: Final = 1.0  # what small thing stands at the origin may be as slender as that
 
@@ -323,14 +330,11 @@ def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -
     They do where x and y are possible as longitude and latitude, span few degrees, and heights span many
     times as much: a town is 0.05 degrees wide and 50 m high.
     """
-    if not (np.isfinite(lowest).all() and np.isfinite(highest).all()):
-        return ""
-    farthest = np.maximum(np.abs(lowest), np.abs(highest))
+    x, y = (max(abs(low), abs(high)) for low, high in zip(lowest[:2], highest[:2], strict=True))
     spans = highest - lowest
-    wide = float(max(spans[0], spans[1]))
-    if not (farthest[0] <= 180.0 and farthest[1] <= 90.0 and max(farthest[:2]) > _OFF_ORIGIN):
-        return ""
-    if not (0.0 < wide <= _MOST_DEGREES and spans[2] > _FLATNESS * wide):
+    wide = max(spans[:2])
+    possible = x <= 180.0 and y <= 90.0 and max(x, y) > _OFF_ORIGIN and 0.0 < wide <= _MAX_DEGREES
+    if not (possible and spans[2] > _FLATNESS * wide and all(map(math.isfinite, spans))):
         return ""
     return (
         f"x and y look like degrees, not metres: x {lowest[0]:.6g} .. {highest[0]:.6g},"

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole and are still there after a power cut, and what keeps them from being written."""
+"""Files that appear whole and survive a power cut, locks on files, and errors of writing."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import secrets
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from typing import IO, Final
 
 from shmmap.errors import CannotWrite, ShmmapError
 
-__all__ = ["appearing_file", "flush_directory", "writing_errors"]
+__all__ = ["appearing_file", "flush_directory", "locked_file", "writing_errors"]
 
 _ELSEWHERE: Final = "choose a directory that this user may write to"
 _HINTS: Final = {
@@ -63,6 +64,17 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
     flush_directory(directory or ".")
 
 
+@contextlib.contextmanager
+def locked_file(path: str, *, mode: int = 0o600) -> Iterator[None]:
+    """Hold a file's exclusive lock, waiting for it; the file is made with ``mode`` if it is not there."""
+    fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
+
+
 def flush_directory(path: str | os.PathLike[str]) -> None:
     """Force the names in a directory to the disk."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -78,7 +90,7 @@ def writing_errors(what: str) -> Iterator[None]:
     try:
         yield
     except ShmmapError:
-        raise  # also one that is an OSError: no answer of the daemon is nothing about a file
+        raise  # also one that is an OSError: that the daemon did not answer is nothing about a file
     except OSError as error:
         raise CannotWrite(
             f"cannot write {error.filename or what}: {error.strerror or error}",

@@ -186,9 +186,12 @@ class _Parser:
             raise self._error("nothing but zero bytes", "zero_filled", at=0)
         if self.head.startswith(b"version https://git-lfs"):
             raise refusal(
-                "lfs_pointer", "a git-lfs pointer instead of the data", path=self.path, offset=0,
+                "lfs_pointer",
+                "a git-lfs pointer instead of the data",
+                path=self.path,
+                offset=0,
                 hint="run git lfs pull",
-            )  # fmt: skip
+            )
         raise self._error("not a PLY file: it does not start with the line 'ply'", at=0)
 
     def _lines(self, at: int, newline: bytes) -> int:
@@ -275,9 +278,11 @@ class _Parser:
             word = axis if axis in given else axis.upper()
             if word not in given:
                 raise refusal(
-                    "no_xyz", f"the vertices have no property {axis}: not a cloud of points in space",
-                    path=self.path, offset=vertex.offset,
-                )  # fmt: skip
+                    "no_xyz",
+                    f"the vertices have no property {axis}: not a cloud of points in space",
+                    path=self.path,
+                    offset=vertex.offset,
+                )
             if word != axis:
                 self.warnings.append(f"property {word!r} is taken as {axis!r}")
             places[given.index(word)] = axis
@@ -315,9 +320,15 @@ class _Parser:
 
 
 _WRITTEN_TYPES: Final = {
-    "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float",
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
     "f8": "double",
-}  # fmt: skip
+}
 
 
 def ply_header(

@@ -21,7 +21,7 @@ from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.body import record_blocks
 from shmmap.formats.pcd.table import FieldTable
 from shmmap.formats.ply_header import HEADER_LIMIT_BYTES, PlyElement, PlyHeader, parse_ply_header
-from shmmap.formats.source_file import FileReader, SourceFile, refusal
+from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
 __all__ = ["PlyReader"]
@@ -31,8 +31,15 @@ _WALK_BYTES: Final = 1 << 20
 _SHOWN_NAME: Final = 60
 _HEADER_END: Final = re.compile(rb"[\r\n]end_header[ \t]*\r?[\r\n].", re.DOTALL)
 _COUNTERS: Final = {
-    "i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q",
-}  # fmt: skip
+    "i1": "b",
+    "u1": "B",
+    "i2": "h",
+    "u2": "H",
+    "i4": "i",
+    "u4": "I",
+    "i8": "q",
+    "u8": "Q",
+}
 
 Block = tuple[NDArray[Any], ...]
 
@@ -57,9 +64,8 @@ class PlyReader(FileReader):
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__(os.fspath(path))
+        super().__init__(path)
         try:
-            self._source = SourceFile(self._fd, self.path)
             head = self._source.peek(min(self._source.size, _FIRST_READ_BYTES))
             if len(head) < self._source.size and not _HEADER_END.search(head):
                 head = self._source.peek(min(self._source.size, HEADER_LIMIT_BYTES))
@@ -179,9 +185,11 @@ class PlyReader(FileReader):
                     (items,) = counter.unpack_from(data, at)
                     if items < 0:
                         raise refusal(
-                            "bad_row", f"row {row + 1}: a list of {items} items", path=self.path,
+                            "bad_row",
+                            f"row {row + 1}: a list of {items} items",
+                            path=self.path,
                             offset=base + at,
-                        )  # fmt: skip
+                        )
                     at += counter.size + items * item_bytes
             if keep:
                 gathered += 1

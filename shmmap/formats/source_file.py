@@ -56,15 +56,28 @@ def open_regular(path: str) -> int:
 class FileReader:
     """A reader that has a file open until it is closed, or its ``with`` block ends.
 
+    Parameters
+    ----------
+    file
+        A path, or an open file descriptor (which stays open and whose position does not matter).
+    path
+        The name used in messages when ``file`` is a descriptor.
+
     Raises
     ------
     MapDataError
         As `open_regular`.
     """
 
-    def __init__(self, path: str) -> None:
-        self.path = path
-        self._fd = open_regular(path)
+    def __init__(self, file: str | os.PathLike[str] | int, path: str = "") -> None:
+        self.path = path or (f"<descriptor {file}>" if isinstance(file, int) else os.fspath(file))
+        self._owned = not isinstance(file, int)
+        self._fd = file if isinstance(file, int) else open_regular(self.path)
+        try:
+            self._source = SourceFile(self._fd, self.path)
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self: _Self) -> _Self:
         return self
@@ -74,9 +87,13 @@ class FileReader:
     ) -> None:
         self.close()
 
+    def fileno(self) -> int:
+        """The open file's descriptor."""
+        return self._fd
+
     def close(self) -> None:
-        """Close the file."""
-        if self._fd >= 0:
+        """Close the file, unless a descriptor was given."""
+        if self._owned and self._fd >= 0:
             os.close(self._fd)
         self._fd = -1
 

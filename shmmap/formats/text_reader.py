@@ -22,7 +22,7 @@ from shmmap.errors import MapDataError
 from shmmap.formats.coordinate_system import CoordinateSystem
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.pcd.table import FieldTable
-from shmmap.formats.source_file import FileReader, SourceFile, refusal
+from shmmap.formats.source_file import FileReader, refusal
 from shmmap.formats.text_rows import NUMBER, RowParser, line_ends, whole_lines
 
 __all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]
@@ -79,10 +79,9 @@ class TextReader(FileReader):
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        super().__init__(os.fspath(path))
+        super().__init__(path)
         suffix = os.path.splitext(self.path)[1].lower()
         try:
-            self._source = SourceFile(self._fd, self.path)
             head = self._source.peek(min(self._source.size, _HEAD_BYTES))
             self._bare_cr = b"\r" in head and b"\n" not in head
             if self._bare_cr:
@@ -244,15 +243,19 @@ class _Lines:
         words = words[:-1] if trailing else words
         if any(b"," in word or len(word.split()) > 1 for word in words):
             raise self._error(
-                "bad_row", f"{_shown(text)} has two kinds of separators", start,
+                "bad_row",
+                f"{_shown(text)} has two kinds of separators",
+                start,
                 hint="separate values by white space, commas or semicolons, and write decimals with a point",
-            )  # fmt: skip
+            )
         if any(not word.strip() for word in words):
             raise self._error("bad_row", f"{_shown(text)} has an empty value", start)
         if not 3 <= len(words) <= MAX_FIELDS:
             raise self._error(
-                "no_xyz", f"{_shown(text)} has {len(words)} values; 3 to {MAX_FIELDS} can be read", start,
-            )  # fmt: skip
+                "no_xyz",
+                f"{_shown(text)} has {len(words)} values; 3 to {MAX_FIELDS} can be read",
+                start,
+            )
         return _Layout([""] * len(words), start, separator, trailing)
 
     def _name(self, layout: _Layout, comments: list[bytes], named: bytes, named_at: int) -> None:
@@ -264,9 +267,11 @@ class _Lines:
                 return
         if named:
             raise self._error(
-                "bad_header", f"{_shown(named)} names no {count} columns, x, y and z once each", named_at,
+                "bad_header",
+                f"{_shown(named)} names no {count} columns, x, y and z once each",
+                named_at,
                 hint="name the coordinates x, y and z, or leave the line out",
-            )  # fmt: skip
+            )
         others = count - 3
         names_of_others: Sequence[str] = _UNNAMED.get(others, ())
         if others == 3 and (self.suffix == ".xyzn" or self._normals(layout)):

@@ -63,7 +63,7 @@ _MAGIC: Final = b"SHMMAPCT"
 _VERSION: Final = 2
 _START: Final = struct.Struct("<8sIIQ")
 _BLOCK_BYTES: Final = 1 << 18
-_MOST_NAME_BYTES: Final = 1 << 16
+_MAX_NAME_BYTES: Final = 1 << 16
 """Many more than any path has."""
 _FLOAT64, _INT64, _INT32 = np.dtype("<f8"), np.dtype("<i8"), np.dtype("<i4")
 
@@ -128,8 +128,11 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
             return [(_INT64, (self.cells, 3))]
         names = np.dtype(f"S{self.name_bytes}"), (self.cells,)
         found: list[tuple[np.dtype[Any], tuple[int, ...]]] = [
-            names, (_FLOAT64, (4, self.cells)), (_INT64, (self.cells, 3)), (_INT32, (self.by_base,))
-        ]  # fmt: skip
+            names,
+            (_FLOAT64, (4, self.cells)),
+            (_INT64, (self.cells, 3)),
+            (_INT32, (self.by_base,)),
+        ]
         for _, cells in self.grids:
             found += [(_INT64, (cells,)), (_INT32, (cells,))]
         return found
@@ -145,7 +148,7 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
         in_grids = [cells for _, cells in self.grids]
         if (
             min(self.cells, self.by_base, *in_grids) < 0
-            or not 0 < self.name_bytes <= _MOST_NAME_BYTES
+            or not 0 < self.name_bytes <= _MAX_NAME_BYTES
             or self.by_base not in (0, self.cells)
             or sum(in_grids) not in (0, self.cells)
         ):

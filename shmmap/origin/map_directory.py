@@ -28,7 +28,7 @@ from shmmap.origin.directory_scan import ScannedFiles, scan
 from shmmap.origin.map_layout import MapLayout, OpenedDirectories, absolute_path, find_layout
 from shmmap.origin.map_report import read_map_frame
 from shmmap.origin.metadata import (
-    MOST_METADATA_BYTES,
+    MAX_METADATA_BYTES,
     TOO_LARGE,
     MapMetadata,
     list_some,
@@ -153,7 +153,7 @@ class MapDirectory:
         return json.dumps([layout.roots, layout.metadata, self.strict])
 
     def scanned(
-        self, most_bytes: int = MOST_METADATA_BYTES, opened: OpenedDirectories | None = None
+        self, max_bytes: int = MAX_METADATA_BYTES, opened: OpenedDirectories | None = None
     ) -> Catalogue:
         """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`.
 
@@ -168,7 +168,7 @@ class MapDirectory:
         if layout.metadata is not None:
             # looked at before it is read: a change meanwhile then differs from what is written down
             sources = [Source.of(layout.metadata, _status(layout.metadata, opened))]
-            data = metadata_bytes(layout.metadata, most_bytes, at=opened.at(layout.metadata))
+            data = metadata_bytes(layout.metadata, max_bytes, at=opened.at(layout.metadata))
         files = scan(layout.roots, recursive=not self.strict, at=opened.at)
         if not len(files.names):
             raise MapMissing(
@@ -265,7 +265,7 @@ def is_served_whole(path: str) -> bool:
         with PcdReader(path) as reader:
             return reader.header.points * reader.header.point_bytes <= _MAX_POINT_BYTES
     except (OSError, MapDataError):
-        return True  # who loads it says what is wrong
+        return True  # loading it says what is wrong
 
 
 def load_single_pcd(path: str) -> Catalogue:

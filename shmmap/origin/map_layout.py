@@ -65,7 +65,7 @@ class OpenedDirectories:
         flags = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
         try:
             fd = os.open(self.at(path), flags)
-        except OSError:  # who looks at it says what is wrong
+        except OSError:  # an error later says what is wrong
             return
         if _is_volume(fd):
             volume = fd

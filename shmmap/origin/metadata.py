@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 from shmmap.errors import MapDataError, MapMissing
 
 __all__ = [
+    "MAX_METADATA_BYTES",
+    "MAX_NAME_BYTES",
     "METADATA_NAME",
-    "MOST_METADATA_BYTES",
-    "MOST_NAME_BYTES",
     "TOO_LARGE",
     "EntryCollector",
     "MapMetadata",
@@ -53,15 +53,15 @@ _INT32 = range(-(2**31), 2**31)
 _RESOLUTIONS = (b"x_resolution", b"y_resolution")
 _FLUSH_ENTRIES = 1 << 14
 _NAMED_IN_PROBLEMS = 3
-_MOST_DIGITS = 64
-MOST_NAME_BYTES = 255
+_MAX_DIGITS = 64
+MAX_NAME_BYTES = 255
 """What a file system takes; the table of names has room for the longest in each row."""
 _SHOWN = 80
 
 
 def _read_corner(text: str, *, strict: bool) -> float | None:
     """Value of one corner coordinate in metres, or None if these rules do not take it."""
-    if len(text) > _MOST_DIGITS:
+    if len(text) > _MAX_DIGITS:
         return None
     if _INTEGER.fullmatch(text):
         digits = text.lstrip("+-")
@@ -123,7 +123,7 @@ class EntryCollector:
 
     def entry(self, key: bytes, x: str, y: str) -> bool:
         """Take ``key: [x, y]``."""
-        if key in _RESOLUTIONS or len(key) > MOST_NAME_BYTES:
+        if key in _RESOLUTIONS or len(key) > MAX_NAME_BYTES:
             return False
         corner_x, corner_y = _read_corner(x, strict=self.strict), _read_corner(y, strict=self.strict)
         if corner_x is None or corner_y is None:
@@ -189,7 +189,7 @@ def list_some(names: list[str]) -> str:
     return some if len(names) <= _NAMED_IN_PROBLEMS else f"{some}, ... ({len(names)} in all)"
 
 
-MOST_METADATA_BYTES: Final = 1 << 30
+MAX_METADATA_BYTES: Final = 1 << 30
 """A map of ten million cells has half of that."""
 TOO_LARGE: Final = "too_large"
 
@@ -227,7 +227,7 @@ _LINE = re.compile(
 )
 
 
-def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES, *, at: str = "") -> bytes:
+def metadata_bytes(path: str, max_bytes: int = MAX_METADATA_BYTES, *, at: str = "") -> bytes:
     """Return what is in the metadata file at ``path``; ``at`` is where to find it, if not there.
 
     Raises
@@ -239,14 +239,16 @@ def metadata_bytes(path: str, most_bytes: int = MOST_METADATA_BYTES, *, at: str 
     """
     try:
         with open(at or path, "rb") as file:
-            data = file.read(most_bytes + 1)
+            data = file.read(max_bytes + 1)
     except OSError as error:
         raise MapMissing(f"cannot read the map's metadata {path}: {error.strerror}") from error
-    if len(data) > most_bytes:
+    if len(data) > max_bytes:
         raise MapDataError(
-            f"more than {most_bytes >> 20} MiB of metadata", path=path, cause=TOO_LARGE,
+            f"more than {max_bytes >> 20} MiB of metadata",
+            path=path,
+            cause=TOO_LARGE,
             hint="it has a line for each cell: is it the map's metadata?",
-        )  # fmt: skip
+        )
     return data
 
 
@@ -328,9 +330,12 @@ def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
 
     if tag := _TAG_DIRECTIVE.search(data):
         raise MapDataError(
-            "tag directives are not read", path=path, offset=tag.start(), cause="bad_yaml",
+            "tag directives are not read",
+            path=path,
+            offset=tag.start(),
+            cause="bad_yaml",
             hint="metadata needs none: remove the line that begins with %TAG",
-        )  # fmt: skip
+        )
     try:
         for event in yaml.parse(data, Loader=_LOADER):
             if isinstance(event, yaml.AliasEvent):
@@ -393,7 +398,7 @@ def _take(entries: EntryCollector, key: str, value: list[str] | str | None, refu
     if len(value) > 2:
         entries.report("values after x and y ignored", name)
     if not entries.entry(name, value[0], value[1]):
-        if len(name) > MOST_NAME_BYTES:
+        if len(name) > MAX_NAME_BYTES:
             raise refuse(f"{key}: no file has so long a name", mark, "bad_corner")
         kind = "integers" if entries.strict else "numbers"
         raise refuse(

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading a map in a process of its own (`shmmap.origin.reread`).
 
-Python's share of reading a million cells takes seconds, during which nobody else in a process would have
-the interpreter, and memory that is not given back.  To parse a number of ten million digits takes a third of
-a second, in which no other thread runs at all.  What the process finds comes through a pipe: an error, or the
-catalogue.
+Python's share of reading a million cells takes seconds of the interpreter, and memory that is not given
+back.  A number of ten million digits takes a third of a second to parse, while no other thread runs at all.
+What the process finds comes through a pipe: an error, or the catalogue.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.catalogue_bytes import read_catalogue
 from shmmap.processes.start_child import how_ended
 
-__all__ = ["Outcome", "read_apart"]
+__all__ = ["Outcome", "ended_early", "not_started", "read_apart"]
 
 _PIPE_BYTES: Final = 1 << 20
-"""As much as every user may have: who reads gets a turn for each time that the pipe is full."""
+"""As much as every user may have: the reader needs a turn each time that the pipe is full."""
 
 
 class Outcome(msgspec.Struct):
@@ -85,14 +84,17 @@ def read_apart(
     command = [sys.executable, "-m", "shmmap.origin.reread", str(os.getpid()), words, known]
     try:
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            env=environment, cwd="/", pipesize=_PIPE_BYTES, pass_fds=descriptors,
-        )  # fmt: skip
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+            cwd="/",
+            pipesize=_PIPE_BYTES,
+            pass_fds=descriptors,
+        )
     except OSError as error:
-        raise ShmmapError(
-            f"{map_path}: cannot start a process that reads it: {error.strerror}",
-            hint="raise the limit of processes or memory (TasksMax=, ulimit -u, MemoryMax=)",
-        ) from error
+        raise not_started(map_path, "reads", error) from error
     try:
         with cast("IO[bytes]", process.stdout) as pipe:
             if line := pipe.readline():
@@ -105,7 +107,20 @@ def read_apart(
     finally:
         process.kill()
         process.wait()
-    raise ShmmapError(
-        f"{map_path}: the process that reads it ended with {how_ended(process.returncode)}",
+    raise ended_early(map_path, "reads", process.returncode)
+
+
+def not_started(what: str, does: str, error: OSError) -> ShmmapError:
+    """Return the error that a process that ``does`` something with ``what`` cannot be started."""
+    return ShmmapError(
+        f"{what}: cannot start a process that {does} it: {error.strerror}",
+        hint="raise the limit of processes or memory (TasksMax=, ulimit -u, MemoryMax=)",
+    )
+
+
+def ended_early(what: str, does: str, code: int) -> ShmmapError:
+    """Return the error that such a process ended before it had answered."""
+    return ShmmapError(
+        f"{what}: the process that {does} it ended with {how_ended(code)}",
         hint="was it killed, or is its memory too small?",
     )

@@ -20,35 +20,35 @@ from shmmap.errors import InternalError, ShmmapError
 from shmmap.origin.catalogue_bytes import write_catalogue
 from shmmap.origin.map_directory import MapDirectory
 from shmmap.origin.map_layout import OpenedDirectories
-from shmmap.origin.metadata import MOST_METADATA_BYTES
+from shmmap.origin.metadata import MAX_METADATA_BYTES
 from shmmap.origin.reading_apart import Outcome
 from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["main"]
 
-_NICENESS: Final = 10  # whoever is being served goes first
-_MOST_BYTES: Final = 8 << 30
-_MOST_S: Final = 600
+_NICENESS: Final = 10  # clients of the daemon go first
+_MAX_BYTES: Final = 8 << 30
+_MAX_CPU_S: Final = 600
 """Memory and processor time for a map; ten million cells take 2.4 GB and 70 s."""
 
 
 def main(arguments: list[str]) -> int:
-    """Run; what is wrong with the map is told, too."""
+    """Read the map and write what was found, errors included."""
     die_with(int(arguments[0]), signal.SIGTERM)
     os.nice(_NICENESS)
-    _limit(resource.RLIMIT_DATA, _MOST_BYTES)
-    _limit(resource.RLIMIT_CPU, _MOST_S)
+    _limit(resource.RLIMIT_DATA, _MAX_BYTES)
+    _limit(resource.RLIMIT_CPU, _MAX_CPU_S)
     words, descriptors = json.loads(arguments[1])
     origin = MapDirectory(**words)
     outcome, catalogue = Outcome(), None
     try:
-        catalogue = origin.scanned(MOST_METADATA_BYTES, OpenedDirectories(descriptors))
+        catalogue = origin.scanned(MAX_METADATA_BYTES, OpenedDirectories(descriptors))
     except ShmmapError as error:
         outcome = Outcome.of(error)
     except OSError as error:
         outcome = Outcome.of(ShmmapError(f"{origin.path}: {error}"))
     except MemoryError:
-        said = f"{origin.path}: to read it takes more than {_MOST_BYTES >> 30} GiB of memory"
+        said = f"{origin.path}: to read it takes more than {_MAX_BYTES >> 30} GiB of memory"
         outcome = Outcome.of(ShmmapError(said, hint="is its metadata sound?"))
     except Exception as error:  # noqa: BLE001  standard error goes nowhere
         outcome = Outcome.of(InternalError(f"{origin.path}: {type(error).__name__}: {error}"))
@@ -59,10 +59,10 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _limit(what: int, most: int) -> None:
+def _limit(what: int, value: int) -> None:
     """Lower one of this process's limits, unless it is low enough."""
     lower = [
-        most if limit == resource.RLIM_INFINITY else min(most, limit) for limit in resource.getrlimit(what)
+        value if limit == resource.RLIM_INFINITY else min(value, limit) for limit in resource.getrlimit(what)
     ]
     resource.setrlimit(what, (lower[0], lower[1]))
 

@@ -39,7 +39,7 @@ from shmmap.origin.remote.slice_part import (
     unpack_part,
     with_parts,
 )
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.store import Store, refuse_read_only
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.new_version import (
@@ -51,7 +51,6 @@ from shmmap.publishing.new_version import (
     switch_version,
 )
 from shmmap.publishing.publish import packed_root
-from shmmap.publishing.restore import object_sizes
 from shmmap.publishing.slicing import BaseVersion, changed_layers, new_objects, read_base
 
 if TYPE_CHECKING:
@@ -115,8 +114,7 @@ def join_slices(
     CannotWrite, Offline
         The store refuses, does not answer, or it took longer than a day.
     """
-    if store.read_only:
-        raise BadRequest(f"{store.url}: {store.read_only}")
+    refuse_read_only(store)
     name = read_run(run)
     seen = begin_version(store, signer, "join")
     if seen.current is None:
@@ -302,7 +300,7 @@ class _Join:
                 path = f"{self._store.url}/{self._run.part_path(of_slice)}"
                 changed = changed_layers(before, after, layers, name=path)
                 kept = after.layers.keys() - set(changed)
-                old = {one for name in kept for one in object_sizes(after.layers[name])}
+                old = {one for name in kept for one in after.layers[name].objects()}
                 new = new_objects(root, number, after, changed) - old
                 for key, objects, since in ((0, old, 0.0), (of_slice, new, since_s)):
                     looked += len(objects)

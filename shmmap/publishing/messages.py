@@ -19,6 +19,7 @@ from shmmap.origin.remote.published_object import ObjectName
 from shmmap.prepare.task_pool import Ready
 
 __all__ = [
+    "TASKS_AHEAD",
     "CellSent",
     "KnownObjects",
     "LayerSent",
@@ -30,6 +31,10 @@ __all__ = [
     "decode_slice_settings",
     "write_known_objects",
 ]
+
+
+TASKS_AHEAD: Final = 8
+"""Cells that a worker has at a time: as many are sent while the next is made."""
 
 
 class PublishSettings(msgspec.Struct, array_like=True):

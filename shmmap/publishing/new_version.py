@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What publishing, joining and restoring share: objects are sent or looked for, a version becomes current.
+"""What publishing, joining and restoring share: objects are made, sent or looked for, a version switched to.
 
 The objects of the version are sent or checked between `begin_version` and `switch_version`.
 """
@@ -8,15 +8,26 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from typing import TYPE_CHECKING, Final
 
-from shmmap.errors import CannotWrite
+import msgspec
+
+from shmmap.errors import CannotWrite, error_from_wire
 from shmmap.failpoints import step
 from shmmap.origin.remote.map_versions import CurrentState, Entry, add_version, read_current, refuse_if_signed
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
+from shmmap.prepare.task_pool import CellTask, TaskPool
+from shmmap.publishing.messages import (
+    TASKS_AHEAD,
+    CellSent,
+    NotSent,
+    PublishSettings,
+    SliceSettings,
+    decode_sent,
+)
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -26,6 +37,7 @@ __all__ = [
     "absent_objects",
     "begin_version",
     "refuse_if_late",
+    "run_workers",
     "send_object",
     "switch_version",
 ]
@@ -72,7 +84,48 @@ def absent_objects(
     return [digest for digest, _ in itertools.compress(asked, absent)]
 
 
-_LONGEST_S: Final = 86_400.0  # objects that a run reuses must not become as old as those that pruning removes
+def run_workers(
+    module: str,
+    settings: PublishSettings | SliceSettings,
+    tasks: Iterator[CellTask],
+    workers: int,
+    *,
+    finished: Callable[[CellTask, CellSent | NotSent], None],
+    died: Callable[[CellTask, str], None],
+) -> None:
+    """Have the worker processes of ``module`` make layers of cells and send them, until all tasks are done.
+
+    Parameters
+    ----------
+    finished
+        Called with what came of each task.
+    died
+        Called with a task that its worker died of, and how.
+
+    Raises
+    ------
+    ShmmapError
+        The store refuses an object: it would refuse every other, too.
+    """
+
+    def answered(task: CellTask, done: CellSent | NotSent) -> None:
+        if isinstance(done, NotSent) and not done.layer:
+            raise error_from_wire(done.code, done.message, done.hint)
+        finished(task, done)
+
+    pool: TaskPool[CellTask, CellSent | NotSent] = TaskPool(
+        module,
+        [msgspec.json.encode(settings).decode()],
+        workers=workers,
+        decode=decode_sent,
+        finished=answered,
+        died=died,
+        ahead=TASKS_AHEAD,
+    )
+    pool.run(tasks)
+
+
+_MAX_RUN_S: Final = 86_400.0  # objects that a run reuses must not become as old as those that pruning removes
 
 
 def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentState:
@@ -98,7 +151,7 @@ def begin_version(store: Store, signer: MapSigner | None, verb: str) -> CurrentS
 
 def refuse_if_late(began_s: float, what: str, hint: str) -> None:
     """Raise `CannotWrite` if a run that began then, by `time.monotonic`, took longer than a day."""
-    if time.monotonic() - began_s > _LONGEST_S:
+    if time.monotonic() - began_s > _MAX_RUN_S:
         raise CannotWrite(f"{what} took longer than a day: the version is not made current", hint=hint)
 
 

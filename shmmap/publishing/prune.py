@@ -27,7 +27,7 @@ from shmmap.origin.remote.map_versions import (
     require_current,
 )
 from shmmap.origin.remote.slice_part import PARTS
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.store import Store, refuse_read_only
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.restore import objects_of
 
@@ -71,8 +71,7 @@ def prune_versions(
     MapMissing, MapDataError, Offline
         Nothing is published there; a version that is kept cannot be read: its objects are unknown.
     """
-    if store.read_only:
-        raise BadRequest(f"{store.url}: {store.read_only}")
+    refuse_read_only(store)
     if not keep_days >= LEAST_KEEP_DAYS:
         raise BadRequest(f"versions are kept for {LEAST_KEEP_DAYS:g} days at least")
     old_s = (time.time() if now_s is None else now_s) - keep_days * _DAY_S

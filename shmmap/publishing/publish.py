@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import msgspec
 import numpy as np
 
-from shmmap.errors import BadRequest, MapDataError, MapMissing, error_from_wire
+from shmmap.errors import BadRequest, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import canonical_layers, layer_spec
@@ -38,14 +38,19 @@ from shmmap.origin.remote.published_index import (
     pack_shard,
 )
 from shmmap.origin.remote.published_object import blob_path
-from shmmap.origin.remote.store import Store
+from shmmap.origin.remote.store import Store, refuse_read_only
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
-from shmmap.prepare.task_pool import CellTask, TaskPool
-from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, decode_sent, write_known_objects
-from shmmap.publishing.new_version import begin_version, refuse_if_late, send_object, switch_version
+from shmmap.prepare.task_pool import CellTask
+from shmmap.publishing.messages import CellSent, NotSent, PublishSettings, write_known_objects
+from shmmap.publishing.new_version import (
+    begin_version,
+    refuse_if_late,
+    run_workers,
+    send_object,
+    switch_version,
+)
 from shmmap.publishing.shards import CellObjects, check_names, divide_into_shards, shard_side
-from shmmap.publishing.worker import TASKS_AHEAD
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -139,8 +144,7 @@ def publish_map(
     InstanceBusy
         Another publisher was quicker: its version is current.
     """
-    if store.read_only:
-        raise BadRequest(f"{store.url}: {store.read_only}")
+    refuse_read_only(store)
     check_names(catalogue)
     names = (LAYER, *(name for name in canonical_layers([LAYER, *layers]) if name != LAYER))
     return _Run(catalogue, store, names, progress, resend=resend, signer=signer).run(
@@ -284,8 +288,6 @@ class _Run:
                 objects.set(task.number, done)
                 for layer in done.layers:
                     self._count(layer.sent)
-            elif not done.layer:  # the store refuses: so it would each other cell
-                raise error_from_wire(done.code, done.message, done.hint)
             else:
                 result.failures.append(Failure(task.cell_id, done.layer, done.message))
             self._progress.advance(1)
@@ -296,16 +298,7 @@ class _Run:
             self._progress.advance(1)
 
         self._progress.stage("publish", len(catalogue))
-        pool: TaskPool[CellTask, CellSent | NotSent] = TaskPool(
-            "shmmap.publishing.worker",
-            [msgspec.json.encode(settings).decode()],
-            workers=workers,
-            decode=decode_sent,
-            finished=finished,
-            died=died,
-            ahead=TASKS_AHEAD,
-        )
-        pool.run(tasks())
+        run_workers("shmmap.publishing.worker", settings, tasks(), workers, finished=finished, died=died)
         return objects
 
     def _count(self, sent_bytes: int) -> None:

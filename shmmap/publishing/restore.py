@@ -18,7 +18,7 @@ from shmmap.origin.remote.map_versions import (
     read_root,
     read_shards,
 )
-from shmmap.origin.remote.published_index import LayerObjects, Root
+from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
@@ -27,7 +27,7 @@ from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, begin_v
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["Restored", "object_sizes", "objects_of", "restore_version"]
+__all__ = ["Restored", "objects_of", "restore_version"]
 
 _NAMED: Final = 3
 
@@ -100,7 +100,7 @@ def _look_for_objects(store: Store, current: Current, progress: PrepareProgress)
 
     with ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads:
         for shard in read_shards(store, root):  # which reads the shards themselves
-            objects = {named for layer in shard.layers.values() for named in object_sizes(layer)}
+            objects = {named for layer in shard.layers.values() for named in layer.objects()}
             missing += map(blob_path, absent_objects(store, sorted(objects), threads))
             looked += len(objects)
             progress.advance(len(shard))
@@ -113,12 +113,6 @@ def _look_for_objects(store: Store, current: Current, progress: PrepareProgress)
             hint="publish its map again",
         )
     return looked
-
-
-def object_sizes(layer: LayerObjects) -> Iterator[tuple[bytes, int]]:
-    """Hash and size of each object."""
-    hashes = layer.hashes.tobytes()
-    return ((hashes[32 * row : 32 * row + 32], size) for row, size in enumerate(layer.sizes.tolist()))
 
 
 def objects_of(store: Store, current: Current) -> Iterator[bytes]:
@@ -135,4 +129,4 @@ def objects_of(store: Store, current: Current) -> Iterator[bytes]:
         yield root.shard_sha256(number)
     for shard in read_shards(store, root):
         for layer in shard.layers.values():
-            yield from (digest for digest, _ in object_sizes(layer))
+            yield from (digest for digest, _ in layer.objects())

@@ -52,7 +52,7 @@ from shmmap.origin.remote.signed_metadata import (
     refused,
     target_of,
 )
-from shmmap.origin.remote.store import Store, put_over
+from shmmap.origin.remote.store import Store, put_over, refuse_read_only
 
 __all__ = ["LIFETIMES", "ROLES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
 
@@ -106,8 +106,7 @@ class MapSigner:
     """
 
     def __init__(self, store: Store, directory: str, *, make_keys: bool = True) -> None:
-        if store.read_only:
-            raise BadRequest(f"{store.url}: {store.read_only}")
+        refuse_read_only(store)
         self._store = store
         self._directory = os.path.abspath(directory)
         root_file = os.path.join(self._directory, ROOT_FILE)

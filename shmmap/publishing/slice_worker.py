@@ -35,8 +35,8 @@ from shmmap.origin.remote.published_object import (
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.processes.start_child import MAX_PACKET_BYTES
-from shmmap.publishing.messages import CellSent, KnownObjects, NotSent, decode_slice_settings
-from shmmap.publishing.worker import TASKS_AHEAD, CellMaker, Sender, make_and_send, run_worker
+from shmmap.publishing.messages import TASKS_AHEAD, CellSent, KnownObjects, NotSent, decode_slice_settings
+from shmmap.publishing.worker import CellMaker, Sender, make_and_send, run_worker
 from shmmap.segment.version import Source, Stamp
 
 __all__ = ["HELD_BYTES", "PublishedPoints", "main"]

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing, error_from_wire
+from shmmap.errors import BadRequest, InstanceBusy, MapDataError, MapMissing
 from shmmap.failpoints import step
 from shmmap.layers.disk_cache import LayerCache
 from shmmap.layers.points import LAYER
@@ -51,15 +51,13 @@ from shmmap.origin.remote.slice_part import (
     unpack_part,
     with_parts,
 )
-from shmmap.origin.remote.store import Store, Tag, put_over
+from shmmap.origin.remote.store import Store, Tag, put_over, refuse_read_only
 from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
-from shmmap.prepare.task_pool import CellTask, TaskPool
-from shmmap.publishing.messages import CellSent, NotSent, SliceSettings, decode_sent
-from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, send_object
-from shmmap.publishing.restore import object_sizes
+from shmmap.prepare.task_pool import CellTask
+from shmmap.publishing.messages import CellSent, NotSent, SliceSettings
+from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, run_workers, send_object
 from shmmap.publishing.shards import CellObjects
-from shmmap.publishing.worker import TASKS_AHEAD
 from shmmap.segment.version import Source
 
 __all__ = ["BaseVersion", "Sliced", "changed_layers", "new_objects", "prepare_slice", "read_base"]
@@ -119,7 +117,7 @@ def new_objects(root: Root, number: int, shard: Shard, changed: Collection[str])
     """Hash and size of the objects of a shard's changed layers, and of the shard if there are any."""
     if not changed:
         return set()
-    found = {one for name in changed for one in object_sizes(shard.layers[name])}
+    found = {one for name in changed for one in shard.layers[name].objects()}
     return found | {(root.shard_sha256(number), int(root.sizes[number]))}
 
 
@@ -199,8 +197,7 @@ def prepare_slice(
         Nothing is published there, the map is damaged, the store does not answer or refuses, or the cache
         directory cannot be written.
     """
-    if store.read_only:
-        raise BadRequest(f"{store.url}: {store.read_only}")
+    refuse_read_only(store)
     if not 1 <= number <= slices <= MAX_SLICES:
         raise BadRequest(
             f"there is no slice {number} of {slices}", hint=f"1/N to N/N, N at most {MAX_SLICES:,}"
@@ -388,20 +385,9 @@ class _Slice:
     # --- cells ----------------------------------------------------------------------------------
 
     def _make(self, workers: int) -> None:
-        pool: TaskPool[CellTask, CellSent | NotSent] = TaskPool(
-            "shmmap.publishing.slice_worker",
-            [msgspec.json.encode(self._settings).decode()],
-            workers=workers,
-            decode=decode_sent,
-            finished=self._finished,
-            died=self._died,
-            ahead=TASKS_AHEAD,
-        )
-        pool.run(self._tasks())
-
-    def _tasks(self) -> Iterator[CellTask]:
-        for number in self._numbers.tolist():
-            yield from self._tasks_of(number)
+        tasks = (task for number in self._numbers.tolist() for task in self._tasks_of(number))
+        module = "shmmap.publishing.slice_worker"
+        run_workers(module, self._settings, tasks, workers, finished=self._finished, died=self._died)
 
     def _tasks_of(self, number: int) -> Iterator[CellTask]:
         shard = self._shard(number)
@@ -437,8 +423,6 @@ class _Slice:
 
     def _finished(self, task: CellTask, done: CellSent | NotSent) -> None:
         if isinstance(done, NotSent):
-            if not done.layer:  # the store refuses, and would refuse every other cell
-                raise error_from_wire(done.code, done.message, done.hint)
             self._failed(task, [Failure(task.cell_id, done.layer, done.message)])
             return
         making = self._making[self._number_of(task)]

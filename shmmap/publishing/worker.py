@@ -43,6 +43,7 @@ from shmmap.prepare.worker import CellPoints
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.publishing.messages import (
+    TASKS_AHEAD,
     CellSent,
     KnownObjects,
     LayerSent,
@@ -55,7 +56,6 @@ from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.version import Source
 
 __all__ = [
-    "TASKS_AHEAD",
     "CellMaker",
     "LayerRefused",
     "MadeCell",
@@ -67,8 +67,24 @@ __all__ = [
 ]
 
 _NICENESS: Final = 5
-TASKS_AHEAD: Final = 8
-"""Cells that a worker has at a time: as many are sent while the next is made."""
+_XYZ: Final = "xyz"
+
+
+class RoundedFiles(Files):
+    """A `shmmap.layers.source_reader.SourceReader`: rows and coordinates as a reader of the map has them."""
+
+    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
+        """Read the file, its points rounded and in their new order."""
+        found = super().read(source, box, None if needs is None else [_XYZ, *(n for n in needs if n != _XYZ)])
+        table = found.points
+        columns = {name: values for name, values in table.columns.items() if needs is None or name in needs}
+        rounded = to_millimetres(table.columns[_XYZ])
+        if rounded is None:
+            return replace(found, points=replace(table, columns=columns))
+        xyz = rounded.xyz
+        ordered = {name: xyz if name == _XYZ else values[rounded.order] for name, values in columns.items()}
+        low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
+        return replace(found, points=replace(table, columns=ordered), z_min=low, z_max=high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,23 +318,3 @@ def main(arguments: list[str]) -> int:
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))
-
-
-_XYZ: Final = "xyz"
-
-
-class RoundedFiles(Files):
-    """A `shmmap.layers.sources.SourceReader`: rows and coordinates as a reader of the map has them."""
-
-    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
-        """Read the file, its points rounded and in their new order."""
-        found = super().read(source, box, None if needs is None else [_XYZ, *(n for n in needs if n != _XYZ)])
-        table = found.points
-        columns = {name: values for name, values in table.columns.items() if needs is None or name in needs}
-        rounded = to_millimetres(table.columns[_XYZ])
-        if rounded is None:
-            return replace(found, points=replace(table, columns=columns))
-        xyz = rounded.xyz
-        ordered = {name: xyz if name == _XYZ else values[rounded.order] for name, values in columns.items()}
-        low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
-        return replace(found, points=replace(table, columns=ordered), z_min=low, z_max=high)

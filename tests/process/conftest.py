@@ -17,7 +17,7 @@ from tests.support.command_line import Verbs
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_reference import LIVE_TOML, LiveDaemon
-from tests.support.map_stores import _buckets, buckets, web  # noqa: F401  fixtures
+from tests.support.map_stores import _buckets, buckets, signed_maps, web  # noqa: F401  fixtures
 from tests.support.raw_client import RawClient
 
 RESOLUTION = 0.2  # that of ``live_drive``, which compiles kernels: before pytest has said where they are kept

@@ -130,7 +130,7 @@ def test_a_disk_that_is_full(cloud: Path, tmp_path: Path, private_tmpfs: Callabl
     assert "are free" in done.stderr
     assert "hint: " in done.stderr
     assert os.listdir(small) == []
-    # room for the points, but not for so many files
+    # room for the points, but not for the number of files
     few = Path(private_tmpfs("16m,nr_inodes=40"))
     done = shmmap("divide", cloud, few / "map")
     assert done.returncode == 73

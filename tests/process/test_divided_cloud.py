@@ -60,7 +60,7 @@ def served(client: RawClient) -> list[tuple[float, ...]]:
 
 
 def points(columns: Columns) -> list[tuple[float, ...]]:
-    """Coordinates to the millimetre that LAS files have, and what tells the points apart."""
+    """Coordinates to the millimetre that LAS files have, and what distinguishes the points."""
     rounded = {axis: np.round(columns[axis], 3) for axis in "xyz"}
     return rows_of({**rounded, "time_stamp": columns["time_stamp"]})
 

@@ -43,12 +43,12 @@ def test_which_maps_are_divided_first(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_cache_keeps_what_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(served_cloud, "_KEPT_CLOUDS", 1)
-    told: list[str] = []
+    sent: list[str] = []
     served = DividedCloud(
-        str(cloud(tmp_path / "0.pcd")), str(tmp_path / "cache"), tell=lambda *lines: told.extend(lines)
+        str(cloud(tmp_path / "0.pcd")), str(tmp_path / "cache"), notify=lambda *lines: sent.extend(lines)
     )
     assert len(served.load()) > 4
-    assert any(line.startswith("STATUS=") for line in told)
+    assert any(line.startswith("STATUS=") for line in sent)
     for i in (1, 2):
         origin = DividedCloud(str(cloud(tmp_path / f"{i}.pcd")), str(tmp_path / "cache"))
         origin.load()
@@ -72,7 +72,7 @@ def test_a_change_is_seen_and_nothing_old_stays(tmp_path: Path) -> None:
 
 def test_where_the_daemon_was_started_plays_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What lies there is not imported, and a cache named from there is found again from elsewhere."""
-    (tmp_path / "json.py").write_text("raise SystemExit('somebody else wrote this')")
+    (tmp_path / "json.py").write_text("raise SystemExit('another program wrote this')")
     monkeypatch.chdir(tmp_path)
     cloud(tmp_path / "a.laz.pcd")
     monkeypatch.setattr(map_directory, "MAX_SINGLE_PCD_BYTES", 500)

@@ -15,8 +15,8 @@ import pytest
 
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
-from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap, random_points
+from tests.support.published_daemon import until
 from tests.support.raw_client import RawClient, circle
 from tests.support.segment_reader import read_segment
 from tests.support.web_servers import faulty_web
@@ -119,7 +119,7 @@ def test_every_reply_is_the_set_difference(
                 web.fault = lambda _path: "503"
             if number == len(places) // 4 + 6:
                 web.heal()
-                until_back(drivers[0], x, states)
+                until(lambda x: drivers[0].step(x, states, 5.0), x)
             if number == len(places) // 2:
                 for seed, name in enumerate(sorted(made.corners)[::3]):
                     made.change(name, seed=seed, count=20)
@@ -140,9 +140,3 @@ def test_every_reply_is_the_set_difference(
         assert seen[3] == 0
         counters = operator.ask("stats")[4]
         assert 0 < counters["map_cells_known"] < 0.8 * SHARDS * CELLS, "the whole list has no room"
-
-
-def until_back(driver: Driver, x: float, states: dict[int, State]) -> None:
-    waiting = Deadline()
-    while waiting(not driver.step(x, states, 5.0)):
-        pass

@@ -14,15 +14,15 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import Shmmap, publish
+from tests.support.command_line import Verbs, publish
 from tests.support.daemon_process import DaemonProcess, Deadline, counters
 from tests.support.divided_map import make_map
+from tests.support.published_daemon import ALL, flip, until, until_taken
 from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 
-ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 CELLS = PAGES = 4
 
 
@@ -35,11 +35,9 @@ def web(tmp_path: Path) -> Iterator[FaultyWeb]:
         yield one
 
 
-def until(one: DaemonProcess, is_so: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
+def counts_when(one: DaemonProcess, is_so: Callable[[Mapping[str, int]], bool]) -> Mapping[str, int]:
     """Wait for counters of which ``is_so`` is true; returns them."""
-    waiting = Deadline()
-    while waiting(not is_so(counters(one))):
-        time.sleep(0.02)
+    until(lambda: is_so(counters(one)))
     return counters(one)
 
 
@@ -51,7 +49,7 @@ def load_all(one: DaemonProcess) -> shmmap.CellSet:
 def evict_all(one: DaemonProcess, client: shmmap.Client) -> None:
     """Evict all cells, and wait until none could be reused."""
     client.evict()
-    until(one, lambda counts: not counts["cells_resident"] and not counts["zombies"])
+    counts_when(one, lambda counts: not counts["cells_resident"] and not counts["zombies"])
 
 
 def objects(web: FaultyWeb) -> list[Path]:
@@ -64,7 +62,7 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
     assert load_all(one).complete
     sizes = [path.stat().st_size for path in objects(web)]
     assert len(sizes) == CELLS + PAGES + 1
-    counts = until(one, lambda counts: counts["objects_fetched"] == len(sizes))
+    counts = counts_when(one, lambda counts: counts["objects_fetched"] == len(sizes))
     assert counts["bytes_fetched"] == sum(sizes)
     assert (counts["objects_from_disk"], counts["fetches_failed"]) == (0, 0)
     assert counts["published_version"] == 1
@@ -76,14 +74,14 @@ def test_what_is_fetched_and_what_is_on_the_disk(daemon: DaemonFactory, web: Fau
         CELLS,
     )
     taken_ns = counts["published_taken_unix_ns"]
-    waiting = Deadline()
-    while waiting(not list(one.state_dir.rglob("*.taken"))):
-        time.sleep(0.02)
+    until_taken(one)
 
     one.stop()
     one.start()
     assert load_all(one).complete
-    counts = until(one, lambda counts: counts["objects_from_disk"] == CELLS + PAGES)  # the root is state
+    counts = counts_when(
+        one, lambda counts: counts["objects_from_disk"] == CELLS + PAGES
+    )  # the root is state
     assert (counts["objects_fetched"], counts["published_taken_unix_ns"]) == (0, taken_ns)
 
 
@@ -93,51 +91,32 @@ def test_damage_and_failures_are_counted(daemon: DaemonFactory, web: FaultyWeb) 
     kept = [path for path in Path(one.cache_dir).rglob("objects/cells/*/*") if path.is_file()]
     assert len(kept) == CELLS
     one.stop()
-    content = kept[0].read_bytes()
-    kept[0].write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    flip(kept[0])
     kept[1].unlink()
     lost = kept[1].name
     web.fault = lambda path: "corrupt" if path.endswith(lost) else ""
     one.start()
     cells = load_all(one)
     assert len(cells.failed) == 1
-    counts = until(one, lambda counts: counts["objects_damaged_in_store"] == 2)  # it is asked twice
+    counts = counts_when(one, lambda counts: counts["objects_damaged_in_store"] == 2)  # it is asked twice
     assert (counts["objects_damaged_on_disk"], counts["fetches_failed"]) == (1, 2)
 
     before_ns = time.time_ns()
     web.refuse()
     with shmmap.connect(one.endpoint) as client:
-        waiting = Deadline()
-        while waiting([failure.code for failure in client.area(ALL, wait=5.0).failed] != ["offline"]):
-            time.sleep(0.05)
-    counts = until(one, lambda counts: counts["origin_out"] == 1 and counts["fetches_failed"] > 2)
+        until(lambda: [failure.code for failure in client.area(ALL, wait=5.0).failed] == ["offline"])
+    counts = counts_when(one, lambda counts: counts["origin_out"] == 1 and counts["fetches_failed"] > 2)
     assert before_ns < counts["origin_out_since_unix_ns"] < time.time_ns()
     web.listen()
-    counts = until(one, lambda counts: counts["origin_out"] == 0)
+    counts = counts_when(one, lambda counts: counts["origin_out"] == 0)
     assert counts["origin_out_since_unix_ns"] == 0
-
-
-def test_a_refused_offer_is_shown_until_another_one_comes(
-    daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path
-) -> None:
-    first = (web.folder / "CURRENT").read_bytes()
-    other = make_map(tmp_path / "other", columns=2, rows=2, points=200)
-    publish(other.root, web.folder)
-    second = (web.folder / "CURRENT").read_bytes()
-    one = daemon(web.url, "--poll", "1")
-    until(one, lambda counts: counts["published_version"] == 2)
-    (web.folder / "CURRENT").write_bytes(first)
-    until(one, lambda counts: counts["published_refused"] == 1)
-    assert "version 1, which is offered, is refused, older" in Shmmap(one, tmp_path)("status")
-    (web.folder / "CURRENT").write_bytes(second)
-    until(one, lambda counts: counts["published_refused"] == 0)
 
 
 def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -> None:
     one = daemon(web.url, "--poll", "0")
     assert load_all(one).complete
-    until(one, lambda counts: counts["objects_fetched"] == CELLS + PAGES + 1)
-    shmmap_ = Shmmap(one, tmp_path)
+    counts_when(one, lambda counts: counts["objects_fetched"] == CELLS + PAGES + 1)
+    shmmap_ = Verbs(one, tmp_path)
     shown: dict[str, Any] = shmmap_.json("status")["published"]
     assert shmmap_.json("top")["published"].keys() == shown.keys()
     assert (shown["version"], shown["objects_fetched"], shown["cells_known"]) == (1, CELLS + PAGES + 1, CELLS)
@@ -169,7 +148,7 @@ def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
         waiting = Deadline()
         while waiting(len(client.area(ALL, wait=5.0).failed) != CELLS):
             evict_all(one, client)  # the counters were of before, and what was evicted was used again
-    until(one, lambda counts: counts["origin_out"] == 1)
+    counts_when(one, lambda counts: counts["origin_out"] == 1)
     assert re.search(
         r"^origin +out of reach for .* \(since .* UTC\): what is in memory and on", shmmap_("status"), re.M
     )
@@ -182,7 +161,7 @@ def test_nothing_of_it_where_the_map_is_files(daemon: DaemonFactory, tmp_path: P
     made = make_map(tmp_path / "town", columns=2, rows=2, points=300)
     one = daemon(made.root)
     assert load_all(one).complete
-    shmmap_ = Shmmap(one, tmp_path)
+    shmmap_ = Verbs(one, tmp_path)
     assert shmmap_.json("status")["published"] is None
     assert shmmap_.json("top")["published"] is None
     for text in (shmmap_("status"), shmmap_("top", "--once"), shmmap_("map")):

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +11,7 @@ from shmmap.dividing.settings import NoProgress
 from shmmap.errors import BadRequest, InstanceBusy, MapMissing, ShmmapError
 from shmmap.origin.map_directory import open_map
 from tests.process.conftest import Meanwhile
+from tests.support.command_line import make_older
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.published_maps import PublishedMapReader
 
@@ -26,8 +24,6 @@ from shmmap.publishing.messages import PublishSettings
 from shmmap.publishing.prune import Pruned
 from shmmap.publishing.publish import Published
 from shmmap.publishing.restore import Restored
-
-DAY_S = 86_400
 
 
 @pytest.fixture
@@ -69,12 +65,8 @@ def program(tmp_path: Path, town: DividedMap) -> Program:
     for seed in (1, 2, 3):
         made.publish(seed)
     for version, days in ((1, 50), (2, 40), (3, 20)):
-        path = made.folder / f"versions/{version}.json"
-        entry = json.loads(path.read_bytes())
-        entry["created"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(time.time() - days * DAY_S))
-        path.write_text(json.dumps(entry))
-    for blob in (made.folder / "blobs/sha256").iterdir():
-        os.utime(blob, (1, 1))
+        make_older(made.folder, days, version)
+    make_older(made.folder, 999)
     return made
 
 

@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -14,14 +12,14 @@ import pytest
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import publish
-from tests.support.daemon_process import DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
+from tests.support.published_daemon import ALL, all_cells, until
 from tests.support.web_servers import Nginx, free_port, needed_nginx, web_server
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 pytest.importorskip("obstore", reason="obstore is not installed")
 
-ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 SLOWLY = "limit_rate 1k;"
 """A cell takes half a minute: a connection that is cut off was in the middle of one."""
 
@@ -70,20 +68,14 @@ def loaded(cells: shmmap.CellSet) -> Cells:
     return {cell.id.rsplit("/", 1)[1]: cell.xyz[:, 0].tobytes() for cell in cells}
 
 
-def test_every_column_is_that_of_the_files(daemon: DaemonFactory, town: Town) -> None:
-    with shmmap.connect(daemon(town.url).endpoint) as client:
-        cells = client.area(ALL, wait=120.0)
-        assert cells.complete, cells.failed
-        assert loaded(cells) == of_files(town.files)
-
-
-def test_polls_are_answered_by_not_modified(daemon: DaemonFactory, town: Town, tmp_path: Path) -> None:
+def test_cells_are_those_of_the_files_and_polls_are_answered_by_not_modified(
+    daemon: DaemonFactory, town: Town, tmp_path: Path
+) -> None:
     log = tmp_path / "asked.log"
     town.restart(f"access_log {log};")
-    daemon(town.url, "--poll", "1")
-    waiting = Deadline()
-    while waiting('/town/CURRENT HTTP/1.1" 304' not in log.read_text()):
-        time.sleep(0.05)
+    with shmmap.connect(daemon(town.url, "--poll", "1").endpoint) as client:
+        assert loaded(all_cells(client)) == of_files(town.files)
+    until(lambda: '/town/CURRENT HTTP/1.1" 304' in log.read_text())
 
 
 def ask_all(one: DaemonProcess, answers: list[Cells]) -> None:
@@ -99,43 +91,14 @@ def test_transfers_that_are_cut_off_are_begun_again(daemon: DaemonFactory, town:
     asking = threading.Thread(target=ask_all, args=(one, answers))
     asking.start()
     try:
-        waiting = Deadline()
-        while waiting(not town.nginx.connections()):
-            time.sleep(0.01)
+        until(lambda: town.nginx.connections())
         town.nginx.kill()
         with shmmap.connect(one.endpoint) as client:
-            while waiting(not client.area(ALL, wait=5.0).failed):
-                time.sleep(0.02)
+            until(lambda: client.area(ALL, wait=5.0).failed)
             kept = [path for path in Path(one.cache_dir).rglob("objects/cells/*/*") if path.is_file()]
             assert kept == [], "nothing of an interrupted transfer is kept"
             town.restart()
-            while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
-                time.sleep(0.02)
-            assert loaded(cells) == of_files(town.files)
+            assert loaded(all_cells(client)) == of_files(town.files)
     finally:
         asking.join()
     assert set().union(*answers) <= of_files(town.files).keys()
-
-
-def test_objects_cut_short_or_changed_are_refused_until_they_are_whole(
-    daemon: DaemonFactory, town: Town
-) -> None:
-    one = daemon(town.url, "--poll", "0")
-    blobs = sorted((town.root / "town/blobs/sha256").iterdir(), key=lambda path: path.stat().st_size)
-    short, changed = blobs[-1], blobs[-2]
-    whole = {path: path.read_bytes() for path in (short, changed)}
-    short.write_bytes(whole[short][:-10])
-    changed.write_bytes(whole[changed][:-1] + bytes([whole[changed][-1] ^ 1]))
-    with shmmap.connect(one.endpoint) as client:
-        cells = client.area(ALL, wait=120.0)
-        assert len(cells.failed) == 2
-        assert {failure.code for failure in cells.failed} == {"load_failed"}
-        assert loaded(cells).items() <= of_files(town.files).items()
-        del cells
-        for path, data in whole.items():
-            path.write_bytes(data)
-        waiting = Deadline()
-        while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
-            with suppress(shmmap.ShmmapError):
-                client.reload()
-        assert loaded(cells) == of_files(town.files)

@@ -17,10 +17,20 @@ import shmmap
 from shmmap.doctor.signed_map import trust_problems
 from shmmap.errors import Offline, ShmmapError
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import Verbs, doctor, health, verb
+from tests.support.command_line import Verbs as Verbs
+from tests.support.command_line import doctor, health, verb
 from tests.support.compiled_programs import built_preload
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline, counters, stop
+from tests.support.daemon_process import DaemonProcess, Deadline, counters, stop
 from tests.support.divided_map import make_map
+from tests.support.published_daemon import (
+    flip,
+    until,
+    until_asked,
+    until_health,
+    until_taken,
+    versions_of,
+    without,
+)
 from tests.support.web_servers import FaultyWeb, faulty_web
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -29,68 +39,39 @@ pytest.importorskip("tuf", reason="tuf is not installed")
 
 from tests.support.published_maps import Signed, in_days
 
-ALL = shmmap.Box(-1e6, -1e6, 1e6, 1e6)
 DAY_S = 86400
 
 
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One map with versions 1 and 2; an equal number for another map; the same by others; all signed."""
-    folder = tmp_path_factory.mktemp("served-signed")
-    made = make_map(folder / "town", columns=2, rows=1, points=100)
-    run = Verbs(folder)
-    run("publish", made.root, folder / "one", "--sign", folder / "keys", "--id-prefix", "/town/")
-    shutil.copytree(folder / "one", folder / "two")
-    shutil.copytree(folder / "one", folder / "equal")
-    made.change("0_0.pcd", seed=1)
-    run("publish", made.root, folder / "two", "--sign", folder / "keys")
-    run("publish", made.root, folder / "other", "--sign", folder / "others", "--id-prefix", "/town/")
-    made.change("0_0.pcd", seed=2)
-    run("publish", made.root, folder / "equal", "--sign", folder / "keys")
-    signed = Signed(folder / "equal", folder / "keys")  # newer than the other version 2
-    signed.write("targets", version=3)
-    signed.snapshot.signed.meta["targets.json"].version = signed.timestamp.signed.snapshot_meta.version = 3
-    signed.write("snapshot", version=3)
-    signed.write("timestamp", version=3)
-    return folder
-
-
 @pytest.fixture
-def web(made_once: Path, tmp_path: Path) -> Iterator[FaultyWeb]:
+def web(signed_maps: Path, tmp_path: Path) -> Iterator[FaultyWeb]:
     """A web server of the map's version 1."""
-    shutil.copytree(made_once / "one", tmp_path / "www")
+    shutil.copytree(signed_maps / "one", tmp_path / "www")
     with faulty_web(tmp_path / "www") as one:
         yield one
 
 
 @pytest.fixture
-def keys(made_once: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made_once / "keys", tmp_path / "keys"))
+def keys(signed_maps: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(signed_maps / "keys", tmp_path / "keys"))
 
 
 @pytest.fixture
-def offer(made_once: Path, web: FaultyWeb) -> Callable[[str], None]:
+def offer(signed_maps: Path, web: FaultyWeb) -> Callable[[str], None]:
     """Have the web server offer another state of the map, in one step."""
 
     def change(name: str) -> None:
         late = ("timestamp.json", "CURRENT")
         shutil.copytree(
-            made_once / name, web.folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns(*late)
+            signed_maps / name, web.folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns(*late)
         )
         for path in late:
-            shutil.copy(made_once / name / path, web.folder / f"{path}.new")
+            shutil.copy(signed_maps / name / path, web.folder / f"{path}.new")
             (web.folder / f"{path}.new").rename(web.folder / path)
 
     return change
 
 
 Offering = Callable[[str], None]
-
-
-def flip(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
 
 
 def sign_timestamp(web: FaultyWeb, keys: Path, **fields: object) -> Signed:
@@ -108,31 +89,9 @@ def trusting(keys: Path) -> tuple[str, str]:
     return "--trust", str(keys / "ROOT.json")
 
 
-def versions_of(one: DaemonProcess) -> dict[str, int]:
-    with shmmap.connect(one.endpoint) as client:
-        cells = client.area(ALL, wait=60.0)
-        assert cells.complete, cells.failed
-        return {cell.id: cell.version for cell in cells}
-
-
 def problems(one: DaemonProcess) -> str:
     """Problems with the signature and the offer, by the statistics."""
     return "; ".join(trust_problems(counters(one), time.time()))
-
-
-def until_remembered(one: DaemonProcess) -> None:
-    waiting = Deadline()
-    while waiting(not list(one.state_dir.rglob("*.taken"))):
-        time.sleep(0.02)
-
-
-def until_polled(web: FaultyWeb, times: int) -> list[tuple[str, int]]:
-    """Wait for ``times`` requests of the timestamp; returns all requests."""
-    asked, waiting = web.requests(), Deadline()
-    while waiting(sum(path == "timestamp.json" for path, _ in asked) < times):
-        time.sleep(0.02)
-        asked += web.requests()
-    return asked
 
 
 # --- the first start ----------------------------------------------------------------------------------
@@ -178,7 +137,8 @@ def test_current_is_not_read(daemon: DaemonFactory, web: FaultyWeb, keys: Path, 
     web.requests()
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     assert len(versions_of(one)) == 2
-    assert not [path for path, _ in until_polled(web, 3) if path in ("CURRENT", "versions/2.json")]
+    asked = until_asked(web, "timestamp.json", 3)
+    assert not [path for path, _ in asked if path in ("CURRENT", "versions/2.json")]
     assert "signature" in verb(one, "status")[1]
     assert health(one)[0] == 0
     # a directory without it, too
@@ -186,26 +146,16 @@ def test_current_is_not_read(daemon: DaemonFactory, web: FaultyWeb, keys: Path, 
     assert versions_of(two).keys() == versions_of(one).keys()
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "says"),
-    [
-        (["--trust", "/nowhere/ROOT.json"], 78, "/nowhere/ROOT.json: No such file"),
-        (["--trust", "/proc/self/status"], 78, "no root of trust"),
-    ],
-)
-def test_a_root_of_trust_that_is_none(
-    daemon: DaemonFactory, web: FaultyWeb, words: list[str], code: int, says: str
-) -> None:
-    one = daemon(web.url, *words, start=False)
-    assert one.run_to_end() == code
-    assert says in one.log
-
-
-def test_files_cannot_be_verified(daemon: DaemonFactory, made_once: Path, keys: Path) -> None:
-    one = daemon(made_once / "town/pointcloud_map.pcd/0_0.pcd", *trusting(keys), start=False)
+def test_what_cannot_be_verified(daemon: DaemonFactory, signed_maps: Path, keys: Path) -> None:
+    """Files, an unsigned map, and a map under what is no root of trust."""
+    for trust, says in (("/nowhere/ROOT.json", "No such file"), ("/proc/self/status", "no root of trust")):
+        one = daemon(signed_maps / "one", "--trust", trust, start=False)
+        assert one.run_to_end() == 78
+        assert says in one.log
+    one = daemon(signed_maps / "town/pointcloud_map.pcd/0_0.pcd", *trusting(keys), start=False)
     assert one.run_to_end() == 78
     assert "--trust is for a published map" in one.log
-    one = daemon(made_once / "town", *trusting(keys), start=False)
+    one = daemon(signed_maps / "town", *trusting(keys), start=False)
     assert one.run_to_end() == 65
     assert "refused, unsigned" in one.log
 
@@ -213,10 +163,7 @@ def test_files_cannot_be_verified(daemon: DaemonFactory, made_once: Path, keys: 
 def test_without_the_package_it_says_what_to_install(
     daemon: DaemonFactory, web: FaultyWeb, keys: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "without").mkdir()
-    (tmp_path / "without" / "tuf.py").write_text("raise ModuleNotFoundError(name='tuf')\n")
-    path = f"{tmp_path / 'without'}:{ROOT}"
-    one = daemon(web.url, *trusting(keys), start=False, environment={"PYTHONPATH": path})
+    one = daemon(web.url, *trusting(keys), start=False, environment=without("tuf", tmp_path))
     assert one.run_to_end() == 69
     assert "pip install tuf 'securesystemslib[crypto]'" in one.log
 
@@ -229,17 +176,15 @@ def test_a_new_version_is_taken_when_it_is_signed(
 ) -> None:
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     before = versions_of(one)
-    asked = until_polled(web, 5)
+    asked = until_asked(web, "timestamp.json", 5)
     verified = [path for path, _ in asked if path == "2.root.json"]
     assert ("timestamp.json", 304) in asked, "polls are conditional"
     assert len(verified) <= 2, "and verify nothing that has not changed"
     offer("two")
-    waiting = Deadline()
-    while waiting((now := versions_of(one)) == before):
-        time.sleep(0.05)
+    until(lambda: versions_of(one) != before)
+    now = versions_of(one)
     assert [cell for cell in now if now[cell] != before[cell]] == ["/town/0_0.pcd"]
-    while waiting(health(one)[0] != 0):
-        time.sleep(0.05)
+    until_health(one, 0)
     assert doctor(one)[1]["signature"]["state"] == "ok"
     assert "reload failed" not in one.log
 
@@ -256,34 +201,27 @@ def test_what_is_refused_later_is_said_once_and_what_was_taken_is_served(
     }  # fmt: skip
     for number, (name, change) in enumerate(changes.items(), 1):
         change(web, keys, offer)
-        waiting = Deadline()
-        while waiting(f"is refused, {name}" not in problems(one)):
-            time.sleep(0.02)
+        until(lambda name: f"is refused, {name}" in problems(one), name)
         web.requests()
-        until_polled(web, 4)  # by then it is logged: verifying asks twice itself
+        until_asked(web, "timestamp.json", 4)  # by then it is logged: verifying asks twice itself
         logged = one.log.count("reload failed")  # also of what was seen while the store was being changed
         assert logged >= number
-        until_polled(web, 3)
+        until_asked(web, "timestamp.json", 3)
         assert one.log.count("reload failed") == logged
         assert versions_of(one) == served
         shutil.rmtree(web.folder)
         web.folder.mkdir()
         offer("two")
         sign_timestamp_of(Signed(web.folder, keys), version=10 * number)
-        waiting = Deadline()
-        while waiting(problems(one) != "" or counters(one)["last_reload_failed"] != 0):
-            time.sleep(0.02)
+        until(lambda: problems(one) == "" and not counters(one)["last_reload_failed"])
     offer("equal")
     sign_timestamp_of(Signed(web.folder, keys), version=100)
-    waiting = Deadline()
-    while waiting("is refused, altered" not in problems(one)):
-        time.sleep(0.02)
+    until(lambda: "is refused, altered" in problems(one))
     assert "offers another map as version 2" in one.log
     assert versions_of(one) == served
     made = make_map(tmp_path / "town", columns=2, rows=1, points=100)
     assert Verbs(tmp_path).json("publish", made.root, web.folder, "--sign", keys)["version"] == 3
-    while waiting(versions_of(one) == served or problems(one) != ""):
-        time.sleep(0.02)
+    until(lambda: versions_of(one) != served and problems(one) == "")
 
 
 def test_a_refusal_is_seen_by_every_verb_also_after_a_restart(
@@ -291,21 +229,18 @@ def test_a_refusal_is_seen_by_every_verb_also_after_a_restart(
 ) -> None:
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     served, says = versions_of(one), "is refused, altered"
-    until_remembered(one)
+    until_taken(one)
     whole = (web.folder / "timestamp.json").read_bytes()
     flip(web.folder / "timestamp.json")
-    waiting = Deadline()
     for _ in range(2):
-        while waiting(says not in problems(one)):
-            time.sleep(0.02)
+        until(lambda: says in problems(one))
         code, text = health(one)
         assert (code, says in text) == (1, True)
         assert "could not be read again" not in text, "it is said once"
         one.stop()
         one.start()
         assert versions_of(one) == served
-    while waiting(says not in problems(one)):
-        time.sleep(0.02)
+    until(lambda: says in problems(one))
     assert verb(one, "health")[0] == 0, "clients lack nothing"
     assert says in verb(one, "status")[1]
     found = doctor(one)[1]
@@ -315,27 +250,23 @@ def test_a_refusal_is_seen_by_every_verb_also_after_a_restart(
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError, match="refused, altered"):
         client.reload()
     (web.folder / "timestamp.json").write_bytes(whole)
-    while waiting(health(one)[0] != 0):
-        time.sleep(0.05)
+    until_health(one, 0)
 
 
 def test_an_altered_object_of_the_root_is_said_once_and_taken_once_it_is_whole(
-    daemon: DaemonFactory, web: FaultyWeb, keys: Path, offer: Offering, made_once: Path
+    daemon: DaemonFactory, web: FaultyWeb, keys: Path, offer: Offering, signed_maps: Path
 ) -> None:
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     served = versions_of(one)
-    root = Signed(made_once / "two", keys).current["root"]
+    root = Signed(signed_maps / "two", keys).current["root"]
     web.fault = lambda path: "corrupt" if path.endswith(root) else ""
     offer("two")
-    waiting = Deadline()
-    while waiting(health(one)[0] == 0):
-        time.sleep(0.05)
-    until_polled(web, 4)
+    until(lambda: health(one)[0] != 0)
+    until_asked(web, "timestamp.json", 4)
     assert one.log.count("reload failed") == 1
     assert versions_of(one) == served
     web.heal()
-    while waiting(health(one)[0] != 0):
-        time.sleep(0.05)
+    until_health(one, 0)
     assert versions_of(one) != served
 
 
@@ -345,58 +276,33 @@ def test_signed_again_it_is_valid_for_longer_also_after_a_restart(
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     served = versions_of(one)
     expires = sign_timestamp(web, keys, expires=in_days(5)).timestamp.signed.expires.timestamp()
-    waiting = Deadline()
-    while waiting(counters(one)["published_expires_unix_ns"] != int(expires * 1e9)):
-        time.sleep(0.05)
+    until(lambda: counters(one)["published_expires_unix_ns"] == int(expires * 1e9))
     assert "reload done" not in one.log
     said = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(expires))
     assert f"verified, valid until {said}" in verb(one, "status")[1]
     one.stop()
     web.refuse()
     one.start()
-    while waiting(counters(one)["published_expires_unix_ns"] != int(expires * 1e9)):
-        time.sleep(0.05)
+    until(lambda: counters(one)["published_expires_unix_ns"] == int(expires * 1e9))
     assert versions_of(one) == served
-
-
-def test_rotated_keys_are_followed_from_the_first_root(
-    daemon: DaemonFactory, web: FaultyWeb, keys: Path, made_once: Path, tmp_path: Path
-) -> None:
-    one = daemon(web.url, *trusting(keys), "--poll", "1")
-    run = Verbs(tmp_path)
-    made = make_map(tmp_path / "town", columns=2, rows=1, points=100)
-    for number, role in enumerate(("root", "targets", "timestamp"), 2):
-        before = versions_of(one)
-        run("versions", web.folder, "--rotate", role, "--sign", keys)
-        made.change("0_0.pcd", seed=10 + number)
-        assert run.json("publish", made.root, web.folder, "--sign", keys)["version"] == number
-        waiting = Deadline()
-        while waiting(versions_of(one) == before):
-            time.sleep(0.05)
-    while waiting(health(one)[0] != 0):  # what was read in the midst of a change is read again
-        time.sleep(0.05)
-    assert Signed(web.folder, keys).root.signed.version == 6
-    two = daemon(web.url, *trusting(keys))
-    assert versions_of(two) == versions_of(one)
-    (made_once / "keys/root.pem").stat()  # others' tests have their own copy
 
 
 # --- restarts -----------------------------------------------------------------------------------------
 
 
 def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
-    daemon: DaemonFactory, web: FaultyWeb, keys: Path, made_once: Path
+    daemon: DaemonFactory, web: FaultyWeb, keys: Path, signed_maps: Path
 ) -> None:
     one = daemon(web.url, *trusting(keys))
     served = versions_of(one)
-    until_remembered(one)
+    until_taken(one)
     one.stop()
     web.refuse()
     one.start()
     assert versions_of(one) == served
     one.stop()
     # no version taken under another root of trust, or without one
-    one.arguments = list(trusting(made_once / "others"))
+    one.arguments = list(trusting(signed_maps / "others"))
     assert one.run_to_end() == 71
     assert "no answer" in one.log
     web.listen()
@@ -404,7 +310,7 @@ def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
     assert "refused, foreign root" in one.log
     two = daemon(web.url)
     assert versions_of(two) == served
-    until_remembered(two)
+    until_taken(two)
     two.stop()
     web.refuse()
     two.arguments = list(trusting(keys))
@@ -416,19 +322,17 @@ def test_a_start_without_a_link_serves_what_was_taken_under_that_root_alone(
 
 
 def test_another_root_of_trust_while_it_runs(
-    daemon: DaemonFactory, web: FaultyWeb, keys: Path, made_once: Path
+    daemon: DaemonFactory, web: FaultyWeb, keys: Path, signed_maps: Path
 ) -> None:
     one = daemon(web.url, *trusting(keys))
     served = versions_of(one)
-    shutil.copy(made_once / "others/ROOT.json", keys / "ROOT.json")
+    shutil.copy(signed_maps / "others/ROOT.json", keys / "ROOT.json")
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError, match="refused, foreign root"):
         client.reload()
     (keys / "ROOT.json").unlink()
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError, match=r"ROOT\.json: No such"):
         client.reload()
-    waiting = Deadline()
-    while waiting("cannot be taken" not in health(one)[1]):
-        time.sleep(0.05)
+    until(lambda: "cannot be taken" in health(one)[1])
     assert versions_of(one) == served
 
 
@@ -473,7 +377,7 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
     expires = sign_timestamp(web, keys, expires=in_days(1)).timestamp.signed.expires
     one = daemon(web.url, *trusting(keys), "--poll", "1")
     served = versions_of(one)
-    until_remembered(one)
+    until_taken(one)
     one.stop()
     one.environment.update(clock(1.01))
     since = f"expired since {expires:%Y-%m-%d %H:%M} UTC: it is served on"
@@ -482,13 +386,11 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
             web.refuse()
         one.start()
         assert versions_of(one) == served
-        waiting = Deadline()
-        while waiting(since not in (said := health(one, clock(1.01)))[1]):
-            time.sleep(0.05)
-        assert said[0] == 1
+        until(lambda: since in health(one, clock(1.01))[1])
+        assert health(one, clock(1.01))[0] == 1
         assert since in verb(one, "status", env=clock(1.01))[1]
-        while waiting(not is_down and "is refused, expired" not in health(one, clock(1.01))[1]):
-            time.sleep(0.05)
+        if not is_down:
+            until(lambda: "is refused, expired" in health(one, clock(1.01))[1])
         assert versions_of(one) == served
         code, text = verb(one, "doctor", "--json", env=clock(1.01))
         assert code == 1
@@ -498,9 +400,7 @@ def test_what_was_taken_is_served_on_when_it_has_expired(
     for name in clock(0):
         del one.environment[name]
     one.start()
-    waiting = Deadline()
-    while waiting(health(one)[0] != 0):
-        time.sleep(0.05)
+    until_health(one, 0)
 
 
 def test_a_clock_a_day_behind(daemon: DaemonFactory, web: FaultyWeb, keys: Path, clock: Clock) -> None:
@@ -508,20 +408,13 @@ def test_a_clock_a_day_behind(daemon: DaemonFactory, web: FaultyWeb, keys: Path,
     sign_timestamp(web, keys, expires=in_days(1))
     one = daemon(web.url, *trusting(keys), "--poll", "1", environment=clock(-1))
     assert len(versions_of(one)) == 2
-    waiting = Deadline()
-    while waiting(not counters(one)["published_signed_unix_ns"]):
-        time.sleep(0.02)
+    until(lambda: counters(one)["published_signed_unix_ns"])
     text = verb(one, "doctor", "--json", env=clock(-1))[1]
     assert f"this machine's clock says {in_days(-1):%Y-%m-%d}" in text
     assert "when the map was signed" in text
     signed = Signed(web.folder, keys)
-    signed.write("targets", version=2, expires=in_days(-0.5))
-    signed.snapshot.signed.meta["targets.json"].version = 2
-    signed.timestamp.signed.snapshot_meta.version = 2
-    signed.write("snapshot", version=2)
-    sign_timestamp_of(signed)
-    while waiting("is refused, expired" not in problems(one)):
-        time.sleep(0.05)
+    signed.write_all(2, timestamp=signed.timestamp.signed.version + 1, expires=in_days(-0.5))
+    until(lambda: "is refused, expired" in problems(one))
     assert f"targets.json was valid until {signed.targets.signed.expires:%Y-%m-%d %H:%M} UTC" in one.log
     assert "the timestamp was signed on" in one.log
 
@@ -559,9 +452,7 @@ def test_it_may_be_killed_or_hang(daemon: DaemonFactory, web: FaultyWeb, keys: P
     web.fault = catch(signal.SIGKILL)
     with shmmap.connect(one.endpoint) as client, pytest.raises(ShmmapError):
         client.reload()
-    waiting = Deadline()
-    while waiting("cannot be taken" not in problems(one)):
-        time.sleep(0.02)
+    until(lambda: "cannot be taken" in problems(one))
     assert "ended with signal SIGKILL" in one.log
     assert len(caught) == 1
     assert versions_of(one) == served
@@ -583,13 +474,11 @@ def test_it_may_be_killed_or_hang(daemon: DaemonFactory, web: FaultyWeb, keys: P
             with suppress(ShmmapError):  # the one before is not over, or the machine is slow
                 client.reload()
     assert not verifiers(one)
-    while waiting(health(one)[0] != 0):  # with the next beat
-        time.sleep(0.05)
+    until_health(one, 0)
 
 
 def test_a_daemon_ends_while_it_verifies(daemon: DaemonFactory, web: FaultyWeb, keys: Path) -> None:
     one = daemon(web.url, *trusting(keys), "--poll", "1")
-    waiting = Deadline()
     asked: list[str] = []
 
     def fault(path: str) -> str:
@@ -598,8 +487,7 @@ def test_a_daemon_ends_while_it_verifies(daemon: DaemonFactory, web: FaultyWeb, 
 
     web.fault = fault
     sign_timestamp(web, keys)
-    while waiting("2.root.json" not in asked):
-        time.sleep(0.01)
+    until(lambda: "2.root.json" in asked)
     assert one.stop() == 0
     web.heal()
 

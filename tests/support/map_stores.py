@@ -29,7 +29,9 @@ from typing import Any, Final
 
 import pytest
 
+from tests.support.command_line import Verbs
 from tests.support.daemon_process import ROOT, Deadline
+from tests.support.divided_map import make_map
 
 
 @pytest.fixture(scope="session")
@@ -399,3 +401,26 @@ def wait_for_trimming() -> None:
 
 if __name__ == "__main__":
     main()
+
+
+@pytest.fixture(scope="session")
+def signed_maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One map of two cells, signed: with versions 1 and 2, another version 2, and signed by others.
+
+    Directories ``one``, ``two``, ``equal``, ``other``; their ``keys`` and ``others``; ``town`` has the files.
+    """
+    from tests.support.published_maps import Signed
+
+    folder = tmp_path_factory.mktemp("signed")
+    made = make_map(folder / "town", columns=2, rows=1, points=100)
+    run = Verbs(folder)
+    run("publish", made.root, folder / "one", "--sign", folder / "keys", "--id-prefix", "/town/")
+    shutil.copytree(folder / "one", folder / "two")
+    shutil.copytree(folder / "one", folder / "equal")
+    made.change("0_0.pcd", seed=1)
+    run("publish", made.root, folder / "two", "--sign", folder / "keys")
+    run("publish", made.root, folder / "other", "--sign", folder / "others", "--id-prefix", "/town/")
+    made.change("0_0.pcd", seed=2)
+    run("publish", made.root, folder / "equal", "--sign", folder / "keys")
+    Signed(folder / "equal", folder / "keys").write_all(3)  # newer than the other version 2
+    return folder

@@ -233,6 +233,14 @@ class Signed:
         name = "timestamp.json" if role == "timestamp" else f"{metadata.signed.version}.{role}.json"
         metadata.to_file(str(self.store / name))
 
+    def write_all(self, number: int, *, timestamp: int = 0, **fields: Any) -> None:
+        """Sign targets with other fields, snapshot and timestamp, all with this number."""
+        self.write("targets", version=number, **fields)
+        self.snapshot.signed.meta["targets.json"].version = number
+        self.timestamp.signed.snapshot_meta.version = number
+        self.write("snapshot", version=number)
+        self.write("timestamp", version=timestamp or number)
+
 
 def read_signed(store: Path, keys: Path) -> Signed:
     """Read a signed map whose entry and ``CURRENT`` say what is signed."""

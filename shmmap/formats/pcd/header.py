@@ -102,9 +102,17 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
     if width * height != points or points > MAX_POINTS:
         return _parse_any(head, path, file_bytes)
     header = PcdHeader(
-        known.fields, width, height, points, known.encoding, known.viewpoint, known.version,
-        plain.end(), known.point_bytes, (),
-    )  # fmt: skip
+        known.fields,
+        width,
+        height,
+        points,
+        known.encoding,
+        known.viewpoint,
+        known.version,
+        plain.end(),
+        known.point_bytes,
+        (),
+    )
     _check_size(header, path, file_bytes)
     return header
 
@@ -324,7 +332,7 @@ class _HeaderParser:
 
 
 def _check_size(header: PcdHeader, path: str, file_bytes: int) -> None:
-    """Refuse a header that promises more than the file can hold, before anybody allocates for it."""
+    """Refuse a header that promises more than the file can hold, before memory is allocated for it."""
     left = file_bytes - header.data_offset
     if header.encoding == "binary":
         needed, what = header.points * header.point_bytes, "bytes of points"

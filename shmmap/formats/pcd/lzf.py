@@ -58,7 +58,7 @@ def _native() -> Callable[[_Bytes, _Bytes], bool] | None:
     """liblzf's own function, which the extension module carries; None where it does not show it.
 
     The module's function allocates its result twice, which costs as much as half the decompression
-    in page faults; the C function writes where it is told to.
+    in page faults; the C function writes to the buffer that it is given.
     """
     import lzf  # a client process must not load it
 

@@ -12,7 +12,6 @@ import os
 import re
 import tempfile
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +24,7 @@ from shmmap.formats.pcd.body import ascii_blocks, binary_blocks, check_sizes, co
 from shmmap.formats.pcd.fields import AXES
 from shmmap.formats.pcd.header import HEADER_LIMIT_BYTES, PcdHeader, parse_header
 from shmmap.formats.pcd.table import coordinate_dtype, field_table
-from shmmap.formats.source_file import SourceFile, open_regular, refusal
+from shmmap.formats.source_file import FileReader, refusal
 
 __all__ = [
     "Block",
@@ -40,19 +39,17 @@ _DATA_LINE: Final = re.compile(rb"^[ \t]*DATA(?=\s)[^\n]*\n", re.MULTILINE | re.
 _TAIL_READ_BYTES: Final = 1 << 18
 
 
-class PcdReader:
+class PcdReader(FileReader):
     """A PCD file, opened and its header checked; `blocks` reads the points.
 
     Parameters
     ----------
-    file
-        A path, or an open file descriptor (which stays open and whose position does not matter).
+    file, path
+        As in `FileReader`.
     keep_non_finite
         Keep points whose x, y or z is NaN or infinite.
     block_points
         Upper limit of rows per block; blocks of wide points are smaller.
-    path
-        The name used in messages when ``file`` is a descriptor.
 
     Attributes
     ----------
@@ -81,11 +78,8 @@ class PcdReader:
         block_points: int = 1 << 16,
         path: str = "",
     ) -> None:
-        self.path = path or (f"<descriptor {file}>" if isinstance(file, int) else os.fspath(file))
-        self._owned = not isinstance(file, int)
-        self._fd = file if isinstance(file, int) else open_regular(self.path)
+        super().__init__(file, path)
         try:
-            self._source = SourceFile(self._fd, self.path)
             self._head = self._read_head()
             self.header: PcdHeader = parse_header(self._head, path=self.path, file_bytes=self._source.size)
             self._head = self._head[: self.header.data_offset]
@@ -101,24 +95,6 @@ class PcdReader:
         self.kept = 0
         self.dropped = 0
         self.digest = b""
-
-    def __enter__(self) -> PcdReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def fileno(self) -> int:
-        """The open file's descriptor."""
-        return self._fd
-
-    def close(self) -> None:
-        """Close the file if this reader opened it."""
-        if self._owned and self._fd >= 0:
-            os.close(self._fd)
-        self._fd = -1
 
     @property
     def record(self) -> np.dtype[np.void]:

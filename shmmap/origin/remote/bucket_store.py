@@ -24,6 +24,7 @@ from shmmap.origin.remote.store import (
     Tag,
     Timeouts,
     is_loopback,
+    refuse_read_only,
 )
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
@@ -126,7 +127,7 @@ class BucketStore:
 
     def list(self, prefix: str) -> Iterator[Listed]:
         """All objects below a prefix."""
-        self._refuse_if_read_only()
+        refuse_read_only(self)
         stream = self._ask(
             prefix, lambda: obstore.list(self._store, prefix.rstrip("/"), chunk_size=_LISTED_AT_ONCE)
         )
@@ -168,7 +169,7 @@ class BucketStore:
             return False
 
     def _put(self, path: str, data: bytes, mode: Any, attributes: dict[str, str]) -> None:
-        self._refuse_if_read_only()
+        refuse_read_only(self)
         self._ask(
             path,
             lambda: obstore.put(
@@ -179,15 +180,11 @@ class BucketStore:
 
     def delete(self, path: str) -> None:
         """Remove an object."""
-        self._refuse_if_read_only()
+        refuse_read_only(self)
         try:
             self._ask(path, lambda: obstore.delete(self._store, path))
         except MapMissing:
             return
-
-    def _refuse_if_read_only(self) -> None:
-        if self.read_only:
-            raise BadRequest(f"{self.url}: {self.read_only}")
 
     # --- errors ---------------------------------------------------------------------------------
 

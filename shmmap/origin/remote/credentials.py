@@ -87,9 +87,11 @@ def _s3_source(environment: Mapping[str, str], *, instance: bool) -> str:
         with contextlib.suppress(ValueError, TypeError):
             if datetime.fromisoformat(expiry.replace("Z", "+00:00")) <= datetime.now(timezone.utc):
                 raise ConfigError(
-                    f"they expired at {expiry}", key="AWS_CREDENTIAL_EXPIRATION", origin="environment",
+                    f"they expired at {expiry}",
+                    key="AWS_CREDENTIAL_EXPIRATION",
+                    origin="environment",
                     hint="export others, and start the daemon again",
-                )  # fmt: skip
+                )
     token = " with AWS_SESSION_TOKEN" if "session_token" in settings else ""
     return f"the environment, AWS_ACCESS_KEY_ID{token}"
 
@@ -228,9 +230,15 @@ def azure_settings(environment: Mapping[str, str], *, instance: bool = False) ->
     for path in _given_file(environment, AZURE_FILE):
         found |= _lines(path)
     for name in (
-        "ACCOUNT_NAME", "ACCOUNT_KEY", "SAS_KEY", "SAS_TOKEN", "CLIENT_ID", "CLIENT_SECRET", "TENANT_ID",
+        "ACCOUNT_NAME",
+        "ACCOUNT_KEY",
+        "SAS_KEY",
+        "SAS_TOKEN",
+        "CLIENT_ID",
+        "CLIENT_SECRET",
+        "TENANT_ID",
         "ENDPOINT",
-    ):  # fmt: skip
+    ):
         value = found.get(f"AZURE_STORAGE_{name}") or found.get(f"AZURE_{name}")
         if value:
             account["sas_key" if name == "SAS_TOKEN" else name.lower()] = value

@@ -4,15 +4,14 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from hashlib import sha256
 from typing import Final, NamedTuple
 
 from shmmap.errors import MapDataError, MapMissing, Offline
-from shmmap.formats.durable_file import appearing_file, writing_errors
+from shmmap.formats.durable_file import appearing_file, locked_file, writing_errors
 from shmmap.origin.remote.store import LONG_RUN, SERVING, Listed, Store, Tag, Timeouts, read_url
 from shmmap.origin.remote.zstd_frame import DAMAGED
 
@@ -173,7 +172,8 @@ class DirectoryStore:
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
         """Replace a file whose hash is still that of ``tag``."""
-        with self._locked():
+        lock = self._path(_LOCK)
+        with writing_errors(lock), locked_file(lock, mode=0o666):
             try:
                 _, now = self.get_tagged(path, tag["size"])
             except (MapMissing, MapDataError):
@@ -198,14 +198,3 @@ class DirectoryStore:
             except FileExistsError:
                 return False
         return True
-
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        path = self._path(_LOCK)
-        with writing_errors(path):
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(fd)

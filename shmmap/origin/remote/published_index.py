@@ -10,10 +10,10 @@ from __future__ import annotations
 import itertools
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -48,12 +48,12 @@ __all__ = [
     "is_id_prefix",
     "is_relative_path",
     "map_version_of",
-    "pack_column",
+    "pack_fields",
     "pack_root",
     "pack_shard",
     "published_layer_version",
     "shard_keys",
-    "unpack_column",
+    "unpack_fields",
     "unpack_root",
     "unpack_shard",
 ]
@@ -132,6 +132,96 @@ class ShardFields(msgspec.Struct, frozen=True):
 _HEAD: Final = msgspec.msgpack.Decoder(_Head)
 _ROOT: Final = msgspec.msgpack.Decoder(RootFields)
 _SHARD: Final = msgspec.msgpack.Decoder(ShardFields)
+
+
+# --- columns ------------------------------------------------------------------------------------------
+
+
+class _HasLayers(Protocol):
+    """A root, or a part of one."""
+
+    @property
+    def layers(self) -> Mapping[str, int]: ...
+
+
+_Columns: TypeAlias = Mapping[str, tuple[str, str, int]]
+"""By attribute of an object: field of its document, dtype, and numbers in a row."""
+
+_SHARD_COLUMNS: Final[_Columns] = {
+    "keys": ("shard_keys", "<i4", 2),
+    "counts": ("shard_cells", "<u4", 1),
+    "sizes": ("shard_bytes", "<u4", 1),
+    "hashes": ("shard_sha256", "u1", 32),
+}
+_LAYER_COLUMNS: Final[_Columns] = {
+    "sizes": ("size", "<u4", 1),
+    "raws": ("raw_size", "<u4", 1),
+    "hashes": ("sha256", "u1", 32),
+    "contents": ("content_sha256", "u1", 32),
+}
+
+
+class Damage:
+    """Makes the error of one object."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __call__(self, message: str) -> MapDataError:
+        return MapDataError(message, path=self._name, cause=DAMAGED)
+
+
+def decode_map(unpacked: bytes, decoder: msgspec.msgpack.Decoder[_Struct], wrong: Damage) -> _Struct:
+    """Read what is in a frame; the error is ``wrong``'s."""
+    try:
+        found: _Struct = decoder.decode(unpacked)
+        return found
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise wrong(f"no MessagePack map of its kind: {error}") from None
+
+
+def pack_fields(described: _HasLayers, kind: type[msgspec.Struct]) -> dict[str, Any]:
+    """Return the fields of the document of ``kind`` that describe a root, or a part of one."""
+    fields = {name: getattr(described, name) for name in kind.__struct_fields__ if hasattr(described, name)}
+    layers = dict(sorted(described.layers.items()))
+    return {**fields, "layers": layers, **_pack_columns(described, _SHARD_COLUMNS)}
+
+
+def unpack_fields(found: msgspec.Struct, wrong: Damage) -> dict[str, Any]:
+    """Return the attributes of the root, or of the part of one, that a document describes."""
+    fields = msgspec.structs.asdict(found)
+    del fields["format"], fields["min_reader"]
+    columns = _unpack_columns(found, _SHARD_COLUMNS, len(fields["shard_cells"]) // 4, wrong)
+    for field, _, _ in _SHARD_COLUMNS.values():
+        del fields[field]
+    return {**fields, **columns}
+
+
+def _pack_columns(described: object, columns: _Columns) -> dict[str, bytes]:
+    return {
+        field: _pack_column(getattr(described, name), dtype) for name, (field, dtype, _) in columns.items()
+    }
+
+
+def _unpack_columns(found: object, columns: _Columns, count: int, wrong: Damage) -> dict[str, NDArray[Any]]:
+    return {
+        name: _unpack_column(getattr(found, field), dtype, count, width, wrong)
+        for name, (field, dtype, width) in columns.items()
+    }
+
+
+def _pack_column(column: NDArray[Any], dtype: str) -> bytes:
+    """Return a column's rows, one after the other."""
+    return np.ascontiguousarray(column, np.dtype(dtype)).tobytes()
+
+
+def _unpack_column(data: bytes, dtype: str, count: int, width: int, wrong: Damage) -> NDArray[Any]:
+    """Read a column of ``count`` rows of ``width`` numbers."""
+    kind = np.dtype(dtype)
+    if len(data) != count * width * kind.itemsize:
+        raise wrong("its columns are not of one length")
+    column: NDArray[Any] = np.frombuffer(data, kind)
+    return column.reshape(-1, width) if width > 1 else column
 
 
 # --- the root -----------------------------------------------------------------------------------------
@@ -216,28 +306,8 @@ class Root:
 
 def pack_root(root: Root) -> bytes:
     """Return what is in a root's frame."""
-    return msgspec.msgpack.encode(
-        RootFields(
-            format=FORMAT,
-            min_reader=READER,
-            id_prefix=root.id_prefix,
-            frame_id=root.frame_id,
-            crs=root.crs,
-            origin=root.origin,
-            unit_m=root.unit_m,
-            encoding=root.encoding,
-            cells=root.cells,
-            bounds=root.bounds,
-            shard_m=root.shard_m,
-            largest_m=root.largest_m,
-            mean_m=root.mean_m,
-            layers=dict(sorted(root.layers.items())),
-            shard_keys=pack_column(root.keys, "<i4"),
-            shard_cells=pack_column(root.counts, "<u4"),
-            shard_bytes=pack_column(root.sizes, "<u4"),
-            shard_sha256=pack_column(root.hashes, "u1"),
-        )
-    )
+    fields = RootFields(format=FORMAT, min_reader=READER, **pack_fields(root, RootFields))
+    return msgspec.msgpack.encode(fields)
 
 
 def map_version_of(unpacked: bytes) -> int:
@@ -280,27 +350,8 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
     if POINTS not in found.layers:
         raise wrong("its layers have no points")
     check_layers(found.layers, wrong)
-    count = len(found.shard_cells) // 4
-    root = Root(
-        id_prefix=found.id_prefix,
-        frame_id=found.frame_id,
-        crs=found.crs,
-        origin=found.origin,
-        unit_m=found.unit_m,
-        encoding=found.encoding,
-        cells=found.cells,
-        bounds=found.bounds,
-        shard_m=found.shard_m,
-        largest_m=found.largest_m,
-        mean_m=found.mean_m,
-        layers=found.layers,
-        keys=unpack_column(found.shard_keys, "<i4", count, 2, wrong),
-        counts=unpack_column(found.shard_cells, "<u4", count, 1, wrong),
-        sizes=unpack_column(found.shard_bytes, "<u4", count, 1, wrong),
-        hashes=unpack_column(found.shard_sha256, "u1", count, 32, wrong),
-        map_version=map_version_of(unpacked),
-    )
-    if not count:
+    root = Root(**unpack_fields(found, wrong), map_version=map_version_of(unpacked))
+    if not len(root.counts):
         raise wrong("it has no shard")
     check_shards(root.keys, root.sizes, wrong)
     if int(root.counts.sum(dtype=np.uint64)) != root.cells or not root.counts.all():
@@ -345,6 +396,11 @@ class LayerObjects:
     raws: NDArray[np.uint32]
     hashes: NDArray[np.uint8]
     contents: NDArray[np.uint8]
+
+    def objects(self) -> Iterator[tuple[bytes, int]]:
+        """Hash and size of each object."""
+        hashes = self.hashes.tobytes()
+        return ((hashes[32 * row : 32 * row + 32], size) for row, size in enumerate(self.sizes.tolist()))
 
     def name(self, row: int) -> ObjectName:
         """The object of a cell."""
@@ -428,16 +484,11 @@ def pack_shard(shard: Shard) -> bytes:
     return msgspec.msgpack.encode(
         ShardFields(
             names=b"\0".join(shard.names),
-            boxes=pack_column(shard.boxes, "<f8"),
-            z=pack_column(shard.z, "<f8"),
-            points=pack_column(shard.points, "<u4"),
+            boxes=_pack_column(shard.boxes, "<f8"),
+            z=_pack_column(shard.z, "<f8"),
+            points=_pack_column(shard.points, "<u4"),
             layers={
-                spec: LayerFields(
-                    size=pack_column(layer.sizes, "<u4"),
-                    raw_size=pack_column(layer.raws, "<u4"),
-                    sha256=pack_column(layer.hashes, "u1"),
-                    content_sha256=pack_column(layer.contents, "u1"),
-                )
+                spec: LayerFields(**_pack_columns(layer, _LAYER_COLUMNS))
                 for spec, layer in sorted(shard.layers.items())
             },
         )
@@ -468,16 +519,11 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int, *, name: st
         raise wrong("its layers are not the root's")
     shard = Shard(
         names=names,
-        boxes=unpack_column(found.boxes, "<f8", count, 4, wrong),
-        z=unpack_column(found.z, "<f8", count, 2, wrong),
-        points=unpack_column(found.points, "<u4", count, 1, wrong),
+        boxes=_unpack_column(found.boxes, "<f8", count, 4, wrong),
+        z=_unpack_column(found.z, "<f8", count, 2, wrong),
+        points=_unpack_column(found.points, "<u4", count, 1, wrong),
         layers={
-            spec: LayerObjects(
-                sizes=unpack_column(layer.size, "<u4", count, 1, wrong),
-                raws=unpack_column(layer.raw_size, "<u4", count, 1, wrong),
-                hashes=unpack_column(layer.sha256, "u1", count, 32, wrong),
-                contents=unpack_column(layer.content_sha256, "u1", count, 32, wrong),
-            )
+            spec: LayerObjects(**_unpack_columns(layer, _LAYER_COLUMNS, count, wrong))
             for spec, layer in found.layers.items()
         },
     )
@@ -514,42 +560,6 @@ def is_relative_path(name: bytes) -> bool:
     except UnicodeDecodeError:
         return False
     return all(part not in (b"", b".", b"..") for part in name.split(b"/"))
-
-
-# --- columns ------------------------------------------------------------------------------------------
-
-
-class Damage:
-    """Makes the error of one object."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __call__(self, message: str) -> MapDataError:
-        return MapDataError(message, path=self._name, cause=DAMAGED)
-
-
-def decode_map(unpacked: bytes, decoder: msgspec.msgpack.Decoder[_Struct], wrong: Damage) -> _Struct:
-    """Read what is in a frame; the error is ``wrong``'s."""
-    try:
-        found: _Struct = decoder.decode(unpacked)
-        return found
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise wrong(f"no MessagePack map of its kind: {error}") from None
-
-
-def pack_column(column: NDArray[Any], dtype: str) -> bytes:
-    """Return a column's rows, one after the other."""
-    return np.ascontiguousarray(column, np.dtype(dtype)).tobytes()
-
-
-def unpack_column(data: bytes, dtype: str, count: int, width: int, wrong: Damage) -> NDArray[Any]:
-    """Read a column of ``count`` rows of ``width`` numbers."""
-    kind = np.dtype(dtype)
-    if len(data) != count * width * kind.itemsize:
-        raise wrong("its columns are not of one length")
-    column: NDArray[Any] = np.frombuffer(data, kind)
-    return column.reshape(-1, width) if width > 1 else column
 
 
 def _is_rectangle(box: Box) -> bool:

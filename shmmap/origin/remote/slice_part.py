@@ -27,8 +27,8 @@ from shmmap.origin.remote.published_index import (
     check_layers,
     check_shards,
     decode_map,
-    pack_column,
-    unpack_column,
+    pack_fields,
+    unpack_fields,
 )
 from shmmap.origin.remote.published_object import POINTS
 from shmmap.origin.remote.zstd_frame import pack_frame, unpack_frame
@@ -189,23 +189,8 @@ class Part:
 
 def pack_part(part: Part) -> bytes:
     """Return the object of a part."""
-    return pack_frame(
-        msgspec.msgpack.encode(
-            PartFields(
-                format=FORMAT,
-                min_reader=READER,
-                version=part.version,
-                root_content=part.root_content,
-                slice=part.slice,
-                slices=part.slices,
-                layers=dict(sorted(part.layers.items())),
-                shard_keys=pack_column(part.keys, "<i4"),
-                shard_cells=pack_column(part.counts, "<u4"),
-                shard_bytes=pack_column(part.sizes, "<u4"),
-                shard_sha256=pack_column(part.hashes, "u1"),
-            )
-        )
-    )
+    fields = PartFields(format=FORMAT, min_reader=READER, **pack_fields(part, PartFields))
+    return pack_frame(msgspec.msgpack.encode(fields))
 
 
 def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: str = "") -> Part:
@@ -244,18 +229,7 @@ def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: s
     if not found.layers or POINTS in found.layers:
         raise wrong("its layers are none, or have points")
     check_layers(found.layers, wrong)
-    count = len(found.shard_cells) // 4
-    part = Part(
-        version=found.version,
-        root_content=found.root_content,
-        slice=found.slice,
-        slices=found.slices,
-        layers=found.layers,
-        keys=unpack_column(found.shard_keys, "<i4", count, 2, wrong),
-        counts=unpack_column(found.shard_cells, "<u4", count, 1, wrong),
-        sizes=unpack_column(found.shard_bytes, "<u4", count, 1, wrong),
-        hashes=unpack_column(found.shard_sha256, "u1", count, 32, wrong),
-    )
+    part = Part(**unpack_fields(found, wrong))
     check_shards(part.keys, part.sizes, wrong)
     if not part.counts.all():
         raise wrong("a shard has no cell")

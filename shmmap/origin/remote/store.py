@@ -34,6 +34,7 @@ __all__ = [
     "may_be_plain",
     "put_over",
     "read_url",
+    "refuse_read_only",
 ]
 
 BUCKET_SCHEMES: Final = ("s3", "gs", "az")
@@ -130,6 +131,12 @@ class Store(ObjectReader, Protocol):
 
     def delete(self, path: str) -> None:
         """Remove an object; one that is not there is no error."""
+
+
+def refuse_read_only(store: Store) -> None:
+    """Raise `BadRequest` if nothing can be written there."""
+    if store.read_only:
+        raise BadRequest(f"{store.url}: {store.read_only}")
 
 
 def put_over(store: Store, path: str, data: bytes, seen: Tag | None) -> bool:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Have a process of its own verify which version of a signed map is current.
+"""Verifying in a process of its own which version of a signed map is current.
 
-python-tuf takes a third of a second and 35 MB to import: neither is for a daemon that runs for weeks.
+python-tuf takes a third of a second and 35 MB to import: a daemon that runs for weeks has neither to spare.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Final
 import msgspec
 
 from shmmap.errors import ConfigError, ShmmapError
-from shmmap.origin.reading_apart import Outcome
+from shmmap.origin.reading_apart import Outcome, ended_early, not_started
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, Current
-from shmmap.processes.start_child import how_ended, packet_buffer, receive_packet, start_child
+from shmmap.processes.start_child import packet_buffer, receive_packet, start_child
 
 __all__ = [
     "Verified",
@@ -28,12 +28,12 @@ __all__ = [
     "verify_apart",
 ]
 
-_LONGEST_S: Final = 300.0
+_TIMEOUT_S: Final = 300.0
 _NO_ROOT: Final = "it is the ROOT.json that `publish --sign` makes"
 
 
 class VerifySettings(msgspec.Struct, frozen=True):
-    """What is verified.
+    """What to verify, and how.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
     return os.path.join(state_dir, "trust", sha256(of).hexdigest()[:32])
 
 
-def verify_apart(settings: VerifySettings, *, timeout_s: float = _LONGEST_S) -> Verified:
+def verify_apart(settings: VerifySettings, *, timeout_s: float = _TIMEOUT_S) -> Verified:
     """Return the version that is signed.
 
     Parameters
@@ -160,10 +160,7 @@ def verify_apart(settings: VerifySettings, *, timeout_s: float = _LONGEST_S) -> 
     try:
         process, channel = start_child("shmmap.origin.remote.verify_version", words, new_session=False)
     except OSError as error:
-        raise ShmmapError(
-            f"{settings.url}: cannot start a process that verifies it: {error.strerror}",
-            hint="raise the limit of processes or memory (TasksMax=, ulimit -u, MemoryMax=)",
-        ) from error
+        raise not_started(settings.url, "verifies", error) from error
     try:
         with channel:
             channel.settimeout(timeout_s)
@@ -179,10 +176,7 @@ def verify_apart(settings: VerifySettings, *, timeout_s: float = _LONGEST_S) -> 
             process.kill()
         code = process.wait()
     if reply is None:
-        raise ShmmapError(
-            f"{settings.url}: the process that verifies it ended with {how_ended(code)}",
-            hint="was it killed, or is its memory too small?",
-        )
+        raise ended_early(settings.url, "verifies", code)
     if reply.verified is None:
         raise reply.error.raised()
     return reply.verified

@@ -7,13 +7,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import socket
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import datetime, timezone
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -21,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 
 from shmmap.errors import MapDataError, MapMissing, ShmmapError
-from shmmap.formats.durable_file import writing_errors
+from shmmap.formats.durable_file import locked_file, writing_errors
 from shmmap.optional_packages import TO_SIGN, needed_packages
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP
@@ -69,7 +67,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
     memory = memory_directory(state_dir, store.url, trusted)
     with writing_errors(memory):
         os.makedirs(memory, mode=0o700, exist_ok=True)
-        with _locked(memory):
+        with locked_file(os.path.join(memory, ".lock")):
             _remove_interim(memory)
             updater, asked = _updater(store, trusted, memory, trust)
             try:
@@ -221,16 +219,6 @@ def _remove_interim(memory: str) -> None:
     for name in os.listdir(memory):
         if name.startswith(tempfile.gettempprefix()):
             os.unlink(os.path.join(memory, name))
-
-
-@contextmanager
-def _locked(directory: str) -> Iterator[None]:
-    fd = os.open(os.path.join(directory, ".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(fd)
 
 
 def main() -> int:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,18 +23,31 @@ from tests.support.divided_map import read_pcd
 from tests.support.skips import open3d_or_skip
 
 
+def read_by_the_project(path: Path) -> dict[str, Any]:
+    columns = dict(cloud.read_pcd(path).columns)
+    xyz = columns.pop("xyz")
+    return {**{axis: xyz[:, i] for i, axis in enumerate("xyz")}, **columns}
+
+
 @pytest.mark.parametrize("encoding", ["binary", "binary_compressed", "ascii"])
 @pytest.mark.parametrize("size", ["20", "12.5", "0.7"])
 def test_the_cells_are_the_input(tmp_path: Path, encoding: str, size: str) -> None:
+    """From a file of each encoding, and in cells of each: no point and no order changes."""
     columns = xyzircaedt(4000, reach=90.0 if size != "0.7" else 5.0)
-    made = divide_quickly(
-        [cloud_file(tmp_path / "in.pcd", columns, encoding)], tmp_path / "map", cell_size=float(size)
-    )
-    truth = expected_rows(rows_of(columns), size)
-    assert map_rows(tmp_path / "map") == truth
-    assert (made.cells, made.points, made.points_read, made.dropped) == (len(truth), 4000, 4000, 0)
-    assert made.fields == [(name, column.dtype.str) for name, column in columns.items()]
-    assert sorted(os.listdir(tmp_path)) == ["in.pcd", "map"]
+    file, truth = cloud_file(tmp_path / "in.pcd", columns, encoding), expected_rows(rows_of(columns), size)
+    for written in ("binary", encoding):
+        made = divide_quickly(
+            [file], tmp_path / "map", cell_size=float(size), encoding=written, force=True, check=True
+        )
+        assert map_rows(tmp_path / "map", read_pcd if written == "binary" else read_by_the_project) == truth
+        assert (made.cells, made.points, made.points_read, made.dropped) == (len(truth), 4000, 4000, 0)
+        assert made.fields == [(name, column.dtype.str) for name, column in columns.items()]
+        assert sorted(os.listdir(tmp_path)) == ["in.pcd", "map"]
+        assert sorted(os.listdir(tmp_path / "map")) == [
+            "pointcloud_map.pcd",
+            "pointcloud_map_metadata.yaml",
+            "shmmap_divide.json",
+        ]
 
 
 def test_fields_in_any_order_with_padding_and_vectors(tmp_path: Path) -> None:
@@ -73,6 +87,8 @@ def test_autoware_s_loader_reads_it(tmp_path: Path) -> None:
     text = (tmp_path / "map" / "pointcloud_map_metadata.yaml").read_text()
     assert text.startswith("x_resolution: 20\ny_resolution: 20\ncity_-")
     assert "." not in text.replace(".pcd", "")
+    for name, (x, y) in list(yaml.safe_load(text).items())[2:]:
+        assert name == f"city_{x}_{y}.pcd"
 
 
 def test_other_readers_read_the_cells(tmp_path: Path) -> None:
@@ -174,25 +190,6 @@ def test_voxels_are_those_of_the_whole_cloud(tmp_path: Path, leaf: float, size: 
             assert row[5] == columns["channel"][members[0]]
             assert np.isclose(row[6], columns["azimuth"][members].astype(np.float64).mean(), atol=1e-6)
     assert by_first == {}
-
-
-def read_by_the_project(path: Path) -> dict[str, Any]:
-    columns = dict(cloud.read_pcd(path).columns)
-    xyz = columns.pop("xyz")
-    return {**{axis: xyz[:, i] for i, axis in enumerate("xyz")}, **columns}
-
-
-@pytest.mark.parametrize("encoding", ["binary", "binary_compressed", "ascii"])
-def test_an_encoding_changes_no_point_and_no_order(tmp_path: Path, encoding: str) -> None:
-    columns = xyzircaedt(3000)
-    file = cloud_file(tmp_path / "in.pcd", columns)
-    made = divide_quickly([file], tmp_path / "map", encoding=encoding, check=True)
-    read = read_pcd if encoding == "binary" else read_by_the_project
-    assert map_rows(tmp_path / "map", read) == expected_rows(rows_of(columns))
-    assert made.points == 3000
-    assert sorted(os.listdir(tmp_path / "map")) == [
-        "pointcloud_map.pcd", "pointcloud_map_metadata.yaml", "shmmap_divide.json",
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])

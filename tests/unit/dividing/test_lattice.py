@@ -24,10 +24,7 @@ def assign(values: list[float], lattice: CellLattice, dtype: str = "<f8") -> lis
     """Indices along x of points (value, value, 0)."""
     x = np.array(values, dtype)
     ix, iy = np.empty(len(x), np.int32), np.empty(len(x), np.int32)
-    numbers = (
-        lattice.size, *lattice.origin, lattice.step, lattice.origin_x, lattice.origin_y, lattice.scale,
-    )  # fmt: skip
-    kept, *_ = assign_cells(x, x, np.zeros(len(x)), numbers, ix, iy, np.zeros((2, 3)))
+    kept, *_ = assign_cells(x, x, np.zeros(len(x)), lattice.numbers, ix, iy, np.zeros((2, 3)))
     assert kept == len(x)
     found: list[int] = ix.tolist()
     return found
@@ -126,7 +123,7 @@ def test_points_that_are_not_finite_are_nowhere() -> None:
     assert extremes.tolist() == [[-1.0] * 3, [1.0] * 3]
 
 
-def test_points_too_far_away_are_told() -> None:
+def test_points_too_far_away_are_reported() -> None:
     x = np.array([1.0, 1e12])
     ix, iy = np.empty(2, np.int32), np.empty(2, np.int32)
     assert assign_cells(x, x, x, (1.0, 0.0, 0.0, 1, 0, 0, 1), ix, iy, np.zeros((2, 3)))[0] == -1
@@ -134,8 +131,9 @@ def test_points_too_far_away_are_told() -> None:
 
 def test_corners_that_are_not_exact_are_out_of_reach() -> None:
     lattice = CellLattice.of(20.0, (1e-6, 0.0))
-    numbers = (20.0, *lattice.origin, lattice.step, lattice.origin_x, lattice.origin_y, lattice.scale)
     ix, iy = np.empty(1, np.int32), np.empty(1, np.int32)
     for x, found in ((4.5e9, 1), (4.6e9, -1), (-4.6e9, -1)):
         there = np.array([x])
-        assert assign_cells(there, there * 0, there * 0, numbers, ix, iy, np.zeros((2, 3)))[0] == found
+        assert (
+            assign_cells(there, there * 0, there * 0, lattice.numbers, ix, iy, np.zeros((2, 3)))[0] == found
+        )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from shmmap.dividing.map_writer import MapWriter, WrittenMap
 from shmmap.errors import BadRequest
+from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.map_directory import open_map
 from tests.support.divided_map import read_pcd
 
@@ -70,7 +71,7 @@ def test_every_point_is_in_its_half_open_cell(tmp_path: Path, size: float) -> No
 
 def test_many_adds_equal_one(tmp_path: Path) -> None:
     columns = cloud(5000)
-    whole = write(tmp_path / "whole", columns)
+    whole = write(tmp_path / "whole", columns, durable=True)
     parts = [{name: column[i : i + 700] for name, column in columns.items()} for i in range(0, 5000, 700)]
     made = write(tmp_path / "parts", *parts)
     assert (made.points, made.cells) == (whole.points, whole.cells)
@@ -80,25 +81,8 @@ def test_many_adds_equal_one(tmp_path: Path) -> None:
         assert sorted(os.listdir(tmp_path / name)) == ["pointcloud_map.pcd", "pointcloud_map_metadata.yaml"]
 
 
-def test_metadata_is_what_autoware_s_loader_reads(tmp_path: Path) -> None:
-    columns = cloud(2000, reach=300.0)
-    write(tmp_path / "map", columns, prefix="city")
-    text = (tmp_path / "map" / "pointcloud_map_metadata.yaml").read_text()
-    read = yaml.safe_load(text)
-    assert read.pop("x_resolution") == read.pop("y_resolution") == 20
-    assert sorted(read) == sorted(os.listdir(tmp_path / "map" / "pointcloud_map.pcd"))
-    for name, corner in read.items():
-        assert [type(value) for value in corner] == [int, int]
-        assert name == f"city_{corner[0]}_{corner[1]}.pcd"
-    strict = open_map(tmp_path / "map", strict=True).load()
-    assert len(strict) == len(read)
-    assert strict.problems == ()
-
-
 @pytest.mark.parametrize("dtype", ["<f4", "<f8"])
 def test_round_trip_through_the_project_s_reader(tmp_path: Path, dtype: str) -> None:
-    from shmmap.formats.pcd.reader import PcdReader
-
     columns = cloud(800, dtype=dtype)
     columns["normal"] = np.linspace(-1, 1, 800 * 3).astype(np.float32).reshape(-1, 3)
     write(tmp_path / "map", columns, cell_size=50)
@@ -203,12 +187,6 @@ def test_any_prefix_comes_back(tmp_path: Path, prefix: str) -> None:
         os.listdir(os.fsencode(tmp_path / "map/pointcloud_map.pcd"))
     )
     assert catalogue.problems == ()
-
-
-def test_durable_maps_are_the_same(tmp_path: Path) -> None:
-    columns = cloud(300)
-    write(tmp_path / "map", columns, durable=True)
-    assert written(tmp_path / "map") == expected(columns, 20.0, "")
 
 
 finite = st.floats(-1e6, 1e6, width=32) | st.integers(-60, 60).map(lambda i: 20.0 * i)

@@ -121,22 +121,22 @@ def test_a_run_killed_while_its_map_appears(tmp_path: Path, monkeypatch: pytest.
     assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
 
 
-def test_something_else_starts_anew(tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", ["another size", "another input", "no resume"])
+def test_another_run_starts_from_the_beginning(tmp_path: Path, case: str) -> None:
     files, columns = inputs(tmp_path, "binary")
     interrupted(files, tmp_path / "map", 4200)
-    made = divide(files, tmp_path / "map", settings(resume=True, cell_size=15.0))
+    options: dict[str, Any] = {"resume": case != "no resume"}
+    if case == "another size":
+        options["cell_size"] = 15.0
+    elif case == "another input":
+        columns = {name: column[::2] for name, column in columns.items()}
+        write_pcd(files[0], columns)
+        files.pop().unlink()
+    made = divide(files, tmp_path / "map", settings(**options))
     assert made.resumed_points == 0
-    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns), "15")
-
-
-def test_a_changed_input_starts_anew(tmp_path: Path) -> None:
-    files, columns = inputs(tmp_path, "binary")
-    interrupted(files, tmp_path / "map", 4200)
-    columns = {name: column[::2] for name, column in columns.items()}
-    write_pcd(files[0], columns)
-    made = divide(files[:1], tmp_path / "map", settings(resume=True))
-    assert made.resumed_points == 0
-    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
+    size = "15" if case == "another size" else "20"
+    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns), size)
+    assert sorted(os.listdir(tmp_path)) == [*(path.name for path in files), "map"]
 
 
 @pytest.mark.parametrize("damage", ["short", "gone", "state", "boot"])
@@ -158,15 +158,6 @@ def test_a_state_that_is_no_use_is_no_danger(tmp_path: Path, damage: str) -> Non
     made = resumed(files, tmp_path / "map")
     assert made.resumed_points == 0
     assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
-
-
-def test_without_resume_leftovers_are_swept(tmp_path: Path) -> None:
-    files, columns = inputs(tmp_path, "binary")
-    interrupted(files, tmp_path / "map", 4200)
-    made = divide(files, tmp_path / "map", settings())
-    assert made.resumed_points == 0
-    assert map_rows(tmp_path / "map") == expected_rows(rows_of(columns))
-    assert sorted(os.listdir(tmp_path)) == ["in0.pcd", "in1.pcd", "map"]
 
 
 def test_two_runs_do_not_mix(tmp_path: Path) -> None:

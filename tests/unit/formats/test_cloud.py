@@ -50,18 +50,21 @@ def test_a_pcd_in_memory(tmp_path: Path) -> None:
     assert cloud.viewpoint[0] == 1
     assert len(cloud.warnings) == 1
     assert read_cloud(path, keep_non_finite=True).dropped == 0
-    told = describe(path)
-    assert (told.format, told.encoding, told.version, told.points, told.dropped) == (
+    described = describe(path)
+    assert (described.format, described.encoding, described.version, described.points, described.dropped) == (
         "pcd",
         "binary",
         "0.7",
         3,
         1,
     )
-    assert [(c.name, c.dtype.str, c.components) for c in told.columns] == [("xyz", "<f4", 3), ("h", "<i2", 2)]
-    assert (told.width, told.height, told.file_bytes) == (3, 1, path.stat().st_size)
-    assert [bound.tolist() for bound in told.bounds] == [[1, 1, 1], [3, 3, 3]]
-    assert told.warnings == cloud.warnings
+    assert [(c.name, c.dtype.str, c.components) for c in described.columns] == [
+        ("xyz", "<f4", 3),
+        ("h", "<i2", 2),
+    ]
+    assert (described.width, described.height, described.file_bytes) == (3, 1, path.stat().st_size)
+    assert [bound.tolist() for bound in described.bounds] == [[1, 1, 1], [3, 3, 3]]
+    assert described.warnings == cloud.warnings
 
 
 def test_an_empty_pcd_has_its_columns(tmp_path: Path) -> None:
@@ -110,9 +113,9 @@ def test_other_formats(tmp_path: Path, name: str, data: bytes, columns: list[str
     assert cloud.xyz.tolist() == [list(point[:3]) for point in POINTS]
     if "intensity" in columns:
         assert cloud.columns["intensity"].tolist() == [0.5, 0.25, 0.125]
-    told = describe(path)
-    assert (told.points, told.dropped, told.format) == (3, 0, name[2:])
-    assert [spec.name for spec in told.columns] == columns
+    described = describe(path)
+    assert (described.points, described.dropped, described.format) == (3, 0, name[2:])
+    assert [spec.name for spec in described.columns] == columns
 
 
 @pytest.mark.parametrize(

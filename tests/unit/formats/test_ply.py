@@ -110,8 +110,8 @@ def test_every_column_keeps_name_and_type(tmp_path: Path, form: str) -> None:
     assert cloud.warnings == ()
     made = divide([tmp_path / "a.ply"], tmp_path / "map", DivideSettings(durable=False, check=True))
     assert dict(made.fields)["gps"] == "<u4"
-    told = describe(tmp_path / "a.ply")
-    assert (told.encoding, told.points, len(told.columns)) == (form, 2, 11)
+    described = describe(tmp_path / "a.ply")
+    assert (described.encoding, described.points, len(described.columns)) == (form, 2, 11)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -70,9 +70,9 @@ def test_columns_are_named(tmp_path: Path, name: str, text: str, columns: list[s
     if len(cloud.xyz) == 2 and columns[:1] != ["nx"]:
         for place, column in enumerate(columns, 3):
             assert cloud.columns[column].tolist() == [row[place] for row in ROWS]
-    told = describe(tmp_path / name)
-    assert [spec.name for spec in told.columns] == ["xyz", *columns]
-    assert told.warnings == cloud.warnings
+    described = describe(tmp_path / name)
+    assert [spec.name for spec in described.columns] == ["xyz", *columns]
+    assert described.warnings == cloud.warnings
 
 
 def test_a_header_may_put_the_coordinates_anywhere(tmp_path: Path) -> None:

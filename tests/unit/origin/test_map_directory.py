@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -54,30 +55,23 @@ def check(map_path: Path | str, cells: Path, **options: object) -> None:
     assert catalogue.ids(catalogue.query(Circle(-10.0, 50.0, 1.0))[0]) == [str(cells / "t_-20_40.pcd")]
 
 
-def test_yaml_beside_the_directory(tmp_path: Path) -> None:
-    root = autoware_map(tmp_path)
-    check(root, root / "pointcloud_map.pcd")
-    check(root, root / "pointcloud_map.pcd", strict=True)
-    check(root / "pointcloud_map.pcd", root / "pointcloud_map.pcd")
-    check(root / "pointcloud_map_metadata.yaml", root / "pointcloud_map.pcd")
-
-
-def test_yaml_inside_the_directory(tmp_path: Path) -> None:
-    cells = tmp_path / "pointcloud_map.pcd"
-    put_cells(cells)
-    (cells / "pointcloud_map_metadata.yaml").write_text(metadata_text())
-    check(tmp_path, cells)
+def test_metadata_beside_or_inside_a_directory_of_any_name(tmp_path: Path) -> None:
+    root = autoware_map(tmp_path / "beside")
+    cells = root / "pointcloud_map.pcd"
+    check(root, cells, strict=True)
+    for path in (root, cells, root / "pointcloud_map_metadata.yaml"):
+        check(path, cells)
+    (root / "pointcloud_map_metadata.yaml").rename(cells / "pointcloud_map_metadata.yaml")
+    check(root, cells)
     check(cells, cells)
-
-
-def test_a_plain_directory_with_any_name(tmp_path: Path) -> None:
-    cells = tmp_path / "cells"
+    root = tmp_path / "plain"
+    cells = root / "cells"
     put_cells(cells)
     (cells / "pointcloud_data_metadata.yaml").write_text(metadata_text())
     check(cells, cells)
-    (cells / "pointcloud_data_metadata.yaml").rename(tmp_path / "pointcloud_map_metadata.yaml")
+    (cells / "pointcloud_data_metadata.yaml").rename(root / "pointcloud_map_metadata.yaml")
     check(cells, cells)
-    check(tmp_path, cells)
+    check(root, cells)
 
 
 def test_explicit_paths(tmp_path: Path) -> None:
@@ -190,17 +184,29 @@ def test_many_missing_files_are_counted(tmp_path: Path) -> None:
     assert problem.endswith("gone_0.pcd, gone_1.pcd, gone_2.pcd, ... (500 in all)")
 
 
-def test_no_entry_has_a_file(tmp_path: Path) -> None:
-    put_cells(tmp_path, ["other.pcd", "another.pcd"])
-    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text())
-    with pytest.raises(MapDataError, match="have no file") as caught:
+@pytest.mark.parametrize(
+    ("names", "metadata", "why"),
+    [
+        (["other.pcd", "another.pcd"], metadata_text(), "have no file"),
+        (NAMES, metadata_text([]), "lists no cells"),
+        (NAMES, None, r"3 PCD files but no pointcloud_map_metadata\.yaml"),
+    ],
+)
+def test_no_cell_to_serve(tmp_path: Path, names: Sequence[str], metadata: str | None, why: str) -> None:
+    put_cells(tmp_path, names)
+    if metadata is not None:
+        (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata)
+    with pytest.raises(MapDataError, match=why) as caught:
         open_map(tmp_path).load()
     assert caught.value.exit_code == 65
+    assert metadata is not None or caught.value.cause == "no_metadata"
 
 
 def test_nothing_there(tmp_path: Path) -> None:
-    with pytest.raises(MapMissing, match="no such file"):
-        open_map(tmp_path / "none")
+    (tmp_path / "file").touch()
+    for path, why in ((tmp_path / "gone", "no such file"), (tmp_path / "file" / "map", "not a directory")):
+        with pytest.raises(MapMissing, match=f"{path}: {why}"):
+            open_map(path)
     with pytest.raises(MapMissing, match="no metadata file"):
         open_map(tmp_path, metadata=tmp_path / "none.yaml")
     with pytest.raises(MapMissing, match="no PCD file"):
@@ -210,49 +216,26 @@ def test_nothing_there(tmp_path: Path) -> None:
     assert MapMissing("x").exit_code == 66
 
 
-def test_several_files_without_metadata(tmp_path: Path) -> None:
-    put_cells(tmp_path)
-    with pytest.raises(MapDataError, match=r"3 PCD files but no pointcloud_map_metadata\.yaml") as caught:
-        open_map(tmp_path).load()
-    assert caught.value.cause == "no_metadata"
-
-
-def test_metadata_without_cells(tmp_path: Path) -> None:
-    put_cells(tmp_path)
-    (tmp_path / "pointcloud_map_metadata.yaml").write_text(metadata_text([]))
-    with pytest.raises(MapDataError, match="lists no cells"):
-        open_map(tmp_path).load()
-
-
-def test_things_called_pcd_that_are_no_files(tmp_path: Path) -> None:
+def test_what_is_no_file_costs_its_own_cell_alone(tmp_path: Path) -> None:
     root = autoware_map(tmp_path)
     cells = root / "pointcloud_map.pcd"
     (cells / "t_0_0.pcd").unlink()
     os.mkfifo(cells / "t_0_0.pcd")
     (cells / "dangling.pcd").symlink_to(cells / "nowhere")
+    (cells / "itself").symlink_to(cells / "itself")
+    (cells / "0.pcd").symlink_to(cells / "0.pcd")
     (cells / "empty.pcd").mkdir()
     catalogue = open_map(root).load()
     assert len(catalogue) == 2
     text = "\n".join(catalogue.problems)
     assert f"no regular file: {cells / 't_0_0.pcd'}" in text
     assert f"cannot be read (No such file or directory): {cells / 'dangling.pcd'}" in text
-
-
-def test_links_that_lead_nowhere_cost_nobody_else(tmp_path: Path) -> None:
-    root = autoware_map(tmp_path)
-    cells = root / "pointcloud_map.pcd"
-    (cells / "itself").symlink_to(cells / "itself")
-    (cells / "0.pcd").symlink_to(cells / "0.pcd")
-    catalogue = open_map(root).load()
-    assert len(catalogue) == 3
-    (problem,) = catalogue.problems
-    assert problem == (
-        f"cannot be read (Too many levels of symbolic links): {cells / '0.pcd'}, {cells / 'itself'}"
-    )
+    looping = f"{cells / '0.pcd'}, {cells / 'itself'}"
+    assert f"cannot be read (Too many levels of symbolic links): {looping}" in text
 
 
 def test_names_that_no_client_could_say(tmp_path: Path) -> None:
-    """They are told of in readable form, and neither served nor looked into."""
+    """They are reported in readable form, and neither served nor looked into."""
     root = autoware_map(tmp_path)
     cells = os.fsencode(root / "pointcloud_map.pcd")
     Path(os.fsdecode(cells + b"/Stra\xdfe.pcd")).write_bytes(b"")
@@ -266,13 +249,6 @@ def test_names_that_no_client_could_say(tmp_path: Path) -> None:
         f"the name is not UTF-8: {root}/pointcloud_map.pcd/Stra\\xdfe.pcd, {root}/pointcloud_map.pcd/\\xff"
     )
     assert lacking.endswith("entries whose file is missing, not served: t_0_0.pcd")
-
-
-def test_why_there_is_no_map(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for path, why in ((tmp_path / "gone", "no such file"), (tmp_path / "file" / "map", "not a directory")):
-        with pytest.raises(MapMissing, match=f"{path}: {why}"):
-            open_map(path)
 
 
 def test_path_that_no_client_could_name(tmp_path: Path) -> None:
@@ -301,27 +277,18 @@ def test_one_pcd_is_one_cell_with_the_bounds_of_its_points(tmp_path: Path, name:
             assert catalogue.stamp(0) == SourceStamp.of(file.stat()).token
 
 
-def test_one_pcd_too_large_wants_dividing(tmp_path: Path) -> None:
-    file = tmp_path / "city.pcd"
-    with open(file, "wb") as out:
-        out.truncate((256 << 20) + 1)
-    with pytest.raises(MapDataError, match="divide it") as caught:
-        open_map(file).load()
-    assert caught.value.cause == "needs_dividing"
-    assert caught.value.exit_code == 65
-
-
-def test_one_pcd_whose_points_are_too_many_is_not_decompressed(tmp_path: Path) -> None:
-    file = tmp_path / "city.pcd"
-    points = 100_000_000
+@pytest.mark.parametrize("points", [0, 100_000_000])
+def test_one_pcd_too_large_wants_dividing(tmp_path: Path, points: int) -> None:
+    """Neither a large file nor one of very many points is read or decompressed."""
     head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
     head += f"WIDTH {points}\nHEIGHT 1\nPOINTS {points}\nDATA binary_compressed\n"
-    with open(file, "wb") as out:
-        out.write(head.encode() + (100 << 20).to_bytes(4, "little") + (points * 12).to_bytes(4, "little"))
-        out.truncate(101 << 20)
-    with pytest.raises(MapDataError, match="1144 MiB of points") as caught:
-        open_map(file).load()
-    assert caught.value.cause == "needs_dividing"
+    with open(tmp_path / "city.pcd", "wb") as out:
+        if points:
+            out.write(head.encode() + struct.pack("<II", 100 << 20, points * 12))
+        out.truncate(101 << 20 if points else (256 << 20) + 1)
+    with pytest.raises(MapDataError, match="1144 MiB of points" if points else "divide it") as caught:
+        open_map(tmp_path / "city.pcd").load()
+    assert (caught.value.cause, caught.value.exit_code) == ("needs_dividing", 65)
 
 
 def test_one_pcd_without_points_or_sense(tmp_path: Path) -> None:

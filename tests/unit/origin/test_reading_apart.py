@@ -95,7 +95,7 @@ def test_endless_metadata_is_refused_in_a_few_words(root: Path, more: str, messa
 
 @pytest.mark.usefixtures("never_here")
 def test_very_many_anchors_are_read_apart(root: Path) -> None:
-    """They name what nobody asks for."""
+    """They name cells that no client needs."""
     write_metadata(root, "".join(f"a{i}: &a{i} [1, 2]\n" for i in range(LONG // 16)))
     (problem,) = origin(root).load().problems
     assert f"entries whose file is missing, not served: a0, a1, a2, ... ({LONG // 16} in all)" in problem

@@ -57,7 +57,7 @@ def assert_equal(a: Catalogue, b: Catalogue) -> None:
 
 
 def rewrite_unseen(origin: MapDirectory) -> Path:
-    """Rewrite a file in place, which no directory shows: tells whether files were looked at."""
+    """Rewrite a file in place, which no directory shows: only a look at the files does."""
     file = Path(origin.path) / "pointcloud_map.pcd" / "1" / "c_20_0.pcd"
     with open(file, "r+b") as out:
         out.write(b"y")
@@ -99,7 +99,7 @@ def add_folder(root: Path) -> None:
 
 
 def restore_metadata_times(root: Path) -> None:
-    """Same size and mtime as before: only the ctime tells."""
+    """Same size and mtime as before: only the ctime differs."""
     file = root / "pointcloud_map_metadata.yaml"
     status = file.stat()
     file.write_text(file.read_text().replace("[20, 0]", "[20, 9]"))
@@ -163,7 +163,7 @@ def test_every_kind_of_damage_is_noticed(origin: MapDirectory, caplog: pytest.Lo
         caplog.clear()
         assert_equal(truth, origin.load())
         assert any("damaged catalogue cache ignored" in message for message in caplog.messages)
-        assert file.read_bytes() == sound  # written anew
+        assert file.read_bytes() == sound  # written again
     file.unlink()
     file.mkdir()
     caplog.clear()

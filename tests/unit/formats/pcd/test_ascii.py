@@ -183,7 +183,7 @@ def test_rows_of_the_wrong_length(tmp_path: Path, text: bytes, row: int) -> None
 
 
 def test_too_few_rows(tmp_path: Path) -> None:
-    error = refused(tmp_path, b"1 2 3\n# padding so that the size alone does not tell\n4 5 6\n", XYZ)
+    error = refused(tmp_path, b"1 2 3\n# padding so that the size alone does not show it\n4 5 6\n", XYZ)
     assert error.cause == "truncated"
     assert "2 rows" in str(error)
 

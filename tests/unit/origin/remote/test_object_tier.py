@@ -58,6 +58,7 @@ def test_an_object_comes_back(cache: Path, tier: ObjectTier, is_index: bool) -> 
     assert len([path for path in cache.rglob("*") if path.is_file()]) == 1
     assert tier.put(NAME, DATA, is_index=is_index), "once more, as another process may at the same time"
     assert tier.problem == ""
+    assert tier.get(NAME, len(DATA) - 1, is_index=is_index) is None, "a size that is not its own"
 
 
 def test_nothing_is_kept_without_a_budget(cache: Path) -> None:
@@ -70,46 +71,26 @@ def test_nothing_is_kept_without_a_budget(cache: Path) -> None:
 # --- what lies there ----------------------------------------------------------------------------------
 
 
-def _zeros(file: Path) -> None:
-    file.write_bytes(bytes(len(DATA)))  # what a power cut may leave
-
-
-def _flipped(file: Path) -> None:
+def flip(file: Path) -> None:
     file.write_bytes(DATA[:-1] + bytes([DATA[-1] ^ 1]))
 
 
-def _short(file: Path) -> None:
-    os.truncate(file, 100)
-
-
-def _empty(file: Path) -> None:
-    os.truncate(file, 0)
-
-
-def _long(file: Path) -> None:
-    file.write_bytes(DATA + b"x")
-
-
-def _huge(file: Path) -> None:
-    os.truncate(file, 1 << 40)
-
-
-def _link(file: Path) -> None:
+def link(file: Path) -> None:
     file.rename(file.with_name("elsewhere"))
     file.symlink_to("elsewhere")
 
 
-def _loop(file: Path) -> None:
+def loop(file: Path) -> None:
     file.unlink()
     file.symlink_to(file.name)
 
 
-def _pipe(file: Path) -> None:
+def pipe(file: Path) -> None:
     file.unlink()
     os.mkfifo(file)
 
 
-def _socket(file: Path) -> None:
+def unix_socket(file: Path) -> None:
     file.unlink()
     here = os.open(file.parent, os.O_PATH)
     with socket.socket(socket.AF_UNIX) as one:
@@ -120,14 +101,25 @@ def _socket(file: Path) -> None:
     file.with_name("s").rename(file)
 
 
-@pytest.mark.parametrize(
-    "damage", [_zeros, _flipped, _short, _empty, _long, _huge, _link, _loop, _pipe, _socket]
-)
-def test_what_is_not_that_object_is_removed_and_replaced(
-    cache: Path, tier: ObjectTier, damage: Callable[[Path], None]
-) -> None:
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "zeros": lambda file: file.write_bytes(bytes(len(DATA))),  # what a power cut may leave
+    "flipped": flip,
+    "of another object": lambda file: file.write_bytes(DATA[::-1]),
+    "short": lambda file: os.truncate(file, 100),
+    "empty": lambda file: os.truncate(file, 0),
+    "long": lambda file: file.write_bytes(DATA + b"x"),
+    "huge": lambda file: os.truncate(file, 1 << 40),
+    "link": link,
+    "loop": loop,
+    "pipe": pipe,
+    "socket": unix_socket,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_what_is_not_that_object_is_removed_and_replaced(cache: Path, tier: ObjectTier, damage: str) -> None:
     tier.put(NAME, DATA)
-    damage(path_of(cache))
+    DAMAGES[damage](path_of(cache))
     assert tier.get(NAME, len(DATA)) is None
     assert tier.damaged_objects == 1
     assert not os.path.lexists(path_of(cache))
@@ -135,15 +127,6 @@ def test_what_is_not_that_object_is_removed_and_replaced(
     assert tier.damaged_objects == 1
     assert tier.put(NAME, DATA)
     assert tier.get(NAME, len(DATA)) == DATA
-
-
-def test_another_object_s_file_under_its_name(cache: Path, tier: ObjectTier) -> None:
-    other = DATA[::-1]
-    tier.put(NAME, DATA)
-    path_of(cache).write_bytes(other)
-    assert tier.get(NAME, len(DATA)) is None
-    tier.put(NAME, DATA)
-    assert tier.get(NAME, len(DATA) - 1) is None, "a size that is not its own"
 
 
 def test_a_directory_in_its_place_is_no_error(
@@ -239,20 +222,19 @@ def test_a_file_where_a_directory_should_be(tmp_path: Path, caplog: pytest.LogCa
 
 
 def test_no_descriptor_is_left_open(cache: Path, tier: ObjectTier) -> None:
-    def count() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
     tier.put(NAME, DATA)
-    before = count()
-    for change in ("", "open to all", "gone"):
-        if change == "open to all":
-            (cache / "objects").chmod(0o777)
-        elif change:
-            shutil.rmtree(cache)
+    before = len(os.listdir("/proc/self/fd"))
+    changes: list[Callable[[], object]] = [
+        lambda: None,
+        lambda: (cache / "objects").chmod(0o777),
+        lambda: shutil.rmtree(cache),
+    ]
+    for change in changes:
+        change()
         for _ in range(20):
             tier.get(NAME, len(DATA))
             tier.put(NAME, DATA, is_index=True)
-    assert count() <= before
+    assert len(os.listdir("/proc/self/fd")) <= before
 
 
 # --- whose it is --------------------------------------------------------------------------------------
@@ -364,11 +346,11 @@ def test_fetched_once(origin: Origin, tier: ObjectTier, cache: Path, is_index: b
 def test_damaged_on_the_disk_is_fetched_again(origin: Origin, tier: ObjectTier, cache: Path) -> None:
     objects = KeptObjects(origin, tier)
     objects.read(NAME, len(DATA))
-    _flipped(path_of(cache))
+    flip(path_of(cache))
     assert objects.read(NAME, len(DATA)) == DATA
     assert path_of(cache).read_bytes() == DATA
     assert (len(origin.asked), tier.damaged_objects) == (2, 1)
-    _flipped(path_of(cache))
+    flip(path_of(cache))
     origin.is_offline = True
     with pytest.raises(Offline):
         objects.read(NAME, len(DATA))
@@ -376,14 +358,12 @@ def test_damaged_on_the_disk_is_fetched_again(origin: Origin, tier: ObjectTier, 
 
 def test_damaged_in_the_store_is_not_kept(origin: Origin, tier: ObjectTier, cache: Path) -> None:
     objects = KeptObjects(origin, tier)
-    (origin.directory / blob_path(NAME)).write_bytes(DATA[::-1])
-    with pytest.raises(MapDataError, match="SHA-256 is not its name") as caught:
-        objects.read(NAME, len(DATA))
-    assert caught.value.cause == "damaged"
-    (origin.directory / blob_path(NAME)).write_bytes(DATA[:-1])
-    with pytest.raises(MapDataError):
-        objects.read(NAME, len(DATA))
-    (origin.directory / blob_path(NAME)).unlink()
+    blob = origin.directory / blob_path(NAME)
+    for data, why in ((DATA[::-1], "SHA-256 is not its name"), (DATA[:-1], "")):
+        blob.write_bytes(data)
+        with pytest.raises(MapDataError, match=why):
+            objects.read(NAME, len(DATA))
+    blob.unlink()
     with pytest.raises(MapMissing):
         objects.read(NAME, len(DATA))
     assert not cache.exists()

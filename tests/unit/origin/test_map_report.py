@@ -1,27 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map's catalogue knows where its frame lies, as the divided map beside it says."""
+"""What a divided map's report says: where its frame lies, and which cells lie far from all others."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from shmmap.dividing.divide import divide
-from shmmap.dividing.settings import DivideSettings
-from shmmap.formats.pcd.writer import write_pcd
 from shmmap.origin.map_directory import open_map
-from shmmap.origin.map_report import REPORT_HEAD, REPORT_NAME, UNKNOWN_FRAME, MapFrame, read_map_frame
+from shmmap.origin.map_report import (
+    REPORT_HEAD,
+    REPORT_NAME,
+    UNKNOWN_FRAME,
+    MapFrame,
+    far_cells_notes,
+    read_map_frame,
+)
+from tests.support.clouds import cloud_file, divide_quickly
 
 
 @pytest.fixture
 def moved_map(tmp_path: Path) -> Path:
     """A map of points in UTM, which `divide` moves."""
     xyz = np.array([[512000.25, 5403000.5, 300.0], [512030.0, 5403010.0, 301.0]])
-    write_pcd(tmp_path / "town.pcd", {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2]})
-    divide([tmp_path / "town.pcd"], tmp_path / "map", DivideSettings(durable=False))
+    divide_quickly([cloud_file(tmp_path / "town.pcd", {"xyz": xyz})], tmp_path / "map")
     return tmp_path / "map"
 
 
@@ -37,8 +42,6 @@ def test_a_catalogue_knows_what_was_subtracted(moved_map: Path, tmp_path: Path) 
 def test_also_where_the_catalogue_comes_from_the_cache(
     moved_map: Path, tmp_path: Path, cached_from: int
 ) -> None:
-    from dataclasses import replace
-
     opened = replace(open_map(moved_map, cache_dir=tmp_path / "cache"), cached_from_cells=cached_from)
     assert [opened.load().frame.origin[0] > 500_000 for _ in range(2)] == [True, True]
 
@@ -72,3 +75,44 @@ def test_a_report_of_any_kind_leaves_a_map(tmp_path: Path, text: str | None, fra
 def test_another_tool_s_map_has_none(moved_map: Path, tmp_path: Path) -> None:
     (moved_map / REPORT_NAME).unlink()
     assert open_map(moved_map, cache_dir=tmp_path / "cache").load().frame == UNKNOWN_FRAME
+
+
+def notes(corners: list[tuple[float, float]], size: float = 20.0, points: int = 100) -> list[str]:
+    names = [f"{x:g}_{y:g}.pcd" for x, y in corners]
+    return far_cells_notes(np.array(corners, np.float64).reshape(-1, 2), size, names, [points] * len(names))
+
+
+TOWN = [(20.0 * i, 20.0 * j) for i in range(20) for j in range(20)]
+
+
+@pytest.mark.parametrize(
+    ("far", "said"),
+    [
+        ([(9000.0, 0.0)], ["1 cell lies 8.6 km from all others, with 100 points (stray ones?): 9000_0.pcd"]),
+        ([(9000.0, 0.0), (9020.0, 0.0)], ["2 cells lie 8.6 km"]),
+        ([(9000.0, 0.0), (0.0, -5000.0)], ["1 cell lies", "1 cell lies"]),
+        ([(-640.0, 0.0)], ["1 cell lies 0.62 km"]),
+        ([(580.0, 0.0)], []),
+        ([(9000.0 + 20 * i, 0.0) for i in range(5)], []),
+        ([], []),
+    ],
+)
+def test_what_is_far(far: list[tuple[float, float]], said: list[str]) -> None:
+    found = notes(TOWN + far)
+    assert len(found) == len(said)
+    assert all(any(words in note for note in found) for words in said)
+
+
+def test_small_maps() -> None:
+    assert notes([]) == notes([(0.0, 0.0)]) == notes([(0.0, 0.0), (20.0, 0.0)]) == []
+    assert len(notes([(0.0, 0.0), (20.0, 0.0), (9000.0, 0.0)])) == 1
+    assert notes([(500.0 * i, 0.0) for i in range(20)], size=500.0) == []
+
+
+def test_divide_says_so(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    xyz = (rng.random((5000, 3)) * [60, 60, 8]).astype(np.float32)
+    xyz[0] = [9000, 0, 0]
+    made = divide_quickly([cloud_file(tmp_path / "a.pcd", {"xyz": xyz})], tmp_path / "map")
+    (note,) = made.notes
+    assert "km from all others, with 1 point (stray ones?): _9000_0.pcd" in note
