@@ -14,7 +14,7 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import Verbs, publish
+from tests.support.command_line import Shmmap, publish
 from tests.support.daemon_process import DaemonProcess, Deadline, counters
 from tests.support.divided_map import make_map
 from tests.support.published_daemon import ALL, flip, until, until_taken
@@ -116,7 +116,7 @@ def test_screens_say_it(daemon: DaemonFactory, web: FaultyWeb, tmp_path: Path) -
     one = daemon(web.url, "--poll", "0")
     assert load_all(one).complete
     counts_when(one, lambda counts: counts["objects_fetched"] == CELLS + PAGES + 1)
-    shmmap_ = Verbs(one, tmp_path)
+    shmmap_ = Shmmap(one, tmp_path)
     shown: dict[str, Any] = shmmap_.json("status")["published"]
     assert shmmap_.json("top")["published"].keys() == shown.keys()
     assert (shown["version"], shown["objects_fetched"], shown["cells_known"]) == (1, CELLS + PAGES + 1, CELLS)
@@ -161,7 +161,7 @@ def test_nothing_of_it_where_the_map_is_files(daemon: DaemonFactory, tmp_path: P
     made = make_map(tmp_path / "town", columns=2, rows=2, points=300)
     one = daemon(made.root)
     assert load_all(one).complete
-    shmmap_ = Verbs(one, tmp_path)
+    shmmap_ = Shmmap(one, tmp_path)
     assert shmmap_.json("status")["published"] is None
     assert shmmap_.json("top")["published"] is None
     for text in (shmmap_("status"), shmmap_("top", "--once"), shmmap_("map")):

@@ -17,11 +17,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.publishing import make_older, publish
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.command_line import health, verb
+from tests.support.command_line import health, make_older, publish, verb
 from tests.support.compiled_programs import built_preload
 from tests.support.cpp_client import CppClient
 from tests.support.daemon_process import ROOT, Deadline, counters
