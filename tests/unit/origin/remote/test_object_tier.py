@@ -359,7 +359,7 @@ def test_damaged_on_the_disk_is_fetched_again(origin: Origin, tier: ObjectTier, 
 def test_damaged_in_the_store_is_not_kept(origin: Origin, tier: ObjectTier, cache: Path) -> None:
     objects = KeptObjects(origin, tier)
     blob = origin.directory / blob_path(NAME)
-    for data, why in ((DATA[::-1], "SHA-256 is not its name"), (DATA[:-1], "")):
+    for data, why in ((DATA[::-1], "SHA-256 is not its name"), (DATA[:-1], "bytes")):
         blob.write_bytes(data)
         with pytest.raises(MapDataError, match=why):
             objects.read(NAME, len(DATA))
