@@ -215,7 +215,7 @@ class Service:
                 memory.statistics.beat()
                 self._tell_epoch("started")
                 self._live.tell()
-                memory.scheduler.pool.start_one()
+                memory.scheduler.start_loader()
                 cells = len(memory.cache.catalogue)
                 log.info(
                         "ready", endpoint=self._socket_path, instance=self._config.instance,

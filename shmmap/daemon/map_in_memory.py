@@ -7,6 +7,7 @@ import contextlib
 import os
 import secrets
 import time
+from functools import partial
 from typing import NamedTuple
 
 from shmmap import __version__
@@ -128,10 +129,15 @@ class MapInMemory:
             )  # fmt: skip
             parent = PreparedParent(settings, self.watched, early)
             parent.start()  # it imports what loaders need while this process gets ready
-            pool = WorkerPool(
-                config.loaders(), directory, parent, config.load_timeout_s, self.watched,
+            pool = partial(
+                WorkerPool,
+                config.loaders(),
+                directory,
+                parent,
+                config.load_timeout_s,
+                self.watched,
                 places=origin.places if origin is not None else 1,
-            )  # fmt: skip
+            )
             self.map_switch = MapSwitch(self.cache)
             self.scheduler = Scheduler(
                 self.cache,
@@ -139,16 +145,14 @@ class MapInMemory:
                 pool,
                 clock=time.monotonic,
                 prefetch_share=config.prefetch_share,
-                ride_out_s=config.ride_out_s,
+                outage_tolerance_s=config.ride_out_s,
             )
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
             self.adoption.take_over(time.monotonic())
             self.cache.tell_all()
-            self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
+            self.watched.watch(reclaimer.closer.fd, self.scheduler.room.on_freed, "memory")
             if pins.fd >= 0:
-                self.watched.watch(
-                    pins.fd, lambda: self.scheduler.room.hear_of_closes(time.monotonic()), "memory"
-                )
+                self.watched.watch(pins.fd, lambda: self.scheduler.room.on_closes(time.monotonic()), "memory")
             if self.cache.names.fd >= 0:
                 self.watched.watch(
                     self.cache.names.fd,

@@ -233,8 +233,8 @@ class Sampler:
         An outage begins when the failed loads were started; its length is shown until the next one.
         """
         prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
-        health = prefetcher.prefetch.health
-        statistics.set("ride_out_ns", int(prefetcher.ride_out_s * 1e9))
+        health = prefetcher.health
+        statistics.set("ride_out_ns", int(prefetcher.outage_tolerance_s * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         statistics.set("origin_out", int(health.is_out))
