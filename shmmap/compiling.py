@@ -120,5 +120,5 @@ def compiled(*signatures: Any, brief: bool = False, **settings: Any) -> Callable
 
 
 def inlined(function: F) -> F:
-    """Make a function callable from kernels; compiled with whoever calls it."""
+    """Make a function callable from kernels; compiled with its callers."""
     return cast("F", numba.njit(nogil=True, inline="always", error_model="numpy")(function))

@@ -22,7 +22,7 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 T = TypeVar("T")
 FEW: Final = 2048
-"""So many are kept in one dict: to share these out takes a fifth of a millisecond."""
+"""Entries that are kept in one dict: to share these out takes a fifth of a millisecond."""
 _SHARDS: Final = 64
 _RAISE: Final = object()
 

@@ -236,7 +236,7 @@ class Service:
                 memory.statistics.beat()
                 self._publish_epoch("started")
                 self._live.begin_events()
-                memory.scheduler.pool.start_one()
+                memory.scheduler.start_loader()
                 cells = len(memory.cache.catalogue)
                 log.info(
                     "ready",

@@ -7,6 +7,7 @@ import contextlib
 import os
 import secrets
 import time
+from functools import partial
 from typing import NamedTuple
 
 from shmmap.daemon.cache.cell_cache import CellCache
@@ -150,7 +151,8 @@ class MapInMemory:
             )
             parent = PreparedParent(settings, self.watched, early)
             parent.start()  # it imports what loaders need while this process gets ready
-            pool = WorkerPool(
+            pool = partial(
+                WorkerPool,
                 config.loaders(),
                 directory,
                 parent,
@@ -170,11 +172,9 @@ class MapInMemory:
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
             self.adoption.take_over(time.monotonic())
             self.cache.tell_all()
-            self.watched.watch(reclaimer.closer.fd, self.scheduler.room.hear_of_freed, "memory")
+            self.watched.watch(reclaimer.closer.fd, self.scheduler.room.on_freed, "memory")
             if pins.fd >= 0:
-                self.watched.watch(
-                    pins.fd, lambda: self.scheduler.room.hear_of_closes(time.monotonic()), "memory"
-                )
+                self.watched.watch(pins.fd, lambda: self.scheduler.room.on_closes(time.monotonic()), "memory")
             if self.cache.names.fd >= 0:
                 self.watched.watch(
                     self.cache.names.fd,

@@ -357,7 +357,7 @@ def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> N
         return
     try:
         cache.store(key, header, fd)
-    except OSError as error:  # the cache is a convenience: a full disk costs nobody a layer
+    except OSError as error:  # the cache is a convenience: a full disk costs no layer
         cache.writable = False
         log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
 

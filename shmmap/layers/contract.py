@@ -3,7 +3,7 @@
 
 A new kind is one module that makes a `LayerKind`, and one registration: a line in
 `shmmap.layers.spec` for a kind of shmmap's own, an entry point of the group ``shmmap.layers``
-(its object a `LayerKind`) for anybody else's.  `shmmap.testing.layer_conformance` checks any kind.
+(its object a `LayerKind`) for any other.  `shmmap.testing.layer_conformance` checks any kind.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ class LayerKind:
     name
         ASCII identifier; what specs say before the parenthesis.
     builder_version
-        1 to 255; raise it when the same points would give other bytes: caches then build anew.
+        1 to 255; raise it when the same points would give other bytes: caches then build again.
     summary, borders
         For people: what it holds, and what happens where two cells meet.
     parameters, columns

@@ -11,7 +11,7 @@ it its new version.  ::
     DIRECTORY/layers/version/cd/<version>.layer
 
 Entries appear whole, by renaming; nothing is synced, since every column is compared with its checksum
-when it is loaded, and an entry that does not match is removed and built anew.  Entries that others could
+when it is loaded, and an entry that does not match is removed and built again.  Entries that others could
 have written are not used.  How much is kept, and what goes first, is in `shmmap.disk_budget`.
 """
 

@@ -285,7 +285,7 @@ SEARCH: Final = LayerKind(
     name="search",
     builder_version=1,
     summary="points sorted by column and height, with a table of columns, for finding neighbours",
-    borders="holds the cell's own points alone; who looks near a border looks into both cells",
+    borders="holds the cell's own points alone; a search near a border looks into both cells",
     parameters=(edge("leaf", "edge of a column, best the distance searched", required=True),),
     columns=(
         LayerColumn("xyz", None, "(rows, 3)", "m", "the points, map frame: by tile, column, then z"),

@@ -28,7 +28,7 @@ from shmmap.segment.version import Source, Stamp, cell_version, layer_version
 
 __all__ = [
     "FILES",
-    "MOST_SOURCE_BYTES",
+    "MAX_SOURCE_BYTES",
     "CellJob",
     "CellSource",
     "Fetcher",
@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 
-MOST_SOURCE_BYTES: Final = 1 << 30
+MAX_SOURCE_BYTES: Final = 1 << 30
 """Points of one cell, uncompressed, that a layer is computed of: all of them are in a process's memory then.
 
 A compressed file of a few megabytes may claim more.  A cloud that is served as one cell has fewer."""
@@ -155,10 +155,10 @@ def read_segment(
 
 
 def _check_size(nbytes: int, name: str) -> None:
-    if nbytes > MOST_SOURCE_BYTES:
+    if nbytes > MAX_SOURCE_BYTES:
         raise refusal(
             "too_large",
-            f"a layer is computed of at most {format_bytes(MOST_SOURCE_BYTES)} of points, not of"
+            f"a layer is computed of at most {format_bytes(MAX_SOURCE_BYTES)} of points, not of"
             f" {format_bytes(nbytes)}",
             path=name,
             hint=SMALLER,

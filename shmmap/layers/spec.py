@@ -80,7 +80,7 @@ def _offered() -> dict[str, LayerKind]:
     for entry in entry_points(group=GROUP):
         try:
             kind = entry.load()
-        except Exception as error:  # noqa: BLE001  somebody else's module: anything may happen in it
+        except Exception as error:  # noqa: BLE001  another package's module: anything may happen in it
             log.error("layer kind not loaded", kind=entry.name, module=entry.value, error=error)
             continue
         if not isinstance(kind, LayerKind) or kind.name != entry.name or kind.name in _own:

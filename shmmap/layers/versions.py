@@ -2,7 +2,7 @@
 """Versions of the layers of a map's cells, and which cells a layer looks into.
 
 A layer with a halo has its neighbours in its version.  Finding them takes some 40 us, so those versions are
-remembered until one of the cells changes, and whoever needs many asks first how many are `unknown`.
+remembered until one of the cells changes, and a caller that needs many asks first which are `unknown`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 
 MAX_NEIGHBOURS: Final = 64
 """Most files that a layer with a halo reads beside its own."""
-MOST_REMEMBERED: Final = 1 << 18
-"""Versions, about 100 bytes each; whoever asks for ever new layers must not fill the daemon's memory."""
+MAX_REMEMBERED: Final = 1 << 18
+"""Versions, about 100 bytes each; requests for ever new layers must not fill the daemon's memory."""
 
 
 _SLACK_M: Final = 1e-3
@@ -208,7 +208,7 @@ class LayerVersions:
             yield layer, [index, *near.tolist()]
 
     def _remember(self, index: int, layer: str, version: int) -> None:
-        if self._count >= MOST_REMEMBERED:
+        if self._count >= MAX_REMEMBERED:
             oldest, known = next(iter(self._known.items()))
             known.popitem()
             self._count -= 1

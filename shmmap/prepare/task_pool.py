@@ -177,16 +177,16 @@ class TaskPool(Generic[_Task, _Done]):
         worker: _Worker[_Task] = _Worker(process, ours)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
-        self._feed(worker, task)
+        self._give(worker, task)
 
-    def _feed(self, worker: _Worker[_Task], task: _Task) -> None:
+    def _give(self, worker: _Worker[_Task], task: _Task) -> None:
         worker.tasks[task.number] = task
         with contextlib.suppress(OSError):  # its end is reported by its channel
             worker.channel.send(encode(task))
 
     def _fill(self, worker: _Worker[_Task]) -> None:
         while len(worker.tasks) < self._ahead and (task := self._next()) is not None:
-            self._feed(worker, task)
+            self._give(worker, task)
 
     def _receive(self, worker: _Worker[_Task]) -> None:
         try:

@@ -184,7 +184,7 @@ class _Mapping:
         sinks: Sequence[SimpleQueue[Owned | None]],
         beside: NDArray[np.uint8] | None,
     ) -> None:
-        # a private mapping keeps the first one, by which the daemon knows who uses the segment
+        # a private mapping keeps the first one, by which the daemon knows the segment's user
         self._beside = beside
         # True: read-only; numpy then refuses to make any view of it writeable
         self.__array_interface__ = {

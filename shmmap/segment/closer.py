@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Closes the last descriptors of removed segments in a thread of its own.
 
-Taking memory back takes the kernel 0.2 ms a megabyte, of whoever closes the last descriptor.  The thread does
-nothing else, and holds the interpreter only for the moment between two closes.
+Taking memory back takes the kernel 0.2 ms a megabyte, in the thread that closes the last descriptor.  This
+one does nothing else, and holds the interpreter only for the moment between two closes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Final
 __all__ = ["Closer"]
 
 SMALL_BYTES: Final = 1 << 16
-MOST_WAITING: Final = 64
+MAX_WAITING: Final = 64
 """Descriptors that may wait to be closed: clients need them more."""
 THREAD_NAME: Final = "shmmap-freeing"
 
@@ -31,7 +31,7 @@ class Closer:
     fd
         Readable when `closed` has something to count.
     small_bytes
-        Memory that is taken back sooner than another thread is told of it.
+        Memory that is taken back sooner than another thread is woken.
     """
 
     def __init__(self) -> None:
@@ -45,10 +45,10 @@ class Closer:
     @property
     def full(self) -> bool:
         """Whether no more may be given to it for now."""
-        return self._waiting >= MOST_WAITING
+        return self._waiting >= MAX_WAITING
 
     def close(self, fd: int, nbytes: int) -> None:
-        """Have a descriptor closed whose segment takes so many bytes."""
+        """Have a descriptor closed whose segment takes ``nbytes``."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
             before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shared-memory directory as the daemon uses it: make, publish, retire, list and remove segments.
 
-Nothing here maps a segment or keeps it open: what the kernel says of who still uses a segment
+Nothing here maps a segment or keeps it open: what the kernel reports about users of a segment
 (`shmmap.segment.pins`) counts every open file, the daemon's own included.
 """
 
@@ -67,8 +67,8 @@ class ShmDirectory:
     ) -> int:
         """Stamp, chmod and name a finished segment; returns the bytes it occupies.
 
-        The name appears only when everything else is done, so whoever can open the segment sees
-        it whole.
+        The name appears only when everything else is done, so any process that can open the segment
+        sees it whole.
         """
         step("daemon.stamp")
         os.pwrite(fd, pack_publish_block(block), header_bytes - 64)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who still uses a segment: what the kernel says, not a timer.
+"""Who still uses a segment: what the kernel reports, not a timer.
 
-A write lease (``F_SETLEASE``) on a file is granted only if nobody else has it open or mapped.  That
-holds through renames, client crashes, SIGSTOP and daemon restarts, and costs 6 us.  Whoever takes
-a lease must ignore SIGIO: an opener makes the kernel send it.
+A write lease (``F_SETLEASE``) on a file is granted only if no other descriptor or mapping of it exists.  That
+holds through renames, client crashes, SIGSTOP and daemon restarts, and costs 6 us.  A process that
+takes a lease must ignore SIGIO: an opener makes the kernel send it.
 
 *Who* it is comes from open-file-description locks: a reader locks the one byte at its session's
 slot right after opening, and the lock lives as long as its mapping.
@@ -31,8 +31,8 @@ __all__ = [
 ]
 
 MAX_SLOT: Final = (1 << 62) - 1
-MOST_RANGES: Final = 32
-PATIENCE_S: Final = 0.02
+MAX_RANGES: Final = 32
+TIMEOUT_S: Final = 0.02
 """Time of the processor that asking for one segment's holders may take; 100 of them take 0.5 ms."""
 LOADER_SLOT: Final = 0
 """The daemon's own loaders lock this one while they look at a segment; no session has it."""
@@ -55,15 +55,15 @@ def lock_slot(fd: int, slot: int) -> None:
 
 
 def has_slot(fd: int, slot: int) -> bool:
-    """Whether session ``slot`` holds the file, or somebody has locked a range that goes over it."""
+    """Whether session ``slot`` holds the file, or a lock of a range covers it."""
     asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, slot, 1, 0)
     return bool(_FLOCK.unpack(fcntl.fcntl(fd, _OFD_GETLK, asked))[0] != fcntl.F_UNLCK)
 
 
 def in_use(fd: int) -> bool:
-    """Whether anybody but this descriptor has the file open or mapped.
+    """Whether the file is open or mapped other than by this descriptor.
 
-    That counts as in use, whoever it is; an operator's pins are another thing.  The caller must own the
+    By whatever process; an operator's pins are another thing.  The caller must own the
     file (or be root) and hold no other descriptor or mapping of it.
     """
     if not keep_if_unused(fd):
@@ -74,7 +74,7 @@ def in_use(fd: int) -> bool:
 
 
 def keep_if_unused(fd: int) -> bool:
-    """As `in_use`, the other way round; who opens the file from now on waits until ``fd`` is closed."""
+    """As `in_use`, negated; an open of the file waits from now on until ``fd`` is closed."""
     try:
         fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
     except BlockingIOError:
@@ -85,16 +85,16 @@ def keep_if_unused(fd: int) -> bool:
 def holders(fd: int, *, limit: int = 1024) -> list[int]:
     """Slots of the sessions that hold the file, ascending, at most ``limit`` of them.
 
-    Whoever uses it without a lock is not among them.  The kernel answers with *some* conflicting lock of the
+    Users without a lock are not among them.  The kernel answers with *some* conflicting lock of the
     range asked about, so the range is split around each answer.  A reader may hold locks without
     number, and each question takes the kernel longer the more there are: asking ends after
-    `PATIENCE_S` or `MOST_RANGES` locks that are nobody's, with what was found by then.
+    `TIMEOUT_S` or `MAX_RANGES` locks that are no session's, with what was found by then.
     """
     found: list[int] = []
     ranges = [(0, MAX_SLOT)]
-    end_s = time.thread_time() + PATIENCE_S  # of work: a busy machine does not make the answer shorter
+    end_s = time.thread_time() + TIMEOUT_S  # of work: a busy machine does not make the answer shorter
     asked_times = strange = 0
-    while ranges and len(found) < limit and strange < MOST_RANGES:
+    while ranges and len(found) < limit and strange < MAX_RANGES:
         asked_times += 1
         if asked_times % 16 == 0 and time.thread_time() > end_s:
             break
@@ -107,7 +107,7 @@ def holders(fd: int, *, limit: int = 1024) -> list[int]:
         if length == 1:
             found.append(at)
         else:
-            strange += 1  # a lock over a range is nobody's slot
+            strange += 1  # a lock over a range is no session's slot
         if at > first:
             ranges.append((first, at - 1))
         if end < last:

@@ -40,7 +40,7 @@ __all__ = [
 
 
 PIECE_BYTES: Final = 1 << 16
-"""Written at a time, in 30 us: in between, whoever else has work for this processor is let in.  A client that
+"""Written at a time, in 30 us: in between, other work for this processor may run.  A client that
 its reply has just woken would else wait until the loader beside it has to wait for something."""
 
 

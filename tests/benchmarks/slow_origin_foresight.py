@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.loading.look_ahead import OriginHealth, Prefetch, WayAhead, Wish
+from shmmap.daemon.loading.look_ahead import OriginHealth, Prefetch, Wish
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Circle
@@ -106,8 +106,7 @@ class Truth(Nothing):
     ) -> None:
         super().__init__()
         self._is_absent = is_absent
-        self._policy = Prefetch(is_absent, outage_tolerance_s)
-        self._policy.health = self.health
+        self._policy = Prefetch(is_absent, outage_tolerance_s, self.health)
         self._times_s, self._cells = future
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
@@ -115,7 +114,7 @@ class Truth(Nothing):
         del catalogue
         if now_s < self.health.next_try_s():
             return None
-        begin, end = np.searchsorted(self._times_s, [now_s, now_s + self._policy.look_ahead.way_s])
+        begin, end = np.searchsorted(self._times_s, [now_s, now_s + self._policy.look_ahead.route_s])
         for at in range(begin, end):
             if self._is_absent(int(self._cells[at]), "points"):
                 self.health.tried(now_s)
@@ -132,14 +131,13 @@ class Policy(Nothing):
 
     def __init__(self, is_absent: IsAbsent, outage_tolerance_s: float, motion: Motion, area: Circle) -> None:
         super().__init__()
-        self._prefetch = Prefetch(is_absent, outage_tolerance_s)
-        self._prefetch.health = self.health
-        self._way = WayAhead(motion, area, ("points",))
-        self._prefetch.ways["client"] = self._way
+        self._prefetch = Prefetch(is_absent, outage_tolerance_s, self.health)
+        self._motion = motion
+        self.asks(area)
 
     def asks(self, area: Circle) -> None:
         """Go on from there."""
-        self._way.asks(area, ("points",))
+        self._prefetch.follow("client", self._motion, area, ("points",))
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
         """Return what the daemon would fetch next."""

@@ -17,25 +17,21 @@ import shmmap
 from shmmap.failpoints import CLIENT_STEPS, DAEMON_STEPS, LIVE_STEPS, ORIGIN_STEPS, WORKER_STEPS
 
 EVERY = (*WORKER_STEPS, *DAEMON_STEPS, *LIVE_STEPS, *ORIGIN_STEPS, *CLIENT_STEPS)
-PROGRAM = """
-import sys
+PROGRAM = f"""
 from shmmap.failpoints import step
-for _ in range(5):
-    step("daemon.link")
-    step("daemon.unlink")
-    print("lives", flush=True)
+for label in {5 * EVERY}:
+    step(label)
+    print(label, flush=True)
 """
 
 
-def run(wanted: str) -> tuple[int, int]:
-    """Exit code and how far it came."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        env={**os.environ, "SHMMAP_TEST_CRASH": wanted},
-        capture_output=True,
-        text=True,
-    )
-    return done.returncode, done.stdout.count("lives")
+def taken(wanted: str | None) -> tuple[int, int]:
+    """Return the exit code of a program that takes every step five times, and how many it took."""
+    environment = {name: value for name, value in os.environ.items() if name != "SHMMAP_TEST_CRASH"}
+    if wanted is not None:
+        environment["SHMMAP_TEST_CRASH"] = wanted
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True)
+    return done.returncode, len(done.stdout.split())
 
 
 def test_each_step_is_in_the_code_once() -> None:
@@ -45,40 +41,25 @@ def test_each_step_is_in_the_code_once() -> None:
     assert found == Counter(EVERY)
 
 
-def steps_taken(wanted: str | None) -> tuple[int, list[str]]:
-    """Exit code of a program that takes every step, and the last ones it took."""
-    environment = {name: value for name, value in os.environ.items() if name != "SHMMAP_TEST_CRASH"}
-    if wanted is not None:
-        environment["SHMMAP_TEST_CRASH"] = wanted
-    program = (
-        f"from shmmap.failpoints import step\nfor label in {EVERY}: step(label); print(label, flush=True)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    return done.returncode, done.stdout.split()
+@pytest.mark.parametrize("wanted", [None, "", "daemon.unlink:6"])
+def test_nothing_happens_without_the_variable_or_before_its_time(wanted: str | None) -> None:
+    assert taken(wanted) == (0, 5 * len(EVERY))
 
 
-@pytest.mark.parametrize("wanted", [None, ""])
-def test_nothing_happens_without_the_variable(wanted: str | None) -> None:
-    assert steps_taken(wanted) == (0, list(EVERY))
-
-
-@pytest.mark.parametrize("label", EVERY)
-def test_with_it_that_step_and_no_other_is_the_last(label: str) -> None:
-    assert steps_taken(label) == (-signal.SIGKILL, list(EVERY[: EVERY.index(label)]))
-
-
-def test_the_nth_time_is_the_last() -> None:
-    assert run("daemon.link") == (-signal.SIGKILL, 0)
-    assert run("daemon.unlink:3") == (-signal.SIGKILL, 2)
-    assert run("daemon.unlink:9") == (0, 5)
+@pytest.mark.parametrize("steps", [WORKER_STEPS, DAEMON_STEPS, LIVE_STEPS, ORIGIN_STEPS, CLIENT_STEPS])
+@pytest.mark.parametrize("time", [1, 3])
+def test_that_step_and_no_other_is_the_last(steps: tuple[str, ...], time: int) -> None:
+    label = steps[-1]
+    before = EVERY.index(label) + (time - 1) * len(EVERY)
+    assert taken(label if time == 1 else f"{label}:{time}") == (-signal.SIGKILL, before)
 
 
 def test_only_one_process_dies_for_a_file(tmp_path: Path) -> None:
     wanted = f"daemon.link:2:{tmp_path}/reached"
-    assert run(wanted) == (-signal.SIGKILL, 1)
+    assert taken(wanted)[0] == -signal.SIGKILL
     assert (tmp_path / "reached").exists()
-    assert run(wanted) == (0, 5)
+    assert taken(wanted) == (0, 5 * len(EVERY))
 
 
 def test_a_name_that_does_not_exist_is_an_error() -> None:
-    assert run("daemon.nowhere")[0] == 1
+    assert taken("daemon.nowhere")[0] == 1

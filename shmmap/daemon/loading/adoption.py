@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an earlier life of the daemon left in the shared-memory directory: taken over, watched or removed.
+"""What a previous run of the daemon left in the shared-memory directory: taken over, watched or removed.
 
 Every name of the instance is looked at once, before anything is served:
 
 - a segment that is published, ours, whole by its header, and of the version its cell has in the map
   now is *adopted*: it serves again as soon as a worker has compared its bytes with their checksums;
-- one of which that is not known yet, because the page of the map that its box lies in is not here, is *set
-  aside*: it keeps its name, its bytes count, and it is judged when the page comes;
-- any other segment that somebody still maps is kept as a retired one, known by name and cell, and is
-  freed when its last reader lets go;
-- the rest is removed.  What this user may not remove (a stranger's file that squats one of our
-  names) is left alone and never served.
+- one whose version is not known yet, because the page of the map that its box lies in is not here, is
+  *deferred*: it keeps its name, its bytes count, and it is judged when the page comes;
+- any other segment that a process still maps is kept as a retired one, known by name and cell, and is
+  freed when its last reader unmaps it;
+- the rest is removed.  What this user may not remove (another account's file under one of our
+  names) is ignored and never served.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = ["Adoption"]
 NOT_IN_MAP: Final = "its cell is not in the map"
 CHANGED: Final = "its cell, or one around it, has changed"
 UNDECIDED: Final = (NOT_IN_MAP, CHANGED)
-"""What may turn out to be otherwise when more of the map is known."""
+"""Reasons that may pass when more of the map is known."""
 ADOPTED: Final = 0.5 * BACKGROUND
 """Priority of pages that segments of an earlier run are judged by: behind all that a client waits for."""
 
@@ -54,7 +54,9 @@ class Adoption:
     cache: CellCache
     loads: Loads
     misplaced: MisplacedCells
-    _aside: dict[str, tuple[Box, int]] = field(default_factory=dict)  # where to look, and the bytes, by name
+    _deferred: dict[str, tuple[Box, int]] = field(
+        default_factory=dict
+    )  # where to look, and the bytes, by name
     _by_page: dict[int, list[str]] = field(default_factory=dict)  # names, by a page that they wait for
 
     def take_over(self, now_s: float) -> None:
@@ -69,27 +71,27 @@ class Adoption:
             log.info("segments of an earlier daemon", **counts)
 
     def pages_came(self, pages: Iterable[int], now_s: float) -> None:
-        """More of the map is known: judge what was set aside for it."""
+        """Judge what was deferred for pages that have come."""
         for page in pages:
             self._judge(self._by_page.pop(page, ()), now_s)
 
     def map_changed(self, now_s: float) -> None:
-        """Another state of the map is served, with other pages: judge by the pages that are here."""
+        """Judge what was deferred by the pages of another state of the map."""
         self._by_page.clear()
-        self._judge(list(self._aside), now_s)
+        self._judge(list(self._deferred), now_s)
 
     def _judge(self, names: Iterable[str], now_s: float) -> None:
         for name in names:
-            area, nbytes = self._aside[name]
+            area, nbytes = self._deferred[name]
             if not self._wait_for_page(name, area):
-                del self._aside[name]
+                del self._deferred[name]
                 self.cache.ledger.aside_bytes -= nbytes
                 self._take(name, now_s)
 
     def close(self, *, keep: bool) -> None:
-        """Take the names of what is still set aside away, or leave them to the next run."""
+        """Remove the names of what is still deferred, or leave them to the next run."""
         if not keep:
-            for name in self._aside:
+            for name in self._deferred:
                 self._remove(name, "the daemon ends")
 
     def _absent_page(self, area: Box) -> int | None:
@@ -107,7 +109,7 @@ class Adoption:
         return page is not None
 
     def _may_become_known(self, resident: Resident) -> Box | None:
-        """Where pages of the map are absent that a segment is judged by; None if none are."""
+        """Return the area by which a segment is judged, if pages of it are absent; else None."""
         if self.cache.catalogue.complete or is_retired(resident.name):
             return None
         min_x, min_y, max_x, max_y = resident.box
@@ -115,8 +117,8 @@ class Adoption:
         area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
         return area if self._absent_page(area) is not None else None
 
-    def _set_aside(self, name: str, area: Box, nbytes: int) -> None:
-        self._aside[name] = area, nbytes
+    def _defer(self, name: str, area: Box, nbytes: int) -> None:
+        self._deferred[name] = area, nbytes
         self.cache.ledger.aside_bytes += nbytes
         self._wait_for_page(name, area)
         pages = self.cache.catalogue.pages
@@ -124,7 +126,7 @@ class Adoption:
             pages.want(pages.of_area(area), ADOPTED)
 
     def _take(self, name: str, now_s: float) -> str:
-        """What becomes of a name."""
+        """Decide about a name; returns what became of it."""
         try:
             fd = self.cache.directory.open(name)
         except OSError as error:
@@ -136,7 +138,7 @@ class Adoption:
                 self._adopt(fd, resident, outside)
                 return "taken_over"
             if why_not in UNDECIDED and (area := self._may_become_known(resident)) is not None:
-                self._set_aside(name, area, resident.nbytes)
+                self._defer(name, area, resident.nbytes)
                 return "set_aside"
             if self._is_used(fd):
                 self._keep_for_readers(name, resident, now_s)
@@ -149,7 +151,7 @@ class Adoption:
     # --- judging ------------------------------------------------------------------------------
 
     def _look(self, fd: int, name: str, now_s: float) -> tuple[Resident, int, str]:
-        """Return a leftover as its header describes it, its points outside, and why it cannot serve."""
+        """Return a leftover as its header describes it, its points outside, and why it cannot be served."""
         live_name, nbytes = name.removesuffix(retired_name("")), measured_bytes(fd)
         unknown = Resident(live_name, Key("", ""), 0, nbytes, 0, (0.0,) * 4, 0.0, 0.0, checked=False)
         status = os.fstat(fd)
@@ -168,7 +170,7 @@ class Adoption:
         return resident, header.outside_points, self._why_not(name, status, header, resident)
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, resident: Resident) -> str:
-        """Why a whole segment cannot serve; empty if it can."""
+        """Return why a whole segment cannot be served; empty if it can."""
         cache, catalogue = self.cache, self.cache.catalogue
         if is_retired(name):
             return "it was retired"
@@ -218,7 +220,7 @@ class Adoption:
         if not is_retired(name):
             try:
                 self.cache.directory.rename(name, retired_name(name))
-            except OSError:  # somebody else has taken that name
+            except OSError:  # another process has taken that name
                 resident.name = another_name(name)
                 self.cache.directory.rename(name, retired_name(resident.name))
         self.cache.reclaimer.adopt(resident, now_s)
@@ -227,6 +229,6 @@ class Adoption:
         try:
             self.cache.directory.unlink(name)
         except OSError as error:
-            # sticky directories let only a file's owner remove it; a directory is nobody's segment
-            tell = log.info if error.errno == errno.EISDIR else log.warning
-            tell("leftover not removed", name=name, unusable=why, error=error.strerror)
+            # in a sticky directory only a file's owner may remove it; a directory is no segment
+            report = log.info if error.errno == errno.EISDIR else log.warning
+            report("leftover not removed", name=name, unusable=why, error=error.strerror)

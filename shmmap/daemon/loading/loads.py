@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Absent cells: what is wanted, which load comes next, what is under way, what failed.
 
-Those who ask take turns, and of each one's loads the nearest comes first: however many cells one process
+Processes that ask take turns, and of each one's loads the nearest comes first: however many cells one process
 asks for, another one's cells do not wait for more than a fair share of them.  Turns are by the time that
 loaders spend, as `shmmap.daemon.transport.inbox` has them by that of the loop; until a load has ended it
-counts by its bytes.  What nobody waits for (checks of adopted segments, pinned cells) comes when nothing else
-is queued.
+counts by its bytes.  What no client waits for (checks of adopted segments, pinned cells) comes when nothing
+else is queued.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from shmmap.segment.version import Stamp
 __all__ = ["BACKGROUND", "LoadQueue", "Loads"]
 
 BACKGROUND: Final = 1e12
-"""From this priority on a load is one that nobody waits for."""
+"""From this priority on no client waits for a load."""
 PREFETCH: Final = 2.0 * BACKGROUND
-"""From this priority on a load is one that nobody has asked for yet; and who asks for those."""
+"""From this priority on no client has asked for a load yet; and the asker of those."""
 FIRST_RETRY_S: Final = 1.0
 LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
-MOST_FAILURES: Final = 1 << 14
-"""Failures of a kind that are remembered: who asks for ever new layers must not fill the memory with them."""
+MAX_FAILURES: Final = 1 << 14
+"""Failures of a kind that are remembered: requests for ever new layers must not fill the memory with them."""
 LOAD_S: Final = 1e-4
-"""What a load is taken to need besides the time for its bytes: many tiny cells are work, too."""
+"""Time charged to a load besides that for its bytes: many tiny cells are work, too."""
 BYTE_S: Final = 1e-9
 LOOKED_BEHIND: Final = 8
-"""Of each kind so many loads of an asker are looked at to know what room is needed soon."""
-MOST_REMEMBERED: Final = 1024
+"""Loads of each kind of an asker that are looked at to know what room is needed soon."""
+MAX_REMEMBERED: Final = 1024
 """Askers whose clocks are remembered; those forgotten when idle lose a debt of loads that have ended."""
 
 _Heap = list[tuple[float, int, Load]]
@@ -59,10 +59,7 @@ class _Asker:
 class LoadQueue:
     """Loads that wait for a worker or for room; one is here from `push` to `discard`.
 
-    Attributes
-    ----------
-    changes : int
-        How often a load came, went or was moved forward: another one may be next.
+    ``changes`` counts loads that came, went or were moved forward: another one may be next.
     """
 
     def __init__(self) -> None:
@@ -76,12 +73,12 @@ class LoadQueue:
         return len(self._loads)
 
     def count(self, asker: Hashable) -> int:
-        """How many loads somebody asked for wait."""
+        """Return how many loads of an asker wait."""
         mine = self._askers.get(asker)
         return 0 if mine is None else sum(number in self._loads for number in mine.best)
 
     def push(self, load: Load, priority: float, asker: Hashable) -> None:
-        """Somebody wants this; asked for again, it is never moved back."""
+        """Queue a load for an asker; asked for again, it is never moved back."""
         self.changes += load.number not in self._loads
         self._loads[load.number] = load
         mine = self._askers.get(asker)
@@ -94,12 +91,12 @@ class LoadQueue:
             heapq.heappush(mine.heaps[load.computed], (priority, load.number, load))
 
     def discard(self, load: Load) -> None:
-        """It does not wait any more."""
+        """Remove a load from the queue."""
         self.changes += 1
         self._loads.pop(load.number, None)
 
     def started(self, load: Load) -> None:
-        """It does not wait any more, and counts for whose turn it was; tell `ended` afterwards."""
+        """Remove a load that begins, and charge it to the asker whose turn it was; `ended` has to follow."""
         self.discard(load)
         load.payer, load.charged_s = self._chosen, LOAD_S + load.estimate * BYTE_S
         chosen = self._askers.get(self._chosen)
@@ -108,7 +105,7 @@ class LoadQueue:
             chosen.clock_s += load.charged_s
 
     def ended(self, load: Load) -> None:
-        """A load that was started has ended, or goes back: it counts for what it took."""
+        """Charge a load that has ended, or goes back, for what it took."""
         payer = self._askers.get(load.payer)
         if payer is not None:
             payer.running -= 1
@@ -116,7 +113,7 @@ class LoadQueue:
         load.spent_s = 0.0
 
     def next(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """The load that comes next, of those that are computed, that are not, or of all; or None."""
+        """Return the load that comes next, of those that are computed, that are not, or of all; or None."""
         best: tuple[bool, float, float, int] | None = None
         found: Load | None = None
         for asker, mine in list(self._askers.items()):
@@ -134,7 +131,7 @@ class LoadQueue:
         return found
 
     def bytes_behind(self) -> int:
-        """Estimates, together, of some loads that come after the one that `next` has just found."""
+        """Return the sum of the estimates of some loads that come after what `next` has just found."""
         chosen = self._askers.get(self._chosen)
         if chosen is None:
             return 0
@@ -146,13 +143,13 @@ class LoadQueue:
         )
 
     def _is_square(self, mine: _Asker) -> bool:
-        """Whether an asker that waits for nothing can be forgotten: nobody else does, or it owes no time."""
+        """Whether an asker that waits for nothing can be forgotten: none else waits, or it owes no time."""
         if mine.running:
             return False
-        return mine.clock_s <= self._clock_s or not self._loads or len(self._askers) > MOST_REMEMBERED
+        return mine.clock_s <= self._clock_s or not self._loads or len(self._askers) > MAX_REMEMBERED
 
     def _clean(self, mine: _Asker) -> None:
-        """Drop what does not wait any more from the front, and from everywhere once it is most."""
+        """Drop what no longer waits from the front, and from everywhere once it is the greater part."""
         for heap in mine.heaps:
             while heap and heap[0][1] not in self._loads:
                 mine.best.pop(heapq.heappop(heap)[1], None)
@@ -173,12 +170,8 @@ class Loads:
     ledger
         Promises the bytes of what is under way.
 
-    Attributes
-    ----------
-    by_key : dict
-        Loads that have not ended.
-    failures : dict
-        Why the last load of a key failed, until it succeeds or the cause may have passed.
+    ``by_key`` has the loads that have not ended; ``failures`` why the last load of a key failed, until it
+    succeeds or the cause may have passed.
     """
 
     def __init__(self, ledger: Ledger) -> None:
@@ -199,7 +192,7 @@ class Loads:
         return self._queue.changes
 
     def queued_of(self, asker: Hashable) -> int:
-        """How many of those somebody asked for."""
+        """Return how many of an asker's loads wait."""
         return self._queue.count(asker)
 
     def want(
@@ -213,7 +206,7 @@ class Loads:
     ) -> Load:
         """Queue a load, or move a queued one forward; however many ask, there is one load.
 
-        Those who ask take turns, in `LoadQueue`.  ``computed`` says that it may take long; by default what is
+        Askers take turns, in `LoadQueue`.  ``computed`` says that it may take long; by default what is
         not ``points`` does.
         """
         load = self.by_key.get(key)
@@ -232,7 +225,7 @@ class Loads:
         return load
 
     def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool | None = None) -> Load:
-        """Queue a load that nobody has asked for yet, behind everything that somebody asks for."""
+        """Queue a load that no client has asked for yet, behind everything that clients ask for."""
         load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH, computed=computed)
         load.wanted, load.prefetch = False, True
         return load
@@ -243,12 +236,12 @@ class Loads:
         return load is not None and load.unless is None
 
     def check(self, resident: Resident) -> None:
-        """Queue the check of a segment of an earlier life, behind everything that somebody asks for."""
+        """Queue the check of a segment of a previous run, behind everything that clients ask for."""
         load = self.want(resident.key, 0, float("inf"))
         load.adopted, load.wanted = resident, False
 
     def next_queued(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """The queued load nearest to whose turn it is, of the kinds that somebody can take; or None."""
+        """Return the nearest load of the asker whose turn it is, of the kinds that a worker can take."""
         while (load := self._queue.next(points=points, layers=layers)) is not None:
             if self.by_key.get(load.key) is load and not load.running:
                 return load
@@ -274,8 +267,8 @@ class Loads:
         load.reserved += extra if fits else 0
         return fits
 
-    def set_aside(self, load: Load) -> None:
-        """A queued load cannot be begun yet; `requeue` it when it can."""
+    def defer(self, load: Load) -> None:
+        """Take a load that cannot be begun yet out of the queue, until `requeue`."""
         self._queue.discard(load)
 
     def requeue(self, load: Load) -> None:
@@ -291,7 +284,7 @@ class Loads:
             self._queue.ended(load)
 
     def finish(self, load: Load, failure: Failure | None = None) -> None:
-        """The load ended; ``failure``, if there is one, stands until it succeeds or is cleared."""
+        """End a load; ``failure``, if there is one, stands until a load succeeds or it is cleared."""
         self._take_back(load)
         self._queue.discard(load)
         if self.by_key.get(load.key) is load:
@@ -314,7 +307,7 @@ class Loads:
         keys = self._keys_failed.setdefault(failure.code, OrderedDict())
         keys.pop(key, None)
         keys[key] = None
-        if len(keys) > MOST_FAILURES:
+        if len(keys) > MAX_FAILURES:
             oldest, _ = keys.popitem(last=False)
             self._forget_failure(oldest, failure.code)
 

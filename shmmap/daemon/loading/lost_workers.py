@@ -23,15 +23,15 @@ __all__ = ["LostWorkers"]
 KILLED: Final = "signal SIGKILL"
 OUT_OF_MEMORY: Final = "out of memory"
 START_ATTEMPTS: Final = 3
-"""After this many loaders in a row that could not start, loads fail instead of waiting."""
+"""Loaders in a row that could not start before loads fail instead of waiting."""
 
 LOSSES_ALLOWED: Final = 3
-"""So often a load may lose its loader along with the loaders' parent: it may be what ends the parent."""
+"""How often a load may lose its loader along with the loaders' parent: it may be what ends the parent."""
 
 
 @dataclass(eq=False, slots=True)
 class LostWorkers:
-    """Replaces workers, and queues again what they had not begun.
+    """Replaces workers, and requeues what they had not begun.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class LostWorkers:
     oom_kills: int = field(default_factory=out_of_memory_kills)
 
     def ended(self, worker: Worker, how: str, now_s: float) -> None:
-        """A worker's process ended; ``how`` is for people, and empty where its parent took it along."""
+        """Handle the end of a worker; ``how`` is for people, and empty where its parent took it along."""
         self.statistics.add("worker_crashes")
         if not worker.ready:
             self._could_not_start(worker, how, now_s)
@@ -62,7 +62,7 @@ class LostWorkers:
             self._vanished(worker, now_s)
 
     def _why_killed(self) -> str:
-        """Whether the kernel killed a loader for lack of memory: that is not its file's fault."""
+        """Say what killed a loader: for lack of memory the kernel does, which is not its file's fault."""
         before, self.oom_kills = self.oom_kills, out_of_memory_kills()
         limit = memory_limit_bytes()
         allowed = f" (the control group allows {format_bytes(limit)})" if limit else ""
@@ -82,7 +82,7 @@ class LostWorkers:
 
     def _could_not_start(self, worker: Worker, how: str, now_s: float) -> None:
         self.pool.failed_starts += 1
-        self.pool.parent.hear()
+        self.pool.parent.poll()
         how = how or self.pool.parent.why_not or "its parent has ended"
         log.error("loader could not start", reason=how)
         give_up = how == RESTART or self.pool.failed_starts >= START_ATTEMPTS
@@ -94,10 +94,10 @@ class LostWorkers:
                 self.loads.requeue(load)
 
     def _vanished(self, worker: Worker, now_s: float) -> None:
-        """Its parent ended: that is no job's fault, unless it happens again and again."""
+        """Replace a worker whose parent ended: no job's fault, unless it happens again and again."""
         at_work = worker.at_work or next(iter(worker.queue), 0)
         for job in self.pool.remove(worker):
-            self.room.hungry.pop(job.number, None)
+            self.room.forget(job.number)
             load = self.jobs.pop(job.number, None)
             if load is None:
                 continue
@@ -115,13 +115,13 @@ class LostWorkers:
             self._vanished(worker, now_s)
             return
         for job in self.pool.remove(worker):
-            self.room.hungry.pop(job.number, None)
+            self.room.forget(job.number)
             load = self.jobs.pop(job.number, None)
             if job.number == at_work:
                 log.error("loader replaced", path=job.source.name, reason=why)
                 if load is not None:
                     load.spent_s = spent_s
-                    # where it took too long nobody looks again: the file system may be what hangs
+                    # after a timeout the file is not looked at again: its file system may be what hangs
                     blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
                     known = load.sources[0] if blamed and load.sources else None
                     self.fail(load, code, f"{job.source.name}: {why}", known, now_s)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.loading.look_ahead import Prefetch, WayAhead
+from shmmap.daemon.loading.look_ahead import Prefetch
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.object_keeper import KeptCell, ObjectKeeper
 from shmmap.daemon.map.origin_link import OriginLink
@@ -22,20 +22,26 @@ from shmmap.daemon.records import Key
 from shmmap.layers.points import LAYER
 from shmmap.origin.remote.published_object import ObjectName, unpack_source
 
-__all__ = [
-    "DiskAhead",
-    "OriginWatch",
-]
+__all__ = ["DiskAhead", "OriginWatch"]
+
+
+LOOK_S: Final = 0.25
+"""Interval of looking whether memory has room and whether loads wait, seconds."""
+KEPT_S: Final = 60.0
+"""How long an object is assumed to stay on the disk, seconds: the disk cache drops unused ones."""
+AGAIN_S: Final = 2.0
+"""Pause before an object that could not be fetched is tried again, seconds."""
+MAX_KNOWN: Final = 1 << 16
 
 
 @dataclass(eq=False, slots=True)
 class OriginWatch:
-    """A chore of the serving loop.
+    """A background task of the serving loop: asks a remote origin whether it answers, when loads fail.
 
     Parameters
     ----------
     try_again
-        Has fetched what of the list of cells could not be had.
+        Fetches what of the list of cells could not be had.
     reload
         Called when there is another version of the map.
     """
@@ -48,7 +54,7 @@ class OriginWatch:
     @property
     def next_s(self) -> float:
         """At once when a load could not read what it needs, or never."""
-        failed = self.scheduler.prefetcher.prefetch.health.failed_in_a_row
+        failed = self.scheduler.prefetcher.health.failed_in_a_row
         return -math.inf if failed and not self.link.is_doubted else math.inf
 
     def run_step(self, now_s: float) -> None:
@@ -57,36 +63,22 @@ class OriginWatch:
         self.link.doubt()
 
     def collect(self) -> None:
-        """Act on what was found out."""
+        """Act on what was found out: once the origin answers again, failed loads are repeated."""
         news = self.link.take()
-        health = self.scheduler.prefetcher.prefetch.health
-        health.unreachable = self.link.is_out
+        self.scheduler.note_origin(unreachable=self.link.is_out, back=news.back)
         if news.back:
-            health.failed_in_a_row, health.waited_s = 0, 0.0
-            self.scheduler.loads.forget_failures()
-            self.scheduler.prefetcher.restart()
             self.try_again()
         if news.changed:
             self.reload()
 
 
-LOOK_S: Final = 0.25
-"""Interval of looking whether memory has room and whether loads wait, seconds."""
-KEPT_S: Final = 60.0
-"""How long an object is assumed to stay on the disk, seconds: the disk cache drops unused ones."""
-AGAIN_S: Final = 2.0
-"""Pause before an object that could not be fetched is tried again, seconds."""
-MOST_KNOWN: Final = 1 << 16
-
-
 class DiskAhead:
-    """A chore of the serving loop, for a published map with a disk cache."""
+    """A background task of the serving loop, for a published map with a disk cache."""
 
     def __init__(self, cache: CellCache, scheduler: Scheduler, keeper: ObjectKeeper) -> None:
         self._cache, self._scheduler, self._keeper = cache, scheduler, keeper
         prefetcher = scheduler.prefetcher
-        self._prefetch = Prefetch(self._is_lacking, prefetcher.outage_tolerance_s)
-        self._prefetch.health = prefetcher.prefetch.health
+        self._prefetch = Prefetch(self._is_lacking, prefetcher.outage_tolerance_s, prefetcher.health)
         self._map_version = 0
         self._rest: dict[tuple[int, str], float] = {}  # until when a layer of a cell is not looked at again
         self._lacking: set[tuple[int, str]] = set()  # not on the disk when they were last looked at
@@ -96,7 +88,7 @@ class DiskAhead:
     @property
     def next_s(self) -> float:
         """When there is something to do: while clients move."""
-        if not self._scheduler.prefetcher.prefetch.ways or self._keeper.free_places <= 0:
+        if not self._scheduler.prefetcher.prefetch.paths or self._keeper.free_places <= 0:
             return math.inf
         return self._next_s
 
@@ -111,11 +103,11 @@ class DiskAhead:
             self._next_s = now_s + LOOK_S
             return
         catalogue = self._cache.catalogue
-        if catalogue.map_version != self._map_version or len(self._rest) > MOST_KNOWN:
+        if catalogue.map_version != self._map_version or len(self._rest) > MAX_KNOWN:
             self._map_version = catalogue.map_version
             self._rest.clear()  # indices mean other cells
             self._forget()
-        self._follow()
+        self._prefetch.follow_like(self._scheduler.prefetcher.prefetch)
         wish = self._prefetch.next(catalogue, now_s)
         if wish is None:
             self._next_s = now_s if self._prefetch.more else self._prefetch.next_s(now_s)
@@ -143,18 +135,6 @@ class DiskAhead:
     def _forget(self) -> None:
         self._lacking.clear()
         self._cache.statistics.set("disk_ahead", 0)
-
-    def _follow(self) -> None:
-        """Take over the paths of the `Prefetcher`."""
-        mine, theirs = self._prefetch.ways, self._scheduler.prefetcher.prefetch.ways
-        for session in mine.keys() - theirs.keys():
-            del mine[session]
-        for session, other in theirs.items():
-            way = mine.get(session)
-            if way is None or way.motion is not other.motion:
-                mine[session] = WayAhead(other.motion, other.area, other.layers)
-            else:
-                way.asks(other.area, other.layers)
 
     def _is_lacking(self, index: int, layer: str) -> bool:
         """Whether a layer of a cell is neither in memory nor on its way there, and may not be on the disk."""

@@ -3,7 +3,7 @@
 
 It has a single thread, opens no file of the map and no segment, and only forks: a packet with one end of a
 channel makes a loader, and when that has ended the same end says how (`worker_messages.Ended`), after
-everything that the loader itself has said.  It dies with the daemon, and the loaders die with it.
+everything that the loader itself has sent.  It dies with the daemon, and the loaders die with it.
 
 Another child compiles the kernels of layers before a layer is asked for: once on a machine, for some seconds,
 behind everything else that the machine has to do.  If it dies, or lacks memory, each loader compiles what it
@@ -20,6 +20,7 @@ import signal
 import socket
 import sys
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, NoReturn
 
@@ -31,62 +32,39 @@ from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.start_child import receive_packet
 from shmmap.version import __version__
 
-__all__ = [
-    "compile_in_child",
-    "is_compiled",
-    "main",
-]
+__all__ = ["main"]
+
+MAX_SETTINGS_BYTES: Final = 1 << 14
+_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
+_MOST_NICE: Final = 19
 
 
-_LEAST: Final = 19  # niceness
-
-
-def is_compiled() -> bool:
-    """Whether there is nothing to do: all is compiled, or cannot be kept."""
-    mark = compiled_mark()
-    return mark is None or mark.is_file()
-
-
-def compile_in_child(channel: socket.socket) -> int:
-    """Begin to compile; returns the child's pid.
-
-    Parameters
-    ----------
-    channel
-        This process's, which the child closes.
-    """
-    ours = os.getpid()
-    pid = os.fork()
-    if not pid:
-        channel.close()
-        _compile(ours)
-    return pid
-
-
-def _compile(parent: int) -> NoReturn:
+def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
+    """Run in a process that was just forked, with its own turn on the processors, and end it."""
     code = 1
     try:
         die_with(parent)
-        os.setsid()
-        os.nice(_LEAST)
-        from shmmap.layers.build import compile_kernels
-
-        with contextlib.suppress(MemoryError):
-            compile_kernels(wait=False)  # else another daemon is at it
-        code = 0
+        os.setsid()  # see autogroups in sched(7)
+        code = run()
     except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
         traceback.print_exc()
     finally:
         os._exit(code)
 
 
-MOST_SETTINGS_BYTES: Final = 1 << 14
-_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
+def _compile() -> int:
+    """Compile the kernels of layers, unless another daemon is at it; returns the exit code."""
+    os.nice(_MOST_NICE)
+    from shmmap.layers.build import compile_kernels
+
+    with contextlib.suppress(MemoryError):
+        compile_kernels(wait=False)
+    return 0
 
 
 @dataclass(eq=False, slots=True)
 class _Parent:
-    """Forks loaders; ``children`` are their ids and our ends of their channels, by pidfd."""
+    """Forks loaders; ``_children`` are their ids and our ends of their channels, by pidfd."""
 
     channel: socket.socket
     settings: WorkerSettings
@@ -97,8 +75,9 @@ class _Parent:
         """Fork until the daemon closes the channel."""
         poller = select.poll()
         poller.register(self.channel, select.POLLIN)
-        if not is_compiled():
-            self._compiling = os.pidfd_open(compile_in_child(self.channel))
+        mark = compiled_mark()
+        if mark is not None and not mark.is_file():
+            self._compiling = self._start_compiling()
             poller.register(self._compiling, select.POLLIN)
         buffer = bytearray(64)
         while True:
@@ -109,7 +88,7 @@ class _Parent:
                     continue
                 if fd in self._children:
                     poller.unregister(fd)
-                    self._bury(fd)
+                    self._reap(fd)
                     continue
                 data, end = receive_packet(self.channel, buffer)
                 if not data:
@@ -124,7 +103,7 @@ class _Parent:
         try:
             pid = os.fork()
         except OSError as error:
-            _tell(end, worker_messages.Ended(-1, f"fork: {error.strerror}"))
+            _send_last(end, worker_messages.Ended(-1, f"fork: {error.strerror}"))
             raise
         if not pid:
             self._become_loader(end, ours)
@@ -133,42 +112,43 @@ class _Parent:
         except OSError as error:
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
-            _tell(end, worker_messages.Ended(-1, f"pidfd_open: {error.strerror}"))
+            _send_last(end, worker_messages.Ended(-1, f"pidfd_open: {error.strerror}"))
             raise
         self._children[pidfd] = pid, end
         return pidfd
 
     def _become_loader(self, end: socket.socket, parent: int) -> NoReturn:
-        code = 1
-        try:
+        self.channel.close()
+        for pidfd, (_, other) in self._children.items():
+            os.close(pidfd)
+            other.close()
+        _run_child(parent, lambda: work(end, self.settings))
+
+    def _start_compiling(self) -> int:
+        """Begin to compile kernels in a child; returns its pidfd."""
+        ours = os.getpid()
+        pid = os.fork()
+        if not pid:
             self.channel.close()
-            for pidfd, (_, other) in self._children.items():
-                os.close(pidfd)
-                other.close()
-            die_with(parent)
-            os.setsid()  # its own turn on the processors, see autogroups in sched(7)
-            code = work(end, self.settings)
-        except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
-            traceback.print_exc()
-        finally:
-            os._exit(code)
+            _run_child(ours, _compile)
+        return os.pidfd_open(pid)
 
     def _end_compiling(self) -> None:
-        """The child that compiles has ended; if it failed, each loader compiles what it needs."""
+        """Reap the child that compiles; if it failed, each loader compiles what it needs."""
         os.waitid(os.P_PIDFD, self._compiling, os.WEXITED)
         os.close(self._compiling)
         self._compiling = -1
 
-    def _bury(self, pidfd: int) -> None:
-        """A loader has ended: say how."""
+    def _reap(self, pidfd: int) -> None:
+        """Report how a loader has ended."""
         os.close(pidfd)
         pid, end = self._children.pop(pidfd)
         _, status = os.waitpid(pid, 0)
-        _tell(end, worker_messages.Ended(os.waitstatus_to_exitcode(status)))
+        _send_last(end, worker_messages.Ended(os.waitstatus_to_exitcode(status)))
 
 
-def _tell(end: socket.socket, message: worker_messages.Ended) -> None:
-    """Say a loader's last word and close its channel; where that is full the end itself has to do."""
+def _send_last(end: socket.socket, message: worker_messages.Ended) -> None:
+    """Send a loader's last message and close its channel; where that is full, the close has to do."""
     with end, contextlib.suppress(OSError):
         end.send(worker_messages.encode(message), socket.MSG_DONTWAIT)
 
@@ -183,13 +163,13 @@ def main(arguments: list[str]) -> int:
     die_with(int(arguments[1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     signal.signal(signal.SIGIO, signal.SIG_IGN)
-    take_slices(0)  # the short ones are for those who serve
+    take_slices(0)  # the short ones are for processes that serve
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
         score.write(_OOM_SCORE)
     with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
         gc.collect()
         gc.freeze()  # a collection in a loader would copy what all of them share
-        data, _ = receive_packet(channel, bytearray(MOST_SETTINGS_BYTES))
+        data, _ = receive_packet(channel, bytearray(MAX_SETTINGS_BYTES))
         if not data:
             return 0  # the daemon did not start after all
         shm_dir, memory_bytes, *more = map(os.fsdecode, bytes(data).split(b"\0"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Carries out what `Prefetch` wishes for, with loaders and memory that nobody asks for just now.
+"""Carries out what `Prefetch` wishes for, with loaders and memory that no client needs just now.
 
 A wish becomes a load like any other when nothing else is queued and a loader has a free place: so one at most
 waits, none is out of date, and what a client asks for comes first.  Some places are kept free, so that a
@@ -16,48 +16,40 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch, WayAhead
+from shmmap.daemon.loading.look_ahead import URGENT_S, Prefetch
 from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.records import Key, Load, Resident
 from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
 
 __all__ = ["Prefetcher"]
 
-MOST_WAYS: Final = 256
+MAX_PATHS: Final = 256
 """Clients for which cells are fetched ahead; each costs a look at every wish."""
-LATE_AT_ONCE: Final = 64
-MOST_COLD: Final = 1 << 14
-"""Cells that were not in memory, of all clients, between two turns; of more the first are forgotten."""
-MOST_ENDED: Final = 1024
+MISSES_PER_TURN: Final = 64
+MAX_COLD: Final = 1 << 14
+"""Cells of all clients that were not in memory, between two turns; of more the first are forgotten."""
+MAX_ENDED: Final = 1024
 """Loads that ended between two turns; of more the first are forgotten."""
 FOLLOW_S: Final = 0.005
-"""So long moves of a few clients may wait, and ended loads while nobody is on a way: of many that follow one
-another all are looked at once."""
+"""How long moves of a few clients may wait, and ended loads while no client moves: many of them are looked at
+together."""
 KEPT: Final = 4
-"""A part of one loader's places is kept free for demands: a quarter, one at least."""
+"""Part of one loader's places that is kept free for demands: a quarter, one at least."""
 SWAP_S: Final = 0.25
-"""So long nothing is looked for in the share of what was fetched ahead after there was nothing to give up."""
+"""How long the full share is not looked through again after there was nothing in it to give up."""
 FULL_S: Final = 1.0
-"""So long nothing is fetched ahead after there was no room for it."""
+"""How long nothing is fetched ahead after there was no room for it."""
 
 
 class Prefetcher:
-    """Has fetched what clients will ask for.
+    """Fetches what clients will ask for.
 
     Parameters
     ----------
     share
-        Part of the budget that may be taken by what nobody has asked for yet; 0: nothing is fetched ahead.
+        Part of the budget for what was fetched ahead and not asked for yet; 0: nothing is fetched ahead.
     outage_tolerance_s
         See `Prefetch`.
-
-    Attributes
-    ----------
-    cold
-        Cells that clients asked for and nobody had fetched ahead; filled by who answers them.
-    ended
-        Loads that have ended, whether they ran, the loader's time, and whether what they read was out of
-        reach; filled by who ends them.
     """
 
     def __init__(
@@ -65,10 +57,11 @@ class Prefetcher:
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
         self._sessions = cache.reclaimer.sessions
-        self.cold: deque[tuple[Session, Key]] = deque(maxlen=MOST_COLD)
-        self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MOST_ENDED)
+        self.cold: deque[tuple[Session, Key]] = deque(maxlen=MAX_COLD)
+        self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MAX_ENDED)
         self.share, self.outage_tolerance_s = share, outage_tolerance_s
         self.prefetch = Prefetch(self._is_absent, outage_tolerance_s)
+        self.health = self.prefetch.health
         self._now_s = 0.0
         self._next_s = -math.inf
         self._full_until_s = self._followed_s = self._answered_s = -math.inf
@@ -77,27 +70,28 @@ class Prefetcher:
         self._no_room = False
 
     def restart(self) -> None:
-        """Look along all paths from the start: more of the map is known, or less."""
+        """Look along all paths from the start: what is known of the map or its origin has changed."""
         self.prefetch.restart()
         self._next_s = -math.inf
 
     # --- clients ----------------------------------------------------------------------------------
 
-    def _follow(self, session: Session) -> None:
-        """A client has moved, or asked for another area; or is no more."""
-        ways = self.prefetch.ways
-        way = ways.get(session)
-        if session.area is None or not self.share:
-            ways.pop(session, None)
-        elif way is not None and way.motion is session.motion:
-            way.asks(session.area, session.layers)
-        elif way is not None or len(ways) < MOST_WAYS:
-            ways[session] = WayAhead(session.motion, session.area, session.layers)
+    def note_cold(self, session: Session, key: Key) -> None:
+        """Note a cell that a client asked for and that was not fetched ahead."""
+        self.cold.append((session, key))
 
-    def _note_late(self) -> None:
-        """Count what clients on their way wait for; of who has just come or jumped nobody could know."""
+    def _follow(self, session: Session) -> None:
+        """Follow a client that has moved, asked for another area, or gone."""
+        paths = self.prefetch.paths
+        if session.area is None or not self.share:
+            paths.pop(session, None)
+        elif session in paths or len(paths) < MAX_PATHS:
+            self.prefetch.follow(session, session.motion, session.area, session.layers)
+
+    def _count_misses(self) -> None:
+        """Count prefetch misses: cells that moving clients wait for; the first request and jumps are none."""
         cache = self._cache
-        for _ in range(min(LATE_AT_ONCE, len(self.cold))):
+        for _ in range(min(MISSES_PER_TURN, len(self.cold))):
             session, key = self.cold[0]
             if session in self._sessions.moved:
                 break  # first where it is
@@ -108,24 +102,24 @@ class Prefetcher:
                     "prefetch_misses", cache.events.prefetch_misses.note(session, cell_id, key.layer)
                 )
 
-    # --- a chore of the serving loop --------------------------------------------------------------
+    # --- a background task of the serving loop ----------------------------------------------------
 
     @property
     def next_s(self) -> float:
-        """When there is something to do: at once when clients moved, loads ended, or a way is looked over."""
+        """When there is something to do: at once when clients moved, loads ended, or a path is looked at."""
         many = len(self._sessions.moved) > MOVES_PER_STEP
-        if self.cold or many or (self.ended and self.prefetch.ways):
+        if self.cold or many or (self.ended and self.prefetch.paths):
             return -math.inf
-        next_s = self._next_s if self.prefetch.ways else math.inf
+        next_s = self._next_s if self.prefetch.paths else math.inf
         return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved or self.ended else next_s
 
     def run_step(self, now_s: float) -> None:
-        """Follow some clients that moved, and wish for what is needed first of what nobody asks for."""
+        """Follow some clients that moved, and have fetched what is needed first of what is not asked for."""
         self._now_s = now_s
         self._followed_s = now_s
         for session in self._sessions.follow_moves():
             self._follow(session)
-        self._note_late()
+        self._count_misses()
         while self.ended:
             self._learn(*self.ended.popleft())
         if now_s < self._full_until_s:
@@ -204,16 +198,20 @@ class Prefetcher:
         return False
 
     def full(self, now_s: float) -> None:
-        """There is no memory for a wish just now."""
+        """Note that there is no memory for a wish just now."""
         self._full_until_s = now_s + FULL_S
 
+    def note_end(self, load: Load, took_s: float, *, out: bool) -> None:
+        """Note the end of a load, the loader's time, and whether what it read was out of reach."""
+        self.ended.append((load, load.running, took_s, out))
+
     def started(self, load: Load) -> None:
-        """A wish was handed to a loader."""
+        """Note that a loader has a wish."""
         self._cache.statistics.add("prefetch_started", load not in self._running)
         self._running[load] = load.estimate
 
     def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
-        """A load has ended: what that tells of where it comes from.
+        """Learn from the end of a load whether its origin answers.
 
         A broken file counts as an answer.  The failure of a load that began before another one succeeded
         belongs to an outage that is over.
@@ -223,7 +221,7 @@ class Prefetcher:
             return
         if not out:
             self._answered_s = self._now_s
-        if self.prefetch.health.ended(took_s, failed=out):
+        if self.health.ended(took_s, failed=out):
             self._loads.forget_failures()
 
     def lacks_room(self, now_s: float) -> bool:
@@ -231,7 +229,7 @@ class Prefetcher:
         return self._no_room or now_s < self._full_until_s
 
     def shortage(self, now_s: float) -> int:
-        """What keeps cells from being fetched ahead: 0 nothing, 1 their share is full, 2 the budget is."""
+        """Return what keeps cells from being fetched: 0 nothing, 1 their share is full, 2 the budget is."""
         ledger = self._cache.ledger
         if ledger.prefetched_bytes + sum(self._running.values()) >= self.share * ledger.budget_bytes:
             return 1 if self.share else 0

@@ -20,16 +20,16 @@ __all__ = ["RESTART", "Early", "PreparedParent", "fork_early"]
 Early: TypeAlias = tuple[ForkedProcess, socket.socket]
 """A parent that has no settings yet, and the channel to it."""
 
-END_PATIENCE_S: Final = 0.1
-"""How long the loop waits for a killed parent to end; one that hangs in the kernel may take for ever."""
-CLOSE_PATIENCE_S: Final = 5.0
+END_TIMEOUT_S: Final = 0.1
+"""How long the loop waits for a killed parent to end; one that hangs in the kernel may never do so."""
+CLOSE_TIMEOUT_S: Final = 5.0
 """The same when the daemon ends: it waits for its child, on a machine that is busy, too."""
 
 RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
 
 
 def _installed() -> tuple[int, int] | None:
-    """What tells the loader program on the disk from another one; None where there is none any more."""
+    """Return what identifies the loader program on the disk; None where it is gone."""
     try:
         status = Path(__file__).with_name("worker_main.py").stat()
     except OSError:
@@ -38,7 +38,7 @@ def _installed() -> tuple[int, int] | None:
 
 
 def fork_early() -> Early | None:
-    """Make the first parent as a fork of this process: what both need is imported once.
+    """Fork the first parent from this process: what both need is imported once.
 
     Before this process has threads, locks, sockets or anything else that is its own; None if it is too late.
     """
@@ -56,14 +56,14 @@ def _run_parent(fd: int, daemon: int) -> int:
 
 
 class PreparedParent:
-    """Has loaders forked.  A parent that ends takes its loaders along; another one is started in its place.
+    """Forks loaders.  A parent that ends takes its loaders along; another one is started in its place.
 
     Parameters
     ----------
     settings
-        What it is told, see `shmmap.daemon.loading.parent_main.main`.
+        Sent to it, see `shmmap.daemon.loading.parent_main.main`.
     watched
-        Told of its descriptor.
+        Watches its descriptor.
     early
         The first one, if there is one already.
 
@@ -99,49 +99,49 @@ class PreparedParent:
                 "shmmap.daemon.loading.parent_main", new_session=True
             )
             self._channel.setblocking(False)
-            with contextlib.suppress(ConnectionError):  # it has ended: `hear` hears of it
+            with contextlib.suppress(ConnectionError):  # it has ended: `poll` finds out
                 self._channel.send(b"\0".join(map(os.fsencode, self._settings)))
-            self._watched.watch(self._channel.fileno(), self.hear, "loaders")
+            self._watched.watch(self._channel.fileno(), self.poll, "loaders")
             self._ready = False
 
     def fork(self, end: socket.socket) -> None:
-        """Have a loader made that speaks over ``end``.
+        """Fork a loader whose channel is ``end``.
 
         Raises
         ------
         OSError
             No more processes, memory or descriptors just now.
         """
-        self.hear()
+        self.poll()
         self.start()
         assert self._channel is not None  # noqa: S101  `start` has seen to it
         socket.send_fds(self._channel, [b"loader"], [end.fileno()])
 
-    def hear(self) -> None:
-        """Hear whether it is ready, or has ended; one that was ready is replaced at once."""
+    def poll(self) -> None:
+        """Read whether it is ready, or has ended; one that was ready is replaced at once."""
         while self._channel is not None:
             try:
                 data, _ = receive_packet(self._channel, self._buffer)
             except BlockingIOError:
                 return
             except ConnectionResetError:
-                continue  # told once, before what it had still said
+                continue  # reported once, before what it had still sent
             if bytes(data) == __version__.encode():
                 self._ready, self.why_not = True, ""
                 continue
             was_ready = self._ready
             self.end(RESTART if data else "")
             if was_ready:
-                log.error("parent of the loaders replaced")
+                log.error("loader parent restarted")
                 with contextlib.suppress(OSError):
                     self.start()
 
     def close(self) -> None:
         """End it, and with it every loader, when the daemon ends."""
-        self.end(patience_s=CLOSE_PATIENCE_S)
+        self.end(timeout_s=CLOSE_TIMEOUT_S)
 
-    def end(self, why: str = "", *, patience_s: float = END_PATIENCE_S) -> None:
-        """End it, and with it every loader; ``why`` tells people, else how it ended does."""
+    def end(self, why: str = "", *, timeout_s: float = END_TIMEOUT_S) -> None:
+        """End it, and with it every loader; ``why`` is for people; else how it ended."""
         if self._channel is None or self._process is None:
             return
         self._watched.unwatch(self._channel.fileno())
@@ -149,7 +149,7 @@ class PreparedParent:
         self._channel = None
         self._process.kill()
         try:
-            how = how_ended(self._process.wait(patience_s))
+            how = how_ended(self._process.wait(timeout_s))
         except subprocess.TimeoutExpired:
             how = "killed, and has not ended yet"
         if not self._ready:

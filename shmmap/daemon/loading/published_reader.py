@@ -38,7 +38,7 @@ __all__ = ["AT_ONCE", "PublishedReader"]
 
 AT_ONCE: Final = 32
 """Objects that a loader fetches at once, as long as they are small."""
-MOST_BYTES: Final = 8 << 20
+MAX_BYTES: Final = 8 << 20
 """Of larger ones fewer are fetched or held at once; always one."""
 _STACK_BYTES: Final = 512 << 10
 """Of a thread: what a loader may take of memory counts them whole."""
@@ -168,7 +168,7 @@ class ObjectFetcher:
     def _begin_some(self) -> None:
         while self._queue and self._under_way < AT_ONCE:
             fetch = self._queue[0]
-            is_much = self._held_bytes and self._held_bytes + fetch.name.size > MOST_BYTES
+            is_much = self._held_bytes and self._held_bytes + fetch.name.size > MAX_BYTES
             if is_much and (self._under_way or self._done):
                 break  # what is held goes when its job is done; without one to do there would be no end
             self._queue.popleft()

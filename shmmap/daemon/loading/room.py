@@ -18,56 +18,48 @@ from shmmap.quantities import format_bytes
 __all__ = ["Room"]
 
 AHEAD_SHARE: Final = 32
-"""For loads that come after the next one room is made in this part of the budget at most."""
+"""Part of the budget in which room is made, at most, for loads that come after the next one."""
 AGAIN_S: Final = 0.05
-"""A load that waits for room asks again after so long, whether anything has changed or not: a precaution."""
+"""After this time a load that waits for room asks again even if nothing has changed: a precaution."""
 
 
 @dataclass(eq=False, slots=True)
 class Room:
-    """Asks the cache for room on behalf of loads.
-
-    Attributes
-    ----------
-    hungry : dict
-        Per job number, the worker that waits for more room, and how many bytes it needs in all.
-    waited_for : bool
-        Whether the load that comes next waits for room, as far as is known.
-    """
+    """Asks the cache for room on behalf of loads."""
 
     cache: CellCache
     loads: Loads
     pool: WorkerPool
     prefetcher: Prefetcher
-    hungry: dict[int, tuple[Worker, int]] = field(default_factory=dict)
-    waited_for: bool = False
+    waited_for: bool = False  # by the load that comes next, as far as is known
+    awaiting_grant: dict[int, tuple[Worker, int]] = field(default_factory=dict)  # and bytes, by job number
     _waited_at: tuple[int, ...] = ()
     _waited_until_s: float = 0.0
 
-    def hear_of_closes(self, now_s: float) -> None:
-        """The kernel reports that segments were closed."""
+    def on_closes(self, now_s: float) -> None:
+        """Handle the kernel's report that segments were closed."""
         if self.cache.reclaimer.hear(now_s):
             self.loads.forget_refusals()
 
     def names_vanished(self, now_s: float) -> None:
-        """The kernel reports that names of segments were removed."""
+        """Handle the kernel's report that names of segments were removed."""
         if self.cache.names_vanished(now_s):
             self.loads.forget_refusals()
 
-    def hear_of_freed(self) -> None:
-        """Memory is back with the kernel."""
+    def on_freed(self) -> None:
+        """Count memory that is back with the kernel."""
         if self.cache.reclaimer.collect():
             self.loads.forget_refusals()
 
-    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Somebody dropped these: what was refused for lack of memory may fit now."""
+    def release(self, residents: Iterable[Resident], now_s: float) -> None:
+        """Note that clients dropped segments: what was refused for lack of memory may fit now."""
         self.cache.reclaimer.let_go(residents, now_s)
         self.loads.forget_refusals()
 
     def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> str:
-        """Make room for a load; why there is none, or nothing where it is on its way.
+        """Make room for a load; returns why there is none, or nothing where it is on its way.
 
-        What gives way is free a moment later.  At the same time more does, for the loads of ``behind`` bytes
+        What is evicted is free a moment later.  At the same time more is, for the loads of ``behind`` bytes
         that come next: else each of them would have to wait for a moment of its own.
         """
         ledger = self.cache.ledger
@@ -84,7 +76,7 @@ class Room:
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
     def wait(self, running: int, now_s: float) -> None:
-        """The load that comes next waits for room, while so many loads are ``running``."""
+        """Have the load that comes next wait for room, while this many loads are ``running``."""
         self.waited_for = True
         self._waited_at, self._waited_until_s = self._state(running), now_s + AGAIN_S
 
@@ -95,18 +87,22 @@ class Room:
         return self.waited_for
 
     def _state(self, running: int) -> tuple[int, ...]:
-        """Another one whenever there may be room, or another load comes next."""
+        """Return what differs whenever there may be room, or another load comes next."""
         ledger = self.cache.ledger
         return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, self.loads.changes, running
 
     def ask(self, worker: Worker, message: Need) -> None:
-        """A worker needs more than was reserved, and waits for `feed`."""
-        self.hungry[message.number] = (worker, message.bytes)
+        """Note that a worker needs more than was reserved; it waits for `grant`."""
+        self.awaiting_grant[message.number] = (worker, message.bytes)
 
-    def feed(self, jobs: Mapping[int, Load], now_s: float) -> None:
+    def forget(self, number: int) -> None:
+        """Forget what a job asked for: it has ended."""
+        self.awaiting_grant.pop(number, None)
+
+    def grant(self, jobs: Mapping[int, Load], now_s: float) -> None:
         """Grant, hold or refuse the extra bytes that workers asked for; ``jobs`` are loads by job number."""
         ledger = self.cache.ledger
-        for number, (worker, nbytes) in list(self.hungry.items()):
+        for number, (worker, nbytes) in list(self.awaiting_grant.items()):
             load = jobs.get(number)
             if load is not None:
                 granted = self.loads.grow(load, nbytes)
@@ -119,7 +115,7 @@ class Room:
                     if freed:
                         continue
                 self.pool.answer(worker, Decision(granted))
-            del self.hungry[number]
+            del self.awaiting_grant[number]
 
     def _may_be_given_back(self) -> bool:
         """Whether a load runs that will end by itself: it may need less than is reserved for it.
@@ -127,4 +123,6 @@ class Room:
         Loads that wait for room do not end by themselves, nor do those that come after them in the
         same loader's queue.
         """
-        return any(worker.queue and self.hungry.keys().isdisjoint(worker.queue) for worker in self.pool)
+        return any(
+            worker.queue and self.awaiting_grant.keys().isdisjoint(worker.queue) for worker in self.pool
+        )

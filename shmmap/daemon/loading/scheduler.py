@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loads from the queue to their end: room is made, a worker is given the job, its messages are handled.
 
-Whatever becomes of a load, only its own cell is concerned: a worker that dies or takes too long is replaced,
+However a load ends, only its own cell is concerned: a worker that dies or takes too long is replaced,
 and the jobs behind the one it died of go back into the queue.  Only workers look at files: it may take long.
 """
 
@@ -35,11 +35,15 @@ __all__ = [
 ]
 
 
-COUNTER: Final = "cells_outside_box"
+LOOKS_PER_PUMP: Final = 16
+"""Loads, and misplaced cells, that one `pump` finds to be of cells that left the map."""
 
 
 class MisplacedCells:
-    """Logs each such cell once a state, and counts them."""
+    """Cells with points outside their box: moved, or the map's metadata is another map's.
+
+    Each is logged once for each of its states; they are counted.
+    """
 
     def __init__(self, cache: CellCache) -> None:
         self._cache = cache
@@ -49,20 +53,22 @@ class MisplacedCells:
     def note(self, cell_id: str, index: int, outside: int) -> None:
         """Note what a loaded or adopted segment says of its cell's points."""
         if not outside:
-            if self._versions.pop(cell_id, 0):
-                self._count()
+            self._forget(cell_id)
             return
         version = self._cache.catalogue.version(index)
         if self._versions.get(cell_id) != version:
             self._versions[cell_id] = version
             self._count()
             log.warning(
-                "points outside the cell's box", cell=cell_id, points=outside,
-                box=self._cache.catalogue.box(index), hint="was the cell moved, and its metadata not?",
-            )  # fmt: skip
+                "points outside the cell's box",
+                cell=cell_id,
+                points=outside,
+                box=self._cache.catalogue.box(index),
+                hint="was the cell moved, and its metadata not?",
+            )
 
     def map_changed(self) -> None:
-        """Have cells looked at again by `check_some`: they may have changed, or left the map."""
+        """Have all of them looked at again by `check_some`: they may have changed, or left the map."""
         self._to_check = deque(self._versions)
 
     def check_some(self, most: int) -> None:
@@ -71,15 +77,14 @@ class MisplacedCells:
             cell_id = self._to_check.popleft()
             index = self._cache.catalogue.find(cell_id)
             if index is None or self._cache.catalogue.version(index) != self._versions.get(cell_id):
-                self._versions.pop(cell_id, None)
-                self._count()
+                self._forget(cell_id)
+
+    def _forget(self, cell_id: str) -> None:
+        if self._versions.pop(cell_id, 0):
+            self._count()
 
     def _count(self) -> None:
-        self._cache.statistics.set(COUNTER, len(self._versions))
-
-
-LOOKS_A_PUMP: Final = 16
-"""Loads that one `pump` finds to be of cells that left the map."""
+        self._cache.statistics.set("cells_outside_box", len(self._versions))
 
 
 class Scheduler:
@@ -87,6 +92,8 @@ class Scheduler:
 
     Parameters
     ----------
+    make_pool
+        Makes the pool, given what it calls with a worker that has sent something.
     clock
         The serving loop's clock, seconds.
     prefetch_share, outage_tolerance_s
@@ -99,8 +106,8 @@ class Scheduler:
     prefetcher, room, misplaced, lost
         Loads what was not asked for yet; asks the cache for room; counts cells with points outside
         their box; replaces workers.
-    on_settled
-        Called with a key when its load ended, in whichever way.
+    ended
+        Keys whose loads have ended, in whichever way, since `take_ended`.
     unfinished : bool
         Whether there may be more for `pump` to do at once.
     """
@@ -109,7 +116,7 @@ class Scheduler:
         self,
         cache: CellCache,
         map_switch: MapSwitch,
-        pool: WorkerPool,
+        make_pool: Callable[[Callable[[Worker], None]], WorkerPool],
         *,
         clock: Callable[[], float],
         prefetch_share: float = 0.0,
@@ -117,11 +124,10 @@ class Scheduler:
     ) -> None:
         self._cache, self._map_switch, self._statistics = cache, map_switch, cache.statistics
         self.loads = Loads(cache.ledger)
-        self.pool = pool
-        pool.on_message = lambda worker: self.on_worker(worker, clock())
-        self.on_settled: Callable[[Key], None] = lambda _key: None
+        self.pool = pool = make_pool(lambda worker: self.on_worker(worker, clock()))
+        self.ended: list[Key] = []
         self._jobs: dict[int, Load] = {}
-        self._doubtful: deque[Key] = deque()
+        self._to_recheck: deque[Key] = deque()
         self._for_pages: dict[Load, None] = {}  # that wait until it is known which cells they look into
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(
@@ -131,7 +137,16 @@ class Scheduler:
         self.misplaced = MisplacedCells(cache)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
-    # --- being asked ----------------------------------------------------------------------------
+    def start_loader(self) -> None:
+        """Start a loader before there is a load."""
+        self.pool.start_one()
+
+    def take_ended(self) -> list[Key]:
+        """Return the keys whose loads have ended since the last call, without those that are loaded again."""
+        ended, self.ended = self.ended, []
+        return [key for key in ended if key not in self.loads.by_key]
+
+    # --- requests -------------------------------------------------------------------------------
 
     def want(
         self, index: int, layer: str, priority: float, now_s: float, asker: Hashable = None
@@ -157,14 +172,14 @@ class Scheduler:
         return load
 
     def map_changed(self) -> None:
-        """Another state of the map is served: loads of cells that left it are ended, some at each `pump`."""
-        self._doubtful = deque([*self.loads.by_key, *self.loads.failures])
+        """Serve another state of the map: loads of cells that left it are ended, some at each `pump`."""
+        self._to_recheck = deque([*self.loads.by_key, *self.loads.failures])
         self.pages_settled()
         self.misplaced.map_changed()
         self.pool.read_through(self._opened)
 
     def pages_settled(self) -> None:
-        """Pages of the map have come, or cannot be had: begin what waits for them, or find out."""
+        """Begin loads that wait for pages of the map, or find out what still lacks: some have come."""
         waiting, self._for_pages = self._for_pages, {}
         for load in waiting:
             if self.loads.by_key.get(load.key) is load:
@@ -186,7 +201,7 @@ class Scheduler:
             why = "which cells lie around it cannot be found out at present"
             self._fail(load, "offline", why, None, now_s)
         else:
-            self.loads.set_aside(load)
+            self.loads.defer(load)
             self._for_pages[load] = None
         return True
 
@@ -198,12 +213,20 @@ class Scheduler:
             return NOT_OPENED
         return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
+    def note_origin(self, *, unreachable: bool, back: bool) -> None:
+        """Note whether the origin is out of reach; if it is back, what failed may be tried again."""
+        self.prefetcher.health.unreachable = unreachable
+        if back:
+            self.prefetcher.health.answers()
+            self.loads.forget_failures()
+            self.prefetcher.restart()
+
     def _drop_some(self) -> None:
-        for _ in range(min(LOOKS_A_PUMP, len(self._doubtful))):
-            key = self._doubtful.popleft()
+        for _ in range(min(LOOKS_PER_PUMP, len(self._to_recheck))):
+            key = self._to_recheck.popleft()
             if self._cache.index_of(key.cell_id) is None:
                 self.loads.cancel(key)
-                self.on_settled(key)
+                self.ended.append(key)
 
     # --- handing out jobs -----------------------------------------------------------------------
 
@@ -216,14 +239,14 @@ class Scheduler:
 
     def pump(self, now_s: float) -> None:
         """Hand a queued load to a worker if memory and workers allow; see `unfinished`."""
-        if self.room.hungry:
-            self.room.feed(self._jobs, now_s)
+        if self.room.awaiting_grant:
+            self.room.grant(self._jobs, now_s)
         self._drop_some()
-        self.misplaced.check_some(LOOKS_A_PUMP)
+        self.misplaced.check_some(LOOKS_PER_PUMP)
         self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
 
     def _hand_out_one(self, now_s: float) -> bool:
-        """See to the load that comes next; False if there is none, or it has to wait."""
+        """Hand out the load that comes next; False if there is none, or it has to wait."""
         if self.room.waited_for and self.room.still_waited_for(len(self._jobs), now_s):
             return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
@@ -262,7 +285,7 @@ class Scheduler:
         return taken
 
     def _job(self, load: Load, number: int) -> Job | Check | None:
-        """What a worker has to do for a load; None if its cell left the map, or nobody wants it any more."""
+        """Return a worker's job for a load; None if its cell left the map, or it is no longer wanted."""
         cache, catalogue = self._cache, self._cache.catalogue
         index = cache.index_of(load.key.cell_id)
         if index is None:
@@ -283,24 +306,30 @@ class Scheduler:
         load.version = cache.layers.version(index, layer)
         points = cache.warm.get(index, LAYER) if layer != LAYER else None
         return Job(
-            number, load.key.cell_id, catalogue.source(index), layer, catalogue.box(index),
-            catalogue.frame_id, load.estimate, points.name if points is not None else "",
-            tuple(map(self._neighbour, around)),
-            ready.version if ready is not None else 0,
-        )  # fmt: skip
+            number,
+            load.key.cell_id,
+            catalogue.source(index),
+            layer,
+            catalogue.box(index),
+            catalogue.frame_id,
+            load.estimate,
+            points=points.name if points is not None else "",
+            neighbours=tuple(map(self._neighbour, around)),
+            ready=ready.version if ready is not None else 0,
+        )
 
     def _neighbour(self, index: int) -> Neighbour:
         catalogue = self._cache.catalogue
         return Neighbour.of(catalogue.id(index), catalogue.source(index), catalogue.box(index))
 
     def next_event_s(self) -> float:
-        """When there is something to do although nothing arrives; infinity for never."""
-        if self._doubtful or self.unfinished:
+        """Return when there is something to do although nothing arrives; infinity for never."""
+        if self._to_recheck or self.unfinished:
             return 0.0
         cache = self._cache
         return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())
 
-    # --- what workers say -----------------------------------------------------------------------
+    # --- messages of workers -----------------------------------------------------------------------
 
     def on_worker(self, worker: Worker, now_s: float) -> None:
         """Handle one message of a worker."""
@@ -325,16 +354,17 @@ class Scheduler:
             self.pool.works_on(worker, message.number, now_s)
         elif isinstance(message, Need):
             self.room.ask(worker, message)
-            self.room.feed(self._jobs, now_s)
+            self.room.grant(self._jobs, now_s)
         else:
             self._on_end(worker, message, now_s)
 
     def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
-        """A worker is done with a job, in whichever way."""
+        """Handle the end of a job, in whichever way."""
         fd, spent_s = self.pool.finished(worker, message.number, now_s)
         if not isinstance(message, Checked) and message.objects:
             self._statistics.add_objects_read(message.objects)
-        self.room.hungry.pop(message.number, None)
+        if self.room.awaiting_grant:
+            self.room.forget(message.number)
         load = self._jobs.pop(message.number, None)
         try:
             if load is None:
@@ -376,10 +406,18 @@ class Scheduler:
                 self.loads.requeue(load)
                 return
         resident = Resident(
-            name="", key=key, version=done.version, nbytes=0, points=done.points,
-            box=cache.catalogue.box(index), z_min=done.z_min, z_max=done.z_max, last_use_s=now_s,
-            load_ns=done.load_ns, prefetched=load.prefetch,
-        )  # fmt: skip
+            name="",
+            key=key,
+            version=done.version,
+            nbytes=0,
+            points=done.points,
+            box=cache.catalogue.box(index),
+            z_min=done.z_min,
+            z_max=done.z_max,
+            last_use_s=now_s,
+            load_ns=done.load_ns,
+            prefetched=load.prefetch,
+        )
         try:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
@@ -398,7 +436,7 @@ class Scheduler:
         self._end(load)
 
     def _on_checked(self, load: Load, message: Checked, now_s: float) -> None:
-        """A worker compared an adopted segment with its checksums, or a file with the state it failed for."""
+        """Handle the check of an adopted segment, or of a file that a load failed for."""
         if load.unless is not None:
             self._on_looked(load, message)
             return
@@ -411,7 +449,7 @@ class Scheduler:
         self._load_after_all(load)
 
     def _on_looked(self, load: Load, message: Checked) -> None:
-        """A worker compared a file with the state it failed for: another state is tried at once."""
+        """Handle the check of a file that a load failed for: another state is tried at once."""
         failure, load.unless = self.loads.failures.get(load.key), None
         if not message.wrong:
             self._end(load, failure)
@@ -432,7 +470,7 @@ class Scheduler:
             self._end(load)
 
     def _fail(self, load: Load, code: str, message: str, stamp: Stamp | None, now_s: float) -> None:
-        """The load ended without a segment; the back-off doubles when it failed the same way before."""
+        """End a load without a segment; the back-off doubles when it failed the same way before."""
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return
@@ -445,7 +483,7 @@ class Scheduler:
         else:
             self._statistics.add("loads_failed")
             cell, layer = load.key
-            if code != "offline" or not self.prefetcher.prefetch.health.unreachable:  # that is said once
+            if code != "offline" or not self.prefetcher.health.unreachable:  # which is logged once
                 log.warning("load failed", cell=cell, layer=layer, code=code, message=message)
         if self._cache.index_of(load.key.cell_id) is None:  # it left the map: nothing is remembered of it
             self._end(load)
@@ -455,8 +493,8 @@ class Scheduler:
         self._end(load, failure)
 
     def _end(self, load: Load, failure: Failure | None = None) -> None:
-        """A load ended; whoever waits for it is told."""
+        """End a load."""
         out = failure is not None and (load.unread or failure.code == "load_timeout")
-        self.prefetcher.ended.append((load, load.running, load.took_s or load.spent_s, out))
+        self.prefetcher.note_end(load, load.took_s or load.spent_s, out=out)
         self.loads.finish(load, failure)
-        self.on_settled(load.key)
+        self.ended.append(load.key)

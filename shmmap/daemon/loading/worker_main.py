@@ -155,7 +155,7 @@ class _Worker:
                     return
 
     def _load(self, job: worker_messages.Job, fd: int) -> None:
-        """Fill the file that came with a job, and close it before anything is said of it."""
+        """Fill the file that came with a job, and close it before its end is reported."""
         started_ns = time.monotonic_ns()
         try:
             try:
@@ -166,12 +166,21 @@ class _Worker:
                 os.close(fd)
             header = made.header
             done = worker_messages.Done(
-                job.number, header.header_bytes, header.rows, header.dropped_points, header.z_min,
-                header.z_max, made.version, header.source.token, time.monotonic_ns() - started_ns,
-                tuple(self.reader.named(warning)[:500] for warning in made.warnings[:20]),
-                tuple(stamp.token for stamp in made.neighbours), made.cached, header.outside_points,
-                self.reader.take_counts(),
-            )  # fmt: skip
+                number=job.number,
+                header_bytes=header.header_bytes,
+                points=header.rows,
+                dropped=header.dropped_points,
+                z_min=header.z_min,
+                z_max=header.z_max,
+                version=made.version,
+                stamp=header.source.token,
+                load_ns=time.monotonic_ns() - started_ns,
+                warnings=tuple(self.reader.named(warning)[:500] for warning in made.warnings[:20]),
+                neighbours=tuple(stamp.token for stamp in made.neighbours),
+                cached=made.cached,
+                outside=header.outside_points,
+                objects=self.reader.take_counts(),
+            )
             step("worker.pass")
             self._send(done)
             step("worker.passed")
@@ -202,8 +211,9 @@ class _Worker:
             raise MapDataError(
                 f"{job.layer} looks into more than {MAX_NEIGHBOURS} cells around one",
                 path=job.source.name,
-                cause="unsupported_format", hint="use a smaller radius, or larger cells",
-            )  # fmt: skip
+                cause="unsupported_format",
+                hint="use a smaller radius, or larger cells",
+            )
         spec = layer_spec(job.layer)
         return make_layer(
             spec,
@@ -216,12 +226,10 @@ class _Worker:
         )
 
     def _cell(self, job: worker_messages.Job) -> CellJob:
-        return CellJob(
-            job.cell_id, job.source, job.box, job.frame_id, job.neighbours, self.reader, job.ready
-        )  # fmt: skip
+        return CellJob(job.cell_id, job.source, job.box, job.frame_id, job.neighbours, self.reader, job.ready)
 
     def _points_in_memory(self, job: worker_messages.Job, spec: LayerSpec) -> CellSource | None:
-        """The cell's points out of their segment, if that is still there and of this state of the source."""
+        """Read the cell's points out of their segment, if it is there and of this state of the source."""
         if not job.points:
             return None
         try:
@@ -268,7 +276,7 @@ def _test_hook(path: str) -> None:
 
 
 def limit_memory(nbytes: int) -> None:
-    """Let what goes beyond it fail in this process, as an error of the cell it works on."""
+    """Limit this process's memory: what goes beyond it is an error of the cell at work."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard != resource.RLIM_INFINITY:
         nbytes = min(nbytes, hard)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the daemon and its loader workers say to each other.
+"""Messages between the daemon and its loader workers.
 
 One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Job` also carries the
 descriptor of the file that the segment goes into, which has no name.  Both ends are always the same version
@@ -88,7 +88,7 @@ class Ready(msgspec.Struct, array_like=True, tag="ready"):
 class Begun(msgspec.Struct, array_like=True, tag="begun"):
     """What a job needs has been fetched, and the worker works on it from now on.
 
-    Only a worker that fetches for several jobs at once says so; any other works on its jobs as they came.
+    Only a worker that fetches for several jobs at once sends it; any other works on its jobs as they came.
     """
 
     number: int
@@ -104,11 +104,11 @@ class Need(msgspec.Struct, array_like=True, tag="need"):
 class Done(msgspec.Struct, array_like=True, tag="done"):
     """The segment is finished, and the worker has closed its own descriptor of it.
 
-    That order is what lets the daemon ask the kernel who else uses a segment from the first moment on.
+    So the daemon can ask the kernel from the first moment on who else uses the segment.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
     the disk cache; ``outside`` points lie outside the cell's box; ``objects``: what the worker has read of a
-    published map since it last said so (`shmmap.origin.remote.object_tier.ObjectCounts`).
+    published map since its last report (`shmmap.origin.remote.object_tier.ObjectCounts`).
     """
 
     number: int
@@ -155,7 +155,7 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
 class Ended(msgspec.Struct, array_like=True, tag="ended"):
     """The worker's process has ended: its exit code (a signal's number below zero), or why there was none.
 
-    Its parent says so over the worker's channel, after everything that the worker has said.
+    Its parent sends it over the worker's channel, after everything that the worker has sent.
     """
 
     code: int

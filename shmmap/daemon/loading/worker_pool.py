@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pool of loader workers: started on demand, fed several jobs ahead, killed at a deadline.
+"""The pool of loader workers: started on demand, given several jobs ahead, killed at a deadline.
 
 Computed layers may take seconds each.  So a cell's points never wait behind them: they go to workers that
 compute nothing, and while all compute one more is kept for points alone.
@@ -38,7 +38,7 @@ JOBS_AHEAD: Final = 4
 """Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
 
 LAYERS_AHEAD: Final = 1
-"""Computed layers among them: each may take long, and who asks next waits for all that were given out."""
+"""Computed layers among them: each may take long, and the next request waits for all that were given out."""
 
 START_DEADLINE_S: Final = 60.0
 """How long a worker may take from its first job until it is ready: its parent's imports, and a fork."""
@@ -59,26 +59,25 @@ def is_computed(job: Work) -> bool:
 class Worker:
     """One worker process; ``queue`` holds its jobs.
 
-    It works on the first of them, or, if it fetches, on the one that it said it has ``begun``.
+    It works on the first of them, or, if it fetches for several jobs at once, on the one that it said it has
+    ``begun``.
 
     Attributes
     ----------
-    pid, pidfd
-        Its process, from when it is ``ready``.
     for_points
         It is the one more that computes nothing.
     layers
         How many of its jobs are layers to be computed.
+    pid, pidfd
+        Its process, from when it is ``ready``.
     segments
         Files without names that its jobs' segments go into, by job.
     prefetched
-        Those of its jobs that nobody waited for when they were given out.
+        Those of its jobs that no client waited for when they were given out.
+    since_s
+        When it began with its job; or when its last message came, if it only fetches.
     opened
         Directory that it reads files through.
-    fetches
-        It fetches for several jobs at once, and says which it works on.
-    since_s
-        Since when it works on what it works on; or when it last said something, if it only fetches.
     """
 
     channel: socket.socket
@@ -101,7 +100,7 @@ class Worker:
 
     @property
     def load(self) -> tuple[int, bool]:
-        """How busy it is; what somebody waits for had better not come behind what nobody does."""
+        """How busy it is; a demand had better not come behind what is fetched ahead."""
         return len(self.queue) + len(self.prefetched), bool(self.prefetched)
 
     @property
@@ -130,14 +129,14 @@ class WorkerPool:
     deadline_s
         How long one load may take; then its worker is killed.
     watched
-        Told of the workers' descriptors.
+        Watches the workers' descriptors.
+    on_message
+        Called with a worker whose channel can be read.
     places
         Jobs that a worker can do at once: more than one where what they need has to be fetched.
 
     Attributes
     ----------
-    on_message
-        Called with a worker that has something to say.
     failed_starts
         Workers in a row that ended before they were ready: not their job's fault.
     """
@@ -147,8 +146,8 @@ class WorkerPool:
     parent: PreparedParent
     deadline_s: float
     watched: WatchedDescriptors
+    on_message: Callable[[Worker], None]
     places: int = 1
-    on_message: Callable[[Worker], None] = field(init=False)
     failed_starts: int = 0
     _workers: dict[int, Worker] = field(default_factory=dict)
     _ending: set[int] = field(default_factory=set)
@@ -160,10 +159,10 @@ class WorkerPool:
     def __iter__(self) -> Iterator[Worker]:
         return iter(list(self._workers.values()))
 
-    # --- who takes a job ------------------------------------------------------------------------
+    # --- giving jobs ------------------------------------------------------------------------
 
     def has_room(self, *, computed: bool) -> bool:
-        """Whether a job, one that computes a layer or another one, can be given to somebody."""
+        """Whether a worker could take a job: one that computes a layer, or another one."""
         found = self._least_busy(computed=computed) is not None
         return found or self._may_start or (not computed and self._may_start_one_for_points)
 
@@ -175,7 +174,7 @@ class WorkerPool:
         return free + self.places * max(0, self.limit - len(queues) - len(self._ending))
 
     def _least_busy(self, *, computed: bool) -> Worker | None:
-        """Who should have the next job of a kind; None if nobody has room for it."""
+        """Return the worker for the next job of a kind; None if none has room for it."""
         able = [
             worker
             for worker in self._workers.values()
@@ -201,7 +200,7 @@ class WorkerPool:
         return bool(self._workers) and count <= self.limit and all(w.layers for w in self)
 
     def start_one(self, *, for_points: bool = False) -> Worker:
-        """Have a worker process made; OSError if that cannot be done."""
+        """Start a worker process; OSError if that cannot be done."""
         ours, theirs = channel()
         try:
             with theirs:
@@ -216,12 +215,12 @@ class WorkerPool:
         return worker
 
     def submit(self, job: Work, now_s: float, *, prefetch: bool = False, opened: Opened = NOT_OPENED) -> bool:
-        """Give a job to the least busy worker, starting one if all are busy; False if nobody took it.
+        """Give a job to the least busy worker, starting one if all are busy; False if none took it.
 
         Parameters
         ----------
         prefetch
-            Whether nobody waits for it.
+            Whether no client waits for it.
         opened
             Directory that its files are to be read through: its path and a descriptor; -1 for none.
 
@@ -264,7 +263,7 @@ class WorkerPool:
     def read_through(self, opened: Opened) -> None:
         """Have all workers read what they are given from now on through another directory."""
         for worker in self._workers.values():
-            worker.opened = ("not told", -1)
+            worker.opened = ("unknown", -1)
             with contextlib.suppress(OSError):  # full or dying: with its next job, if there is one
                 self._send_root(worker, opened)
 
@@ -286,24 +285,22 @@ class WorkerPool:
         with contextlib.suppress(OSError):
             worker.channel.send(worker_messages.encode(message))
 
-    # --- what they say --------------------------------------------------------------------------
+    # --- messages --------------------------------------------------------------------------
 
     def receive(self, worker: Worker) -> tuple[worker_messages.FromWorker, int] | None:
-        """Next message of a worker and the descriptor that came with it (-1: none).
-
-        None when there is nothing more to read now.
+        """Return the next message of a worker and its descriptor (-1: none); None when there is none now.
 
         Raises
         ------
         EOFError
-            When the worker's parent is gone, and it with it, or it has lost its mind.
+            When the worker's parent is gone, and it with it, or its message cannot be read.
         """
         while True:
             try:
                 data, fd = receive_packet(worker.channel, self._buffer)
                 break
             except ConnectionResetError:
-                continue  # told once, before what the dead worker had still said
+                continue  # reported once, before what the dead worker had still sent
             except BlockingIOError:
                 return None
             except OSError as error:
@@ -319,17 +316,17 @@ class WorkerPool:
             raise EOFError("its message could not be read") from error
 
     def begun(self, worker: Worker, pid: int, pidfd: int, now_s: float) -> None:
-        """The worker is ready; its pidfd is the pool's now."""
+        """Note that a worker is ready; its pidfd is the pool's now."""
         worker.pid, worker.pidfd = pid, pidfd
         worker.since_s = now_s
         self.failed_starts = 0
 
     def works_on(self, worker: Worker, number: int, now_s: float) -> None:
-        """A worker that fetches has what a job needs, and works on it from now on."""
+        """Note that a worker that fetches has what a job needs, and works on it from now on."""
         worker.begun, worker.since_s = number, now_s
 
     def finished(self, worker: Worker, number: int, now_s: float) -> tuple[int, float]:
-        """The worker is done with a job; its next one begins now, unless it fetches.
+        """Note the end of a job; the worker's next one begins now, unless it fetches.
 
         Returns
         -------
@@ -366,23 +363,23 @@ class WorkerPool:
                 os.close(pidfd)
             else:
                 self._ending.add(pidfd)
-                self.watched.watch(pidfd, lambda: self._bury(pidfd), "loaders")
+                self.watched.watch(pidfd, lambda: self._reap(pidfd), "loaders")
         return list(worker.queue.values())
 
-    def _bury(self, pidfd: int) -> None:
+    def _reap(self, pidfd: int) -> None:
         self.watched.unwatch(pidfd)
         self._ending.discard(pidfd)
         os.close(pidfd)
 
     def overdue(self, now_s: float) -> list[Worker]:
-        """Workers whose current load, or whose start, is past its deadline; or that fetch and say nothing."""
+        """Return workers whose load or start is past its deadline, or that fetch without a message."""
         return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
 
     def _due_s(self, worker: Worker) -> float:
         return worker.since_s + (self.deadline_s if worker.ready else START_DEADLINE_S)
 
     def next_deadline_s(self) -> float:
-        """When the next load becomes overdue; infinity when nothing loads."""
+        """Return when the next load becomes overdue; infinity when nothing loads."""
         return min((self._due_s(w) for w in self._workers.values() if w.queue), default=float("inf"))
 
     def close(self) -> None:
@@ -391,4 +388,4 @@ class WorkerPool:
             self.remove(worker)
         self.parent.close()
         for pidfd in list(self._ending):
-            self._bury(pidfd)
+            self._reap(pidfd)

@@ -74,7 +74,6 @@ class CellRequests:
     ) -> None:
         self._cache = cache
         self._scheduler = scheduler
-        scheduler.on_settled = self.settled
         self._statistics = cache.statistics
         self._due = due
         self._now_s = clock
@@ -185,7 +184,7 @@ class CellRequests:
 
     def let_go(self, residents: Iterable[Resident]) -> None:
         """Somebody dropped these."""
-        self._scheduler.room.let_go(residents, self._now_s())
+        self._scheduler.room.release(residents, self._now_s())
 
     # --- loading and waiting --------------------------------------------------------------------
 
@@ -281,7 +280,7 @@ class CellRequests:
         """Count what nobody fetched ahead: if the client was on its way, it is late."""
         load = self._scheduler.loads.by_key.get(key)
         if load is None or load.prefetch:
-            self._scheduler.prefetcher.cold.append((wanted.session, key))
+            self._scheduler.prefetcher.note_cold(wanted.session, key)
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def settled(self, key: Key) -> None:
@@ -393,10 +392,12 @@ class CellRequests:
 
     def next_deadline_s(self) -> float:
         """When there is something to do: when the next client's patience ends; infinity when nobody waits."""
-        return self._patient.next_deadline_s()
+        return 0.0 if self._scheduler.ended else self._patient.next_deadline_s()
 
     def answer_overdue(self, now_s: float) -> None:
         """Answer those who waited long enough, with what there is; see to what is left to tidy."""
+        for key in self._scheduler.take_ended():
+            self.settled(key)
         for wanted in self._patient.overdue(now_s):
             self._answer_in_turn(wanted)
         self.tidy()

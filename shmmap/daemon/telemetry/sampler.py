@@ -255,7 +255,7 @@ class Sampler:
         An outage begins when the failed loads were started; its length is shown until the next one.
         """
         prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
-        health = prefetcher.prefetch.health
+        health = prefetcher.health
         statistics.set("outage_tolerance_ns", int(prefetcher.outage_tolerance_s * 1e9))
         statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))

@@ -13,6 +13,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -97,8 +98,7 @@ class InnerDaemon:
         self.evictor = Evictor(self.reclaimer)
         self.watched = WatchedDescriptors()
         self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
-        self.pool = WorkerPool(workers, self.directory, self.parent, load_timeout_s, self.watched)
-        self.settled: list[Key] = []
+        self.ended: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
             catalogue, self.evictor, self.statistics, self.event_log,
@@ -107,13 +107,14 @@ class InnerDaemon:
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         self.map_switch = MapSwitch(self.cache)
+        make_pool = partial(WorkerPool, workers, self.directory, self.parent, load_timeout_s, self.watched)
         self.scheduler = Scheduler(
-            self.cache, self.map_switch, self.pool, clock=self.now_s, prefetch_share=prefetch_share,
+            self.cache, self.map_switch, make_pool, clock=self.now_s, prefetch_share=prefetch_share,
             outage_tolerance_s=outage_tolerance_s,
         )  # fmt: skip
-        self.loads = self.scheduler.loads
-        self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.hear_of_freed)
-        self.watched.watch(pins.fd, lambda: self.scheduler.room.hear_of_closes(self.now_s()))
+        self.loads, self.pool = self.scheduler.loads, self.scheduler.pool
+        self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.on_freed)
+        self.watched.watch(pins.fd, lambda: self.scheduler.room.on_closes(self.now_s()))
         self.hold_answers = False
         self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []
@@ -124,7 +125,6 @@ class InnerDaemon:
             due=self._answer,
             clock=self.now_s,
         )
-        self.scheduler.on_settled = self._on_settled
         self.queries = MapQueries(
             DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir), self.cache,
             self.sessions, OperatorPins(self.cache, self.scheduler), self.map_switch, self.loads,
@@ -139,10 +139,6 @@ class InnerDaemon:
         """Begin to serve a request for cells, and do what of it needs no waiting."""
         verb = getattr(self.cells, type(message).__name__.lower())
         finish(verb(session, message))
-
-    def _on_settled(self, key: Key) -> None:
-        self.settled.append(key)
-        self.cells.settled(key)
 
     def now_s(self) -> float:
         """Return the time of the daemon's clock."""
@@ -172,6 +168,7 @@ class InnerDaemon:
         self.scheduler.pump(now_s)
         while self.scheduler.unfinished:
             self.scheduler.pump(now_s)
+        self.ended += self.scheduler.ended
         self.cells.answer_overdue(now_s)
         self.map_switch.run_step(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:

@@ -67,7 +67,7 @@ def test_so_is_its_segment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         made = derive(parse_layer("crop(z_min=-1000)"), CellJob("cell", Source(str(path)), BOX), fd)
         os.pwrite(fd, pack_publish_block(PublishBlock(1, 2)), made.header.header_bytes - 64)
         assert len(read_segment(fd, BOX, None).points) == 100
-        monkeypatch.setattr(sources, "MOST_SOURCE_BYTES", 100 * 16 - 1)
+        monkeypatch.setattr(sources, "MAX_SOURCE_BYTES", 100 * 16 - 1)
         with pytest.raises(MapDataError) as caught:
             read_segment(fd, BOX, None)
     directory.close()

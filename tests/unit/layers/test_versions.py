@@ -36,7 +36,7 @@ class Map:
         self.read()
 
     def read(self) -> LayerVersions:
-        """Read the map anew."""
+        """Read the map again."""
         self.catalogue: Catalogue = open_map(str(self.made.root), cache_dir=self._cache).load(fresh=True)
         self.versions = LayerVersions(lambda: self.catalogue)
         return self.versions
@@ -151,8 +151,8 @@ def test_what_is_unknown_is_what_takes_long(one: Map, monkeypatch: pytest.Monkey
     one.versions.version(3, "denoise")
     assert (3, "denoise") not in list(one.versions.unknown(range(16), ["denoise"]))
     before = one.all(FAR)
-    monkeypatch.setattr(layer_versions, "MOST_REMEMBERED", 4)
-    for number in range(100):  # whoever asks for ever new layers fills no memory
+    monkeypatch.setattr(layer_versions, "MAX_REMEMBERED", 4)
+    for number in range(100):  # requests for ever new layers fill no memory
         one.versions.version(number % 16, f"normals(radius={number % 50 + 1}.0)")
     assert sum(map(len, one.versions._known.values())) == one.versions._count <= 16 * len(FAR)
     assert one.all(FAR) == before

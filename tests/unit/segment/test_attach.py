@@ -10,6 +10,7 @@ import os
 import resource
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -259,3 +260,23 @@ def test_without_a_lock_it_is_just_as_safe(
 
     monkeypatch.setattr(attach_module, "lock_slot", refuse)
     assert len(attach(publish(), shm_dir=shm.path, slot=5).columns) == 2
+
+
+@pytest.mark.parametrize("needs_less", [False, True])
+@pytest.mark.parametrize("how", ["end", "give_back", "del"])
+def test_what_is_owned_is_given_back_once(how: str, needs_less: bool) -> None:
+    """By its end, or by `Owned.end` although another thread still refers to it."""
+    gone: list[int] = []
+    memory = Owned(zip([7]), gone.append)
+    assert (memory.value, gone) == (7, [])
+    if needs_less and how != "give_back":
+        memory.keep(partial(gone.append, 7))
+    elsewhere = memory if how == "end" else None
+    if how == "end":
+        memory.end()
+        assert gone == [7]
+        memory.end()
+    elif how == "give_back":
+        memory.give_back()
+    del memory, elsewhere
+    assert gone == [7]

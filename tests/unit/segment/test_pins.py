@@ -223,7 +223,7 @@ def test_asking_for_holders_without_number_ends(
         lock_slot(stranger, slot)
     fd = shm.open(name)
     assert holders(fd) == list(slots)
-    monkeypatch.setattr(pins, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(pins, "TIMEOUT_S", 0.0)
     found = holders(fd)
     os.close(fd)
     os.close(stranger)

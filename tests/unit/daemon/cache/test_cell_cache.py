@@ -80,7 +80,7 @@ def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
 
 def test_failures_are_remembered_up_to_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last ones of each kind; of those forgotten nothing stays."""
-    monkeypatch.setattr("shmmap.daemon.loading.loads.MOST_FAILURES", 3)
+    monkeypatch.setattr("shmmap.daemon.loading.loads.MAX_FAILURES", 3)
     loads = Loads(Ledger(1 << 20))
 
     def fail(number: int, code: str) -> Key:
@@ -339,7 +339,7 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
     assert jobs == queue
     assert decision == worker_messages.Decision(True), "and none of a job that nobody has"
     assert not wait_readable([puppet.channel.fileno()], 0.0)
-    assert (one.ledger.reserved_bytes, one.scheduler.room.hungry) == (0, {})
+    assert (one.ledger.reserved_bytes, one.scheduler.room.awaiting_grant) == (0, {})
     puppet.channel.close()
 
 

@@ -129,7 +129,7 @@ def test_a_large_segment_s_memory_counts_until_it_is_free(
 
 def test_so_many_wait_to_be_closed(memory: Memory, monkeypatch: pytest.MonkeyPatch) -> None:
     """The others keep their names, and count, until there is room for them."""
-    monkeypatch.setattr(closer, "MOST_WAITING", 3)
+    monkeypatch.setattr(closer, "MAX_WAITING", 3)
     monkeypatch.setattr(closer.Closer, "_run", lambda _: None)  # nobody closes anything
     large = memory.publish(5, LARGE)
     for resident in large:

@@ -1,46 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loader that fetches what several jobs need at once, and the pool's account of it."""
+"""A loader that fetches what several jobs need at once."""
 
 from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from shmmap.daemon.loading import worker_messages
-from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.loading.worker_main import _Worker
 from shmmap.daemon.loading.worker_messages import Begun, Check, Done, Failed, Job, Ready
-from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, WorkerPool
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import Offline
-from shmmap.layers.contract import Box
-from shmmap.layers.sources import FILES, CellJob, CellSource
+from shmmap.layers.sources import FILES, CellJob, Fetcher, Files
 from shmmap.layers.spec import LayerSpec
 from shmmap.processes.start_child import MAX_PACKET_BYTES
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.layout import SegmentHeader
-from shmmap.segment.version import Source, Stamp
+from shmmap.segment.version import Source
 from tests.support.divided_map import random_points, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
 PATIENCE_S = 60.0
 
 
-class Store:
-    """Sources that come when the test says so; their words are a path."""
+class Store(Files):
+    """Sources that come when the test says so; all of them are one file."""
 
-    def __init__(self) -> None:
-        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+    def __init__(self, path: Path) -> None:
+        super().__init__(lambda _name: str(path))
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC | os.EFD_SEMAPHORE)
         self.begun: SimpleQueue[int] = SimpleQueue()
         self._come: deque[int] = deque()
         self.lost: set[str] = set()
@@ -50,10 +45,8 @@ class Store:
         self._come.append(number)
         os.eventfd_write(self.fd, 1)
 
-    # --- Fetcher
-
     @property
-    def fetcher(self) -> Store:
+    def fetcher(self) -> Fetcher:  # type: ignore[override]
         return self
 
     def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
@@ -61,50 +54,28 @@ class Store:
         self.begun.put(number)
 
     def done(self) -> int | None:
-        if not self._come:
-            os.eventfd_read(self.fd)
-            return None
-        number = self._come.popleft()
-        if not self._come:
-            os.eventfd_read(self.fd)
-        return number
-
-    # --- SourceReader
-
-    def _file(self, source: Source) -> Source:
-        if source.name in self.lost:
-            raise Offline(f"{source.name}: the store does not answer")
-        return Source(source.words.decode())
-
-    def stamp(self, source: Source) -> Stamp | None:
-        return FILES.stamp(Source(source.words.decode()))
-
-    def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
-        return FILES.read(self._file(source), box, needs)
+        os.eventfd_read(self.fd)
+        return self._come.popleft()
 
     def fill(
-        self, spec: LayerSpec, job: CellJob, fd: int, *, reserve: Callable[[int], None] | None,
+        self,
+        spec: LayerSpec,
+        job: CellJob,
+        fd: int,
+        *,
+        reserve: Callable[[int], None] | None,
         warn: Callable[[str], None],
-    ) -> SegmentHeader | None:  # fmt: skip
-        there = CellJob(job.cell_id, self._file(job.source), job.box, job.frame_id)
-        return FILES.fill(spec, there, fd, reserve=reserve, warn=warn)
-
-    def named(self, message: str) -> str:
-        return message
-
-    def explain(self, source: Source, message: str) -> str:
-        del source
-        return message
-
-    def take_counts(self) -> tuple[int, ...]:
-        return ()
+    ) -> SegmentHeader | None:
+        if job.source.name in self.lost:
+            raise Offline(f"{job.source.name}: the store does not answer")
+        return super().fill(spec, job, fd, reserve=reserve, warn=warn)
 
 
 class Loader:
     """One that works in a thread, and our end of its channel."""
 
     def __init__(self, path: Path) -> None:
-        self.store, self.path = Store(), path
+        self.store, self.path = Store(path), path
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.settimeout(PATIENCE_S)
         worker = _Worker(theirs, ShmDirectory("/dev/shm"), None, self.store, _light=True)
@@ -118,8 +89,7 @@ class Loader:
         assert isinstance(self.said(), Ready)
 
     def give(self, number: int, layer: str = "points") -> None:
-        source = Source(f"cell {number}", str(self.path).encode())
-        job = Job(number, f"/map/{number}", source, layer, BOX, "map", 1 << 30)
+        job = Job(number, f"/map/{number}", Source(f"cell {number}"), layer, BOX, "map", 1 << 30)
         fd = os.memfd_create("segment")
         socket.send_fds(self.channel, [worker_messages.encode(job)], [fd])
         os.close(fd)
@@ -184,81 +154,7 @@ def test_what_does_not_come_is_offline_and_the_others_are_not(loader: Loader) ->
 def test_a_check_is_done_meanwhile(loader: Loader) -> None:
     """It needs nothing that has to be fetched."""
     loader.give(1)
-    source = Source("cell 2", str(loader.path).encode())
-    loader.channel.send(
-        worker_messages.encode(Check(2, source, "", FILES.stamp(Source(str(loader.path))) or b""))
-    )
+    stamp = FILES.stamp(Source(str(loader.path)))
+    loader.channel.send(worker_messages.encode(Check(2, Source("cell 2"), "", stamp or b"")))
     assert loader.said() == Begun(2)
-    assert loader.said() == worker_messages.Checked(2, "", FILES.stamp(Source(str(loader.path))))
-
-
-# --- the pool ---------------------------------------------------------------------------------
-
-
-class NoParent:
-    """Makes no loader: what a pool sends lies in a channel."""
-
-    def __init__(self) -> None:
-        self.ends: list[socket.socket] = []
-
-    def fork(self, end: socket.socket) -> None:
-        self.ends.append(end.dup())
-
-    def close(self) -> None:
-        for end in self.ends:
-            end.close()
-
-
-@pytest.fixture
-def pool() -> Iterator[WorkerPool]:
-    directory, watched = ShmDirectory("/dev/shm"), WatchedDescriptors()
-    one = WorkerPool(2, directory, cast("PreparedParent", NoParent()), 30.0, watched, places=3)
-    one.on_message = lambda _worker: None
-    yield one
-    one.close()
-    watched.close()
-    directory.close()
-
-
-def give(pool: WorkerPool, number: int, now_s: float, **words: Any) -> bool:
-    job = Job(number, "cell", Source("cell"), words.pop("layer", "points"), BOX, "map", 0, **words)
-    return pool.submit(job, now_s)
-
-
-def test_free_places_are_counted_and_a_second_loader_comes_when_the_first_is_full(pool: WorkerPool) -> None:
-    free = []
-    for number in range(1, 7):
-        free.append(pool.free_places)
-        assert give(pool, number, 0.0)
-    assert free == [6, 5, 4, 3, 2, 1]
-    assert pool.free_places == 0
-    assert [list(worker.queue) for worker in pool] == [[1, 2, 3], [4, 5, 6]]
-    for number in range(7, 7 + 2 * JOBS_AHEAD):
-        assert give(pool, number, 0.0), "some are given ahead"
-    assert not pool.has_room(computed=False)
-
-
-def test_a_layer_that_lies_ready_is_no_computed_one(pool: WorkerPool) -> None:
-    for number in (1, 2, 3):
-        assert give(pool, number, 0.0, layer="ndt(leaf=2.0)", ready=7)
-    (worker,) = pool
-    assert worker.layers == 0
-    assert give(pool, 4, 0.0, layer="ndt(leaf=2.0)")
-    assert sum(one.layers for one in pool) == 1
-
-
-def test_deadlines_count_from_the_begin_of_the_work(pool: WorkerPool) -> None:
-    """What is only fetched has its own ones; a loader that says nothing at all hangs."""
-    for number in (1, 2):
-        give(pool, number, 0.0)
-    (worker,) = pool
-    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as loader:
-        pool.begun(worker, loader.pid, os.pidfd_open(loader.pid), 1.0)
-        assert (worker.at_work, pool.next_deadline_s()) == (0, 31.0)
-        pool.works_on(worker, 2, 20.0)
-        assert (worker.at_work, pool.next_deadline_s()) == (2, 50.0)
-        fd, spent_s = pool.finished(worker, 2, 25.0)
-        os.close(fd)
-        assert (spent_s, worker.at_work, pool.next_deadline_s()) == (5.0, 0, 55.0)
-        assert pool.overdue(54.9) == []
-        assert pool.overdue(55.0) == [worker]
+    assert loader.said() == worker_messages.Checked(2, "", stamp)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who gets which job, and what becomes of a pool whose processes vanish."""
+"""Which loader gets which job, when it is overdue, and what becomes of a pool whose processes vanish."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import socket
+import subprocess
 from collections.abc import Iterator
 from typing import Any, cast
 
@@ -25,52 +26,51 @@ from tests.unit.daemon.inner_daemon import Inner, names
 
 
 class NoParent:
-    """Makes loaders that never say a word."""
+    """Forks no loader: what a pool sends lies in a channel."""
 
     def __init__(self) -> None:
-        self.ends: list[int] = []
+        self.ends: list[socket.socket] = []
 
     def fork(self, end: socket.socket) -> None:
-        self.ends.append(os.dup(end.fileno()))
+        self.ends.append(end.dup())
 
     def close(self) -> None:
-        for fd in self.ends:
-            os.close(fd)
+        for end in self.ends:
+            end.close()
 
 
 class Jobs:
     """A pool, and jobs for it; ``given`` are their numbers by worker, in the order in which workers came."""
 
-    def __init__(self, limit: int) -> None:
-        self.watched = WatchedDescriptors()
+    def __init__(self, limit: int, places: int) -> None:
+        self.watched, self.directory = WatchedDescriptors(), ShmDirectory("/dev/shm")
         parent = cast("PreparedParent", NoParent())
-        self.directory = ShmDirectory("/dev/shm")
-        self.pool = WorkerPool(limit, self.directory, parent, 30.0, self.watched)
+        self.pool = WorkerPool(
+            limit, self.directory, parent, 30.0, self.watched, lambda _worker: None, places=places
+        )
         self.number = 0
 
-    def give(self, layer: str) -> bool:
+    def give(self, layer: str = "points", ready: int = 0) -> bool:
         self.number += 1
-        job: Work = Job(self.number, "cell", Source("/cell.pcd"), layer, (0.0,) * 4, "map", 0)
+        job: Work = Job(self.number, "cell", Source("/cell.pcd"), layer, (0.0,) * 4, "map", 0, ready=ready)
         if layer == "check":
             job = Check(self.number, Source("/cell.pcd"), "", b"")
-        if not self.pool.has_room(computed=layer == "ndt"):
-            return False
-        return self.pool.submit(job, 0.0)
+        return self.pool.has_room(computed=layer == "ndt" and not ready) and self.pool.submit(job, 0.0)
 
     @property
     def given(self) -> list[list[int]]:
         return [list(worker.queue) for worker in self.pool]
 
-    def done(self, worker: Worker) -> None:
-        fd, spent_s = self.pool.finished(worker, next(iter(worker.queue)), 1.0)
-        assert spent_s >= 0.0
+    def done(self, worker: Worker, number: int = 0, now_s: float = 1.0) -> float:
+        fd, spent_s = self.pool.finished(worker, number or next(iter(worker.queue)), now_s)
         if fd >= 0:  # a check has none
             os.close(fd)
+        return spent_s
 
 
 @contextlib.contextmanager
-def jobs(limit: int) -> Iterator[Jobs]:
-    one = Jobs(limit)
+def jobs(limit: int, places: int = 1) -> Iterator[Jobs]:
+    one = Jobs(limit, places)
     try:
         yield one
     finally:
@@ -102,7 +102,7 @@ def test_points_never_wait_behind_layers(limit: int) -> None:
 
 
 def test_layers_get_their_share_of_loaders_that_points_keep_busy() -> None:
-    """What is free next is offered to both; points keep a loader without layers as long as there is one."""
+    """A free loader is offered to both; points keep a loader without layers as long as there is one."""
     with jobs(2) as one:
         while one.give("points"):
             pass
@@ -121,7 +121,45 @@ def test_layers_get_their_share_of_loaders_that_points_keep_busy() -> None:
         assert (first.layers, second.layers) == (2, 0)
 
 
-def test_a_loader_that_computes_is_no_hindrance_to_points(
+def test_of_loaders_that_fetch_a_second_one_starts_when_the_first_is_full() -> None:
+    with jobs(2, places=3) as one:
+        for free in (6, 5, 4, 3, 2, 1):
+            assert one.pool.free_places == free
+            assert one.give()
+        assert one.pool.free_places == 0
+        assert one.given == [[1, 2, 3], [4, 5, 6]]
+        for _ in range(2 * JOBS_AHEAD):
+            assert one.give(), "some are given ahead"
+        assert not one.give()
+
+
+def test_a_layer_that_lies_ready_is_no_computed_one() -> None:
+    with jobs(2, places=3) as one:
+        for _ in range(3):
+            assert one.give("ndt", ready=7)
+        (worker,) = one.pool
+        assert worker.layers == 0
+        assert one.give("ndt")
+        assert sum(worker.layers for worker in one.pool) == 1
+
+
+def test_deadlines_count_from_the_begin_of_the_work() -> None:
+    """What is only fetched has its own ones; a loader that sends nothing at all hangs."""
+    with jobs(2, places=3) as one, subprocess.Popen(["cat"], stdin=subprocess.PIPE) as loader:
+        assert one.give()
+        assert one.give()
+        (worker,), pool = one.pool, one.pool
+        pool.begun(worker, loader.pid, os.pidfd_open(loader.pid), 1.0)
+        assert (worker.at_work, pool.next_deadline_s()) == (0, 31.0)
+        pool.works_on(worker, 2, 20.0)
+        assert (worker.at_work, pool.next_deadline_s()) == (2, 50.0)
+        assert one.done(worker, 2, 25.0) == 5.0
+        assert (worker.at_work, pool.next_deadline_s()) == (0, 55.0)
+        assert pool.overdue(54.9) == []
+        assert pool.overdue(55.0) == [worker]
+
+
+def test_a_loader_that_computes_does_not_hinder_points(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With a single loader, and a layer that is never finished."""
@@ -132,14 +170,14 @@ def test_a_loader_that_computes_is_no_hindrance_to_points(
     one.run_until(lambda: [worker.layers for worker in one.pool] == [1])
     one.ask(quick, Selected(2, ("20_20.pcd",), wait=900.0))
     assert names(one.cells_of(2)) == ["20_20.pcd"]
-    assert [key.layer for key in one.settled] == ["points"]
+    assert [key.layer for key in one.ended] == ["points"]
     one.run_until(lambda: all(worker.ready for worker in one.pool))
     one.offset_s += 301.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
 
 
 def test_a_dead_loader_gets_no_job(inner: Inner, small_map: DividedMap) -> None:
-    """Until its parent has said that it ended, and how, nobody else would know that it is dead."""
+    """Until its parent has reported how it ended, only its pidfd shows that it is dead."""
     one = inner(small_map.root)
     one.everything()
     (worker,) = one.pool
@@ -160,7 +198,7 @@ def test_a_dead_loader_gets_no_job(inner: Inner, small_map: DividedMap) -> None:
 def test_a_parent_that_vanishes_again_and_again(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whose fault that is nobody knows; the load that was under way each time is given up at last."""
+    """The cause is unknown; the load that was under way each time is given up at last."""
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
     one = inner(small_map.root)
     wanted = ("0_0.pcd", "20_20.pcd")

@@ -117,7 +117,7 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
     assert not one.ledger._needed
     assert one.cells.next_deadline_s() == math.inf
     assert 9 not in [reply.request for _, reply in one.replies]
-    assert sorted(one.settled) == sorted(one.ledger.by_key), "each load has ended once"
+    assert sorted(one.ended) == sorted(one.ledger.by_key), "each load has ended once"
 
 
 def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
@@ -128,7 +128,7 @@ def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> 
     for session in sessions:
         for number in range(4):
             one.ask(session, Selected(number, ("0_0.pcd",), wait=30.0))
-    one.run_until(lambda: one.settled)
+    one.run_until(lambda: one.ended)
     assert (len(one.due), one.replies) == (12, [])
     one.cells.answer_overdue(one.now_s() + 60.0)
     assert len(one.due) == 12, "each is due once"

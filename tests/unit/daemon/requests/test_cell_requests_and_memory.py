@@ -85,7 +85,7 @@ def test_looking_for_room_where_others_map_everything_comes_to_an_end(
             while one.evictor.free(1 << 30, one.now_s()):
                 looks += 1
                 assert looks < 10
-                one.scheduler.room.hear_of_closes(one.now_s())
+                one.scheduler.room.on_closes(one.now_s())
 
 
 def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
@@ -182,7 +182,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     one.ask(session, Area(1, CircleMessage(0, 0, 5), wait=30.0))
     assert len(one.cells_of(1).cells) == 4
     one.ask(session, Selected(2, ("20_20.pcd", "20_0.pcd"), wait=900.0))
-    one.run_until(lambda: one.scheduler.room.hungry)
+    one.run_until(lambda: one.scheduler.room.awaiting_grant)
     (worker,) = one.pool
     os.kill(worker.pid, signal.SIGKILL)
     one.run_until(lambda: worker not in list(one.pool))
@@ -191,7 +191,7 @@ def test_a_loader_killed_while_it_waits_for_room(inner: Inner, small_map: Divide
     assert [failure.code for failure in reply.failed] == ["load_failed"]
     assert "SIGKILL" in reply.failed[0].message
     one.run_until(lambda: not one.ledger.reserved_bytes)
-    assert one.scheduler.room.hungry == {}
+    assert one.scheduler.room.awaiting_grant == {}
 
 
 def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map: DividedMap) -> None:
@@ -204,10 +204,10 @@ def test_the_deadline_ends_a_loader_that_waits_for_room(inner: Inner, small_map:
     one.ask(session, Area(1, CircleMessage(0, 0, 5), wait=30.0))
     assert len(one.cells_of(1).cells) == 4
     one.ask(session, Selected(2, ("20_20.pcd",), wait=30.0))
-    one.run_until(lambda: one.scheduler.room.hungry)
+    one.run_until(lambda: one.scheduler.room.awaiting_grant)
     one.offset_s += 0.6
     assert [failure.code for failure in one.cells_of(2).failed] == ["load_timeout"]
-    assert (one.ledger.reserved_bytes, one.scheduler.room.hungry, len(one.pool)) == (0, {}, 0)
+    assert (one.ledger.reserved_bytes, one.scheduler.room.awaiting_grant, len(one.pool)) == (0, {}, 0)
 
 
 def test_duplicates_count_once_for_the_quota(inner: Inner, small_map: DividedMap) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells are loaded before somebody asks for them: with real loaders, and memory that is really short."""
+"""Cells are loaded before a client asks for them: with real loaders, and memory that is really short."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import PREFETCH
 from shmmap.daemon.loading.look_ahead import IN_A_ROW, URGENT_S
-from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MOST_WAYS
+from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MAX_PATHS
 from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
 from shmmap.protocol.events import Loaded, decode_event
@@ -57,7 +57,7 @@ def count(one: InnerDaemon, name: str) -> int:
 
 
 def idle(one: InnerDaemon) -> bool:
-    """Whether nothing is being loaded, and nothing wished for until later."""
+    """Whether nothing is loading, and nothing wished for until later."""
     prefetcher = one.scheduler.prefetcher
     return not one.loads.by_key and not prefetcher.ended and prefetcher.next_s > one.now_s()
 
@@ -98,7 +98,7 @@ def test_loads_that_were_begun_in_an_outage_do_not_make_another_one(
     Drive(one)
     one.run_until(lambda: idle(one))
     prefetcher, now_s = one.scheduler.prefetcher, one.now_s()
-    health = prefetcher.prefetch.health
+    health = prefetcher.health
     load = Load(Key("a", "points"), 0, 0.0, 1, sources=(bytes(24),))
 
     def end(after_s: float, took_s: float, out: bool) -> tuple[bool, int]:
@@ -126,8 +126,8 @@ def test_layers_are_fetched_as_the_client_asks_for_them(prefetching: Callable[..
     assert len(kinds) == 2
 
 
-def test_nobody_s_way_nothing_is_fetched(inner: Inner, street: DividedMap) -> None:
-    """Who stands still, who has gone, and where it is switched off."""
+def test_without_a_path_nothing_is_fetched(inner: Inner, street: DividedMap) -> None:
+    """For a client that stands still or has gone, or where prefetching is switched off."""
     off = inner(street.root, prefetch_share=0.0, name="off")
     Drive(off)
     off.run_until(lambda: idle(off))
@@ -139,23 +139,23 @@ def test_nobody_s_way_nothing_is_fetched(inner: Inner, street: DividedMap) -> No
     assert [count(each, "prefetch_started") for each in (off, one)] == [0, 0]
     drive = Drive(one)
     one.turn()
-    assert len(one.scheduler.prefetcher.prefetch.ways) == 2
+    assert len(one.scheduler.prefetcher.prefetch.paths) == 2
     drive.session.disconnect()
     session.disconnect()
     one.run_until(lambda: idle(one))
-    assert not one.scheduler.prefetcher.prefetch.ways
+    assert not one.scheduler.prefetcher.prefetch.paths
 
 
-def test_a_crowd_costs_no_more_than_so_many_ways(inner: Inner, street: DividedMap) -> None:
+def test_of_a_crowd_a_limited_number_of_clients_is_followed(inner: Inner, street: DividedMap) -> None:
     one = inner(street.root, prefetch_share=0.5)
-    for number in range(MOST_WAYS + 10):
+    for number in range(MAX_PATHS + 10):
         session = one.session()
         one.ask(session, Area(number, CircleMessage(0.0, 10.0, 1.0), wait=0.0))
     one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
-    assert len(one.scheduler.prefetcher.prefetch.ways) == MOST_WAYS
+    assert len(one.scheduler.prefetcher.prefetch.paths) == MAX_PATHS
 
 
-def test_a_loader_is_kept_for_what_somebody_asks_for(prefetching: Callable[..., InnerDaemon]) -> None:
+def test_a_loader_is_kept_for_demands(prefetching: Callable[..., InnerDaemon]) -> None:
     """One of two loaders fetches ahead and hangs: the other one has the demand."""
     one = prefetching()
     Drive(one)
@@ -254,9 +254,9 @@ def test_what_is_asked_for_while_it_is_fetched_is_loaded_once(
     assert drive.session.motion.travelled_m == 0.0
 
 
-def test_a_client_that_moves_on_and_has_to_wait_is_late(prefetching: Callable[..., InnerDaemon]) -> None:
+def test_a_moving_client_that_has_to_wait_is_a_prefetch_miss(prefetching: Callable[..., InnerDaemon]) -> None:
     """Not one that has just come, nor one that jumps."""
-    one = prefetching(prefetch_share=1e-9)  # a way, but no memory for it
+    one = prefetching(prefetch_share=1e-9)  # a path, but no memory for it
     drive = Drive(one)
     one.run_until(lambda: not one.sessions.moved and not one.scheduler.prefetcher.cold)
     assert count(one, "prefetch_misses") == 0
@@ -309,7 +309,7 @@ def test_a_full_share_gives_up_what_is_needed_later(prefetching: Callable[..., I
 
 
 def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., InnerDaemon]) -> None:
-    """What lies behind gives way, what is nearer ahead does not; nothing is refused or failed."""
+    """What lies behind is evicted, what is nearer ahead is not; nothing is refused or failed."""
     one = prefetching(prefetch_share=1.0)
     drive = Drive(one)
     one.run_until(lambda: idle(one))
@@ -328,7 +328,7 @@ def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., Inn
     assert few.loads.failures == {}
     assert count(few, "refused_over_budget") == 0
     before = columns[-1]
-    for x in (-320.0, -290.0, -260.0):  # it lets go of what it has left behind
+    for x in (-320.0, -290.0, -260.0):  # it releases what it has left behind
         few.offset_s += 3.0 + HAND_OUT_GRACE_S
         drive.session.drop(list(drive.session.held))
         assert drive.ask(x)
@@ -342,14 +342,14 @@ def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., Inn
 def test_an_origin_that_comes_back_is_used_at_once(
     prefetching: Callable[..., InnerDaemon], street: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While it is away one load in a while tells whether it is; then what had failed is tried at once."""
+    """While it is away one load now and then shows whether it is; then what had failed is tried at once."""
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "offline:")
     marks = [Path(street.id(f"{x}_{y}.pcd") + ".offline") for x in range(-300, 400, 20) for y in (-20, 0, 20)]
     for mark in marks:
         mark.touch()
     one = prefetching()
     drive = Drive(one)
-    health = one.scheduler.prefetcher.prefetch.health
+    health = one.scheduler.prefetcher.health
     one.run_until(lambda: health.is_out)
     tried = count(one, "prefetch_started")
     for _ in range(3):
@@ -378,7 +378,7 @@ def test_broken_files_are_no_matter_of_where_they_come_from(
     one.stop_clock()
     Drive(one)
     one.run_until(lambda: idle(one))
-    assert not one.scheduler.prefetcher.prefetch.health.is_out
+    assert not one.scheduler.prefetcher.health.is_out
     assert {Path(key.cell_id).name for key in one.loads.failures} == set(broken)
     assert count(one, "loads_failed") == len(broken)
     there = {Path(resident.key.cell_id).name for resident in one.ledger.residents()}

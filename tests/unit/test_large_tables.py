@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sharded dictionary does what a dict does, and none of its tables is large."""
+"""A sharded dictionary does what a dict does; a sparse table takes the memory of its written rows."""
 
 from __future__ import annotations
 
+import mmap
+from pathlib import Path
+
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from shmmap import large_tables
-from shmmap.large_tables import ShardedDict
+from shmmap.large_tables import ShardedDict, sparse_zeros
 
 KEYS = st.integers(0, 40)
 DONE = st.sampled_from(["set", "delete", "pop", "popitem", "get", "default"])
+ROWS = 1 << 23
+WRITTEN = 64
 
 
 @pytest.fixture(params=[5, 1000], ids=["shared out", "few"])
@@ -37,6 +43,9 @@ def test_it_does_what_a_dict_does(steps: list[tuple[str, int]]) -> None:
         elif what == "popitem" and plain:
             taken, value = ours.popitem()
             assert plain.pop(taken) == value
+        elif what == "popitem":
+            with pytest.raises(KeyError, match="empty"):
+                ours.popitem()
         elif what == "default":
             assert ours.setdefault(key, number) == plain.setdefault(key, number)
         assert ours.get(key) == plain.get(key)
@@ -46,20 +55,40 @@ def test_it_does_what_a_dict_does(steps: list[tuple[str, int]]) -> None:
     assert (len(ours), set(ours), sorted(ours.values())) == (len(plain), set(plain), sorted(plain.values()))
 
 
-def test_none_of_its_tables_is_large() -> None:
+def test_few_entries_are_in_one_dict_and_many_in_none_that_is_large() -> None:
     ours: ShardedDict[int, int] = ShardedDict()
+    ours[1] = 1
+    assert len(ours._shards) == 1
     for number in range(100_000):
         ours[hash(f"cell {number}")] = number
     assert max(map(len, ours._shards)) < 100_000 / 32
 
 
-def test_few_entries_take_little_memory() -> None:
-    ours: ShardedDict[int, int] = ShardedDict()
-    ours[1] = 1
-    assert len(ours._shards) == 1
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
 
 
-def test_nothing_is_taken_from_an_empty_one() -> None:
-    ours: ShardedDict[int, int] = ShardedDict()
-    with pytest.raises(KeyError, match="empty"):
-        ours.popitem()
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [(0, np.uint64), (3, np.bool_), ((7, 2), np.float64), ((1 << 20, 3), np.int32)]
+)
+def test_it_is_an_array_of_zeros(shape: int | tuple[int, ...], dtype: type[np.generic]) -> None:
+    table = sparse_zeros(shape, dtype)
+    right = np.zeros(shape, dtype)
+    assert table.dtype == right.dtype
+    assert np.array_equal(table, right)
+    table[...] = 1
+    assert table.all()
+    assert table.flags.c_contiguous
+
+
+def test_a_row_here_and_there_takes_no_more_than_a_page_each_and_memory_goes_with_the_table() -> None:
+    before = resident_bytes()
+    table = sparse_zeros(ROWS, np.uint64)
+    table[:: ROWS // WRITTEN] = 7
+    assert int(table.sum()) == 7 * WRITTEN
+    assert table[1] == 0
+    assert resident_bytes() - before < table.nbytes / 2
+    table[...] = 1
+    before = resident_bytes()
+    del table
+    assert before - resident_bytes() > 0.9 * 8 * ROWS
