@@ -72,7 +72,7 @@ def anything(_: Intent) -> bool:
 
 
 def test_another_route_and_another_velocity_come(
-    one: WholeDaemon, make: MakeWindow, received: list[Intent]
+    make: MakeWindow, one: WholeDaemon, received: list[Intent]
 ) -> None:
     with make(one.endpoint) as window:
         window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=PATIENCE_S)
@@ -90,7 +90,7 @@ def test_another_route_and_another_velocity_come(
 
 
 def test_nothing_is_asked_before_it_has_moved_or_time_has_passed(
-    one: WholeDaemon, make: MakeWindow, received: list[Intent]
+    make: MakeWindow, one: WholeDaemon, received: list[Intent]
 ) -> None:
     with make(one.endpoint, refresh_interval=NEVER) as window:
         window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=PATIENCE_S)
@@ -108,7 +108,7 @@ def test_a_route_that_is_given_once_comes(one: WholeDaemon, received: list[Inten
         move_until(received, lambda: time.sleep(0.01), lambda i: i.route == LEFT)
 
 
-def test_long_routes_are_thinned(one: WholeDaemon, make: MakeWindow, received: list[Intent]) -> None:
+def test_long_routes_are_thinned(make: MakeWindow, one: WholeDaemon, received: list[Intent]) -> None:
     """Many more places than the daemon takes; in C++ the same places are sent as in Python."""
     turns = np.linspace(0.0, 9.0, 6000)
     route = np.stack([20.0 * turns * np.cos(turns), 20.0 * turns * np.sin(turns)], axis=-1)

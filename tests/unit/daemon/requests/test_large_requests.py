@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -205,6 +207,7 @@ def test_very_much_is_let_go_in_parts(inner: Inner, made: DividedMap) -> None:
     assert len(session.held) == CELLS
     dispatch = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
     dispatch.cells = one.cells
+    dispatch.handshake = cast("Any", SimpleNamespace(sessions=one.sessions))
     work = dispatch._route(session.connection, Release(2, pack_versions(versions[1:])), b"") or ()
     assert [len(session.held) for _ in work] == [CELLS - CELLS_A_STEP * part for part in range(1, PARTS)]
     assert list(session.held) == versions[:1]
