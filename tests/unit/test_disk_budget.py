@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import random
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -101,7 +102,11 @@ def test_a_place_that_is_a_link_a_pipe_or_a_file_is_no_place(tmp_path: Path, nam
     kept = [outside.add(kind, 1) for kind in PLACES]
     place = tmp_path / "cache" / name
     place.parent.mkdir()
-    makers = lambda: place.symlink_to(outside.path / name), lambda: os.mkfifo(place), place.touch
+    makers: list[Callable[[], object]] = [
+        lambda: place.symlink_to(outside.path / name),
+        lambda: os.mkfifo(place),
+        lambda: place.touch(),
+    ]
     for make in makers:
         make()
         assert DiskBudget(str(place.parent), 0).trim() == 0
