@@ -63,10 +63,12 @@ def test_read_layer(served: DaemonProcess, divided_map: DividedMap) -> None:
     assert (found[1], int(found[3])) == (divided_map.id("0_0.pcd"), len(divided_map.points("0_0.pcd")["x"]))
 
 
-def test_record_events(served: DaemonProcess, tmp_path: Path) -> None:
-    with shmmap.connect(served.endpoint) as client:
+def test_record_events(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:
+    """A daemon of its own: the recording begins with the events of the last minute."""
+    one = daemon(divided_map.root)
+    with shmmap.connect(one.endpoint) as client:
         assert client.around(5.0, 5.0, 2.0, wait=30.0).complete
-    assert run("record_events.py", str(tmp_path / "events"), "0.5", beside=served) == ""
+    assert run("record_events.py", str(tmp_path / "events"), "3", beside=one) == ""
     events = [json.loads(line) for line in (tmp_path / "events").read_text().splitlines()]
     assert [event["seq"] for event in events] == sorted(event["seq"] for event in events)
     assert "0_0.pcd" in {event["id"] for event in events if event["kind"] == "loaded"}
