@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.events.log import nowhere
-from shmmap.daemon.events.publisher import EventPublisher, events_path
+from shmmap.daemon.events.log import EventPublisher, events_path
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.host.instance import InstanceLock, make_runtime_dir, take_away
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
@@ -129,13 +128,18 @@ class Service:
         self._look_s = 0.0
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
-        quota, budget = config.session_quota, cache.ledger.budget_bytes
+        survey, events, ledger = cache.survey, cache.events, cache.ledger
+        quota, budget = config.session_quota, ledger.budget_bytes
         self._inbox = Inbox(statistics)
         cells = CellRequests(
-            cache, scheduler, quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
-            due=self._inbox.due, clock=time.monotonic,
-        )  # fmt: skip
-        sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
+            cache,
+            scheduler,
+            memory.waiting,
+            quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
+            due=self._inbox.due,
+            clock=time.monotonic,
+        )
+        sampler = Sampler(cache, survey, scheduler, statistics, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
             config, cache, sessions, self._pins, memory.map_switch, scheduler.loads, memory.event_log,
@@ -143,9 +147,8 @@ class Service:
         )  # fmt: skip
         self._operators = operators = OperatorRequests(cache, self._pins, reloader)
         handshake = Handshake(
-            sessions, cells, statistics, memory.event_log, operators, cache.survey, live.left,
-            cache.events.minutes,
-        )  # fmt: skip
+            sessions, cells, statistics, memory.event_log, operators, survey, live.left, events.minutes
+        )
         paging = Paging(
             cache, scheduler, memory.map_switch, cells, queries, memory.adoption, sessions, watched
         )  # fmt: skip
@@ -174,13 +177,13 @@ class Service:
             operators,
             authorization,
             live,
-            cache.survey,
+            survey,
             sampler,
             defects,
             self._inbox.due,
         )
         chores: deque[tuple[str, Chore]] = deque()
-        chores += [("usage", cache.survey), ("map", memory.map_switch), ("map", paging)]
+        chores += [("usage", survey), ("map", memory.map_switch), ("map", paging)]
         chores += [("memory", scheduler.prefetcher)]
         chores += [("statistics", sampler), ("memory", cache.evictor), ("answers", live)]
         if origin_watch is not None:
@@ -194,7 +197,8 @@ class Service:
             dispatch,
             operators,
             cells,
-            cache,
+            events,
+            survey,
             scheduler,
             chores,
             statistics,
@@ -213,15 +217,19 @@ class Service:
                 self._listen()
                 memory.statistics.set("starting", 0)
                 memory.statistics.beat()
-                self._tell_epoch("started")
+                self._publish_epoch("started")
                 self._live.tell()
                 memory.scheduler.pool.start_one()
-                cells = len(memory.cache.catalogue)
+                cells, ledger = len(memory.cache.catalogue), memory.cache.ledger
                 log.info(
-                        "ready", endpoint=self._socket_path, instance=self._config.instance,
-                        map=self._config.map_path, cells=cells, budget_bytes=memory.cache.ledger.budget_bytes,
-                        start_s=time.monotonic() - started_s,
-                    )  # fmt: skip
+                    "ready",
+                    endpoint=self._socket_path,
+                    instance=self._config.instance,
+                    map=self._config.map_path,
+                    cells=cells,
+                    budget_bytes=ledger.budget_bytes,
+                    start_s=time.monotonic() - started_s,
+                )
                 self._manager.ready(f"serving {cells} cells")
                 _settle_memory()
                 if self._signals.reload_wanted:
@@ -243,12 +251,11 @@ class Service:
         step("daemon.bind")
         events = SocketFile(events_path(self._socket_path), self._gid)
         publisher = EventPublisher(
-            events.socket, memory.watched, self._connections, memory.statistics, memory.event_log.standing
+            events.socket, memory.watched, self._connections, memory.statistics, memory.event_log
         )
         self._sockets.append((events, publisher.listener))
         for _file, one in self._sockets:
             one.begin()
-        memory.event_log.send = publisher.send
 
     def _look_after_sockets(self, now_s: float) -> None:
         """Make the files of sockets again that another program removed; connections stay as they are."""
@@ -277,8 +284,8 @@ class Service:
     def _end(self) -> None:
         keep = self._signals.keep
         self._manager.stopping("keeping memory for the next start" if keep else "freeing memory")
-        self._tell_epoch("stopping")
-        self._memory.event_log.send = nowhere
+        self._publish_epoch("stopping")
+        self._memory.event_log.close()
         self._connections.deliver(LAST_WORDS_S)
         for file, _listener in self._sockets:
             file.close()
@@ -288,10 +295,10 @@ class Service:
         for file, _listener in self._sockets:
             file.remove()
 
-    def _tell_epoch(self, what: str) -> None:
-        cache = self._memory.cache
+    def _publish_epoch(self, what: str) -> None:
+        catalogue, ledger = self._memory.cache.catalogue, self._memory.cache.ledger
         self._memory.event_log.publish(
-            Epoch, what, cache.catalogue.map_version, len(cache.catalogue), cache.ledger.resident_count
+            Epoch, what, catalogue.map_version, len(catalogue), ledger.resident_count
         )
 
     def _beat(self) -> None:
@@ -310,7 +317,8 @@ class Service:
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)
             self._published.look(self._elsewhere)
-        version = memory.cache.catalogue.map_version
+        catalogue = memory.cache.catalogue
+        version = catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
             memory.statistics.update_identity(memory.identity)
@@ -321,19 +329,21 @@ class Service:
         change.collect()
 
     def _status(self) -> str:
-        cache = self._memory.cache
+        memory, ledger = self._memory, self._memory.cache.ledger
         return status_line(
-            resident=cache.ledger.cell_count,
-            cells=len(cache.catalogue), clients=len(self._memory.sessions),
-            used_bytes=cache.ledger.used_bytes, budget_bytes=cache.ledger.budget_bytes,
-            failed=self._memory.statistics.values["loads_failed"],
-        )  # fmt: skip
+            resident=ledger.cell_count,
+            cells=len(memory.cache.catalogue),
+            clients=len(memory.sessions),
+            used_bytes=ledger.used_bytes,
+            budget_bytes=ledger.budget_bytes,
+            failed=memory.statistics.values["loads_failed"],
+        )
 
     # --- reload -----------------------------------------------------------------------------------
 
     def _watch_map(self) -> None:
         if self._config.watch:
-            watch = FileWatch(self._directories(self._memory.cache.catalogue.id_prefix))
+            watch = FileWatch(self._directories(self._memory.cache.id_prefix))
             self._memory.watched.watch(watch.fd, lambda: watch.drain(time.monotonic()), "map")
             self._file_watch = watch
 

@@ -13,7 +13,7 @@ from shmmap.segment.version import Stamp
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired", "failure_code"]
 
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
-"""Failures for lack of memory: they pass when somebody lets go."""
+"""Failures for lack of memory: they pass when memory is released."""
 
 
 def failure_code(error: OSError) -> str:
@@ -32,10 +32,10 @@ class Key(NamedTuple):
 class Resident:
     """A published segment and what the daemon knows of its use.
 
-    ``checked`` is false for one of an earlier life of the daemon until its bytes were compared with
-    their checksums: until then nobody is handed it.  ``prefetched`` is true for one that was fetched before
-    anybody asked for it, until somebody does.  ``handle`` and ``stale_handle`` are encoded once, for all
-    replies; ``sessions`` are the slots of those who hold it; ``place`` is where it stands
+    ``checked`` is false for one of a previous run of the daemon until its bytes were compared with
+    their checksums: until then it is not handed out.  ``prefetched`` is true until a client asks for what was
+    prefetched.  ``handle`` and ``stale_handle`` are encoded once, for all
+    replies; ``sessions`` are the slots of sessions that hold it; ``place`` is where it stands
     among all segments of its size; ``deferred_s`` how long it was deferred when it was last found in use.
     """
 
@@ -63,13 +63,13 @@ class Resident:
 class Retired:
     """A segment out of service; ``resident`` says what it was.
 
-    ``probe_after_s`` is when its use is next worth a look, ``condemned`` that nobody had it open
+    ``probe_after_s`` is when its use is next worth a look, ``unopened`` that no process had it open
     at the last look, ``interval_s`` how long the last wait between two looks was; before ``tick_over_s``
-    somebody may be just opening it.
+    a process may be just opening it.
     """
 
     resident: Resident
-    condemned: bool = False
+    unopened: bool = False
     probe_after_s: float = 0.0
     interval_s: float = 0.0
     tick_over_s: float = 0.0

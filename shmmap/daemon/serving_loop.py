@@ -15,7 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.holders import Survey
+from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
@@ -68,7 +69,8 @@ class ServingLoop:
     dispatch: Dispatch
     operators: OperatorRequests
     cells: CellRequests
-    cache: CellCache
+    cell_events: CellEvents
+    survey: Survey
     scheduler: Scheduler
     chores: deque[tuple[str, Chore]]
     statistics: StatisticsWriter
@@ -97,8 +99,8 @@ class ServingLoop:
         """Answer those who still wait, unless they are left to the next life."""
         if self._answer_at_end:
             self.cells.answer_all()
-            while not self.cache.survey.idle:
-                self.cache.survey.step()
+            while not self.survey.idle:
+                self.survey.step()
 
     def _patience_s(self) -> float:
         """How long nothing has to be done if nothing comes."""
@@ -130,6 +132,7 @@ class ServingLoop:
             self._breathe()
             self._others.pop(fd, None)
             self._call(fd)
+            self._guarded("answers", self.cells.answer_finished)
         self._breathe()
         self._look_after_the_rest(time.monotonic())
         self._breathe()
@@ -137,9 +140,9 @@ class ServingLoop:
         for _ in range(LOADS_A_TURN):
             self._breathe()
             self._guarded("memory", self.scheduler.pump, time.monotonic())
-            while self.cache.untold:
+            while self.cell_events.pending:
                 self._breathe()
-                self._guarded("memory", self.cache.tell_next)
+                self._guarded("memory", self.cell_events.flush_one)
             if not self.scheduler.unfinished:
                 break
 
@@ -190,7 +193,7 @@ class ServingLoop:
             self._guarded("requests", turn.go_on)
         else:
             self._guarded("answers", turn.go_on)
-        self._guarded("memory", self.cache.tell_all)
+        self._guarded("memory", self.cell_events.flush)
         now_s = time.monotonic()
         self.inbox.served(turn, now_s - start_s)
         if turn.asked and turn.over:

@@ -97,9 +97,8 @@ def steps(count: int) -> None:
         source=PinSource.LEASES,
     )  # fmt: skip
     ledger, sessions = Ledger(count * SEGMENT_BYTES), Sessions()
-    reclaimer = Reclaimer(ledger, cast("Any", nothing), sessions, cast("Any", nothing))
-    reclaimer.on_retired = lambda *_: None
-    reclaimer.on_gone = lambda *_: None
+    observer = SimpleNamespace(segment_retired=lambda *_: None, segment_gone=lambda *_: None)
+    reclaimer = Reclaimer(ledger, cast("Any", nothing), sessions, cast("Any", nothing), cast("Any", observer))
     evictor = Evictor(reclaimer)
     side = math.isqrt(count - 1) + 1
 

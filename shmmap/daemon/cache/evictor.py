@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from shmmap.daemon.cache.eviction_order import BATCH, Score
 from shmmap.daemon.cache.reclaimer import (
     HAND_OUT_GRACE_S,
-    LOOKS_AT_ONCE,
+    LOOKS_PER_TURN,
     SHARE_S,
     WATCHED_INTERVAL_S,
     Reclaimer,
@@ -37,7 +37,7 @@ REFRESH_S: Final = 0.004
 """How often a few scores are brought up to date."""
 ROUND_S: Final = 2.0
 """How often, at most, those of all segments, a few at a time."""
-WORK_AT_ONCE: Final = 4
+WORK_PER_TURN: Final = 4
 """Segments looked at by one `free`, 15 us each; to retire one is as much work."""
 PLACES_S: Final = 0.25
 """How often the places of clients that move are taken over."""
@@ -83,7 +83,11 @@ class Evictor:
     reclaimer: Reclaimer
     evicted_count: int = 0
     wake_s: float = math.inf
-    _waits: tuple[int, float, float] = (-1, -math.inf, -math.inf)  # all is as at so many changes, until then
+    _waits: tuple[int, float, float] = (
+        -1,
+        -math.inf,
+        -math.inf,
+    )  # at so many changes; all is as it was then, until when
     _score: Score = _UNTIL_CLIENTS_MOVE
     _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
     _round_version: int = 0
@@ -94,7 +98,7 @@ class Evictor:
     _new_ones: bool = False
 
     def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> bool:
-        """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
+        """Retire segments until ``shortage`` bytes are about to be freed; False if the rest is in use.
 
         True also means that calling again at ``wake_s`` helps.
 
@@ -130,12 +134,12 @@ class Evictor:
                 order.defer(resident, order.deferred, math.inf)
             elif graced_s > now_s:
                 order.defer(resident, order.in_grace, graced_s)
-            elif work >= WORK_AT_ONCE:
+            elif work >= WORK_PER_TURN:
                 break
             elif self._found_in_use(resident, now_s):
                 work += 1
             else:
-                work = WORK_AT_ONCE
+                work = WORK_PER_TURN
                 missing -= resident.nbytes
                 self.reclaimer.retire(resident, now_s, "room")
                 self.evicted_count += 1
@@ -152,7 +156,7 @@ class Evictor:
         """Whether a grace that will end is worth waiting for: no process has opened that segment yet."""
         ledger = self.reclaimer.ledger
         order = ledger.order
-        for _ in range(LOOKS_AT_ONCE):
+        for _ in range(LOOKS_PER_TURN):
             soon = order.in_grace.first()
             if soon is None:
                 return False
@@ -173,7 +177,7 @@ class Evictor:
         if not self.reclaimer.is_pinned(resident):
             return False
         order = self.reclaimer.ledger.order
-        longer_s = 2.0 * resident.deferred_s if self.reclaimer.pins.tell_once(resident.name) else 0.0
+        longer_s = 2.0 * resident.deferred_s if self.reclaimer.pins.watch_next_close(resident.name) else 0.0
         resident.deferred_s = min(max(PIN_MEMO_S, longer_s), WATCHED_INTERVAL_S)
         order.defer(resident, order.deferred, now_s + max(resident.deferred_s, SHARE_S * len(order.deferred)))
         return True
@@ -202,7 +206,7 @@ class Evictor:
             self._round, self._round_version = ledger.segments.walk(), score.version
 
     def _scored(self, now_s: float, age_s: float) -> Score:
-        """How segments are scored, by where clients are; if they move, were ``age_s`` ago at most."""
+        """Return how segments are scored, by where clients are now, or were ``age_s`` ago at most."""
         sessions = self.reclaimer.sessions
         if sessions.places_version != self._score.version and now_s - self._placed_s >= age_s:
             self._placed_s = now_s

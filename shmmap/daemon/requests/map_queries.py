@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from shmmap import __version__
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.holders import Share, Usage
 from shmmap.daemon.cache.map_switch import MapSwitch
-from shmmap.daemon.cache.survey import Share, Usage
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages
+from shmmap.daemon.pace import Pace
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
@@ -91,15 +91,16 @@ class MapQueries:
         return self.cache.catalogue
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
-        """Tell a new client where everything is."""
+        """Answer a new client's hello: where everything is."""
         cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
+        ledger = cache.ledger
         return messages.Welcome(
             message.request, major, minor, daemon=__version__, instance=self.config.instance,
             epoch=self.cache.epoch, session=session.slot, map_version=catalogue.map_version,
             map_path=self.config.map_path, frame_id=catalogue.frame_id, shm_dir=self.config.shm_dir,
             id_prefix=cache.id_prefix, segment_prefix=cache.segment_prefix, cells=len(catalogue),
             bounds=catalogue.bounds, layers=self._kinds,
-            budget_bytes=cache.ledger.budget_bytes, pid=os.getpid(), events=self.events_path,
+            budget_bytes=ledger.budget_bytes, pid=os.getpid(), events=self.events_path,
             origin=catalogue.frame.origin, crs=catalogue.frame.crs, unit_m=catalogue.frame.unit_m,
         )  # fmt: skip
 
@@ -285,8 +286,8 @@ class MapQueries:
         return self._changes
 
     def _row(self, index: int) -> messages.MetadataRow:
-        catalogue = self._catalogue
-        heights = self.cache.heights.get(index) or (None, None)
+        catalogue, known = self._catalogue, self.cache.heights
+        heights = known.get(index) or (None, None)
         wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.source_bytes(index)
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
@@ -294,23 +295,27 @@ class MapQueries:
         self, message: messages.Stats, usage: Usage, now_s: float
     ) -> Generator[None, None, messages.StatsReply]:
         """Answer a request for statistics with what a survey found, some sessions a turn."""
-        rows: list[messages.SessionRow] = []
-        for number, sessions in enumerate(parts(tuple(self.sessions))):
-            if number:
-                yield
-            rows += [_session_row(one, usage.shares.get(one.slot, Share()), now_s) for one in sessions]
+        statistics, pace, rows = self.cache.statistics, Pace(), list[messages.SessionRow]()
+        for one in tuple(self.sessions):
+            yield from pace.pause()
+            rows.append(_session_row(one, usage.shares.get(one.slot, Share()), now_s))
         return messages.StatsReply(
-            message.request, self.cache.epoch, self._catalogue.map_version,
-            dict(self.cache.statistics.values), tuple(rows), usage.unknown, usage.unknown_bytes,
-        )  # fmt: skip
+            message.request,
+            self.cache.epoch,
+            self._catalogue.map_version,
+            dict(statistics.values),
+            tuple(rows),
+            usage.unknown,
+            usage.unknown_bytes,
+        )
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
-        cache, catalogue = self.cache, self._catalogue
+        cache, catalogue, ledger, heights = self.cache, self._catalogue, self.cache.ledger, self.cache.heights
         index = cache.index_of(message.id)
-        # a cell that left the map while somebody maps it still shows, with version 0
+        # a cell that left the map while a process maps it still shows, with version 0
         ids = {message.id, cache.id_prefix + message.id} if index is None else {catalogue.id(index)}
-        found = [resident for cell_id in sorted(ids) for resident in cache.ledger.of_cell(cell_id)]
-        retired = itertools.islice(cache.ledger.retired.values(), LOOKED_AT)
+        found = [resident for cell_id in sorted(ids) for resident in ledger.of_cell(cell_id)]
+        retired = itertools.islice(ledger.retired.values(), LOOKED_AT)
         found += [one.resident for one in retired if one.resident.key.cell_id in ids]
         shown = tuple(map(self._segment, found))
         if index is None:
@@ -322,7 +327,7 @@ class MapQueries:
             return messages.ShownCell(message.request, found[0].key.cell_id, 0, *found[0].box, 0, shown)
         (cell_id,) = ids
         failures = [failure for key, failure in self.loads.failures.items() if key.cell_id == cell_id]
-        z_min, z_max = cache.heights.get(index) or (None, None)
+        z_min, z_max = heights.get(index) or (None, None)
         return messages.ShownCell(
             message.request, cell_id, catalogue.version(index), *catalogue.box(index),
             catalogue.source_bytes(index), shown,
@@ -332,14 +337,19 @@ class MapQueries:
         )  # fmt: skip
 
     def _segment(self, resident: Resident) -> messages.ShownSegment:
+        holders, ledger = self.cache.holders, self.cache.ledger
         state = "resident" if self.cache.is_current(resident) else "stale"
-        if resident.name in self.cache.ledger.retired:
+        if resident.name in ledger.retired:
             state = "zombie"
-        holders = self.cache.holders.of(resident)
         return messages.ShownSegment(
-            resident.key.layer, resident.version, resident.name, state, resident.nbytes, resident.points,
-            holders,
-        )  # fmt: skip
+            resident.key.layer,
+            resident.version,
+            resident.name,
+            state,
+            resident.nbytes,
+            resident.points,
+            holders.of(resident),
+        )
 
 
 def _session_row(session: Session, share: Share, now_s: float) -> messages.SessionRow:

@@ -63,9 +63,9 @@ def test_a_defect_beside_a_request_does_not_starve_its_process() -> None:
         handled.append(turn.body)
         yield from ()
 
-    nothing: Any = SimpleNamespace(poll=lambda _timeout_s: [], callbacks={}, tell_all=broken, handle=handle)
+    nothing: Any = SimpleNamespace(poll=lambda _timeout_s: [], callbacks={}, flush=broken, handle=handle)
     loop = ServingLoop(
-        nothing, inbox, nothing, nothing, nothing, nothing, nothing, deque(),
+        nothing, inbox, nothing, nothing, nothing, nothing, nothing, nothing, deque(),
         statistics, Defects(statistics), nothing,
     )  # fmt: skip
     connection = cast("Connection", Client())
@@ -91,13 +91,14 @@ def test_turns_are_measured(inner: Inner, small_map: DividedMap) -> None:
     read, write = os.pipe()
     one.watched.watch(read, compute, "loaders")
     nothing: Any = SimpleNamespace(
-        free=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None,
-        end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
-        unfinished=False, untold=False,
+        free=lambda _now_s: None, pump=lambda _now_s: None, flush=lambda: None,
+        end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, answer_finished=lambda: None,
+        stop_by_s=math.inf,
+        unfinished=False, pending=False,
     )  # fmt: skip
     nothing.lost = nothing
     loop = ServingLoop(
-        one.watched, Inbox(one.statistics), nothing, nothing, nothing, nothing, nothing, deque(),
+        one.watched, Inbox(one.statistics), nothing, nothing, nothing, nothing, nothing, nothing, deque(),
         one.statistics, Defects(one.statistics), one.event_log,
     )  # fmt: skip
     told = one.event_log.last
@@ -143,13 +144,14 @@ def test_clients_are_served_before_anything_else_is_heard(inner: Inner, small_ma
         inbox.hear(cast("Connection", Client()), b"ask", False)
 
     nothing: Any = SimpleNamespace(
-        free=lambda _now_s: None, pump=lambda _now_s: None, tell_all=lambda: None, handle=handle,
-        end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, stop_by_s=math.inf,
-        unfinished=False, untold=False,
+        free=lambda _now_s: None, pump=lambda _now_s: None, flush=lambda: None, handle=handle,
+        end_overdue=lambda _now_s: None, answer_overdue=lambda _now_s: None, answer_finished=lambda: None,
+        stop_by_s=math.inf,
+        unfinished=False, pending=False,
     )  # fmt: skip
     nothing.lost = nothing
     loop = ServingLoop(
-        one.watched, inbox, nothing, nothing, nothing, nothing, nothing, deque(),
+        one.watched, inbox, nothing, nothing, nothing, nothing, nothing, nothing, deque(),
         one.statistics, Defects(one.statistics), one.event_log,
     )  # fmt: skip
     with contextlib.ExitStack() as stack:

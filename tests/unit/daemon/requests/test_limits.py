@@ -17,7 +17,7 @@ from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
 
 def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     one = inner(small_map.root)
-    monkeypatch.setattr(limits, "MOST_CELLS", 15)
+    monkeypatch.setattr(limits, "MAX_CELLS", 15)
     with pytest.raises(BadRequest, match="more than 15 cells in one request"):
         one.ask(one.session(), Area(1, EVERYWHERE))
     with pytest.raises(BadRequest, match="more than 15 cells"):  # known or not
@@ -29,7 +29,7 @@ def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: 
 
 def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
-    many = limits.MOST_HELD
+    many = limits.MAX_HELD
     for message in (
         Differential(1, EVERYWHERE, held=(HeldCell("a"),) * (many + 1)),
         Differential(1, EVERYWHERE, packed=bytes(8 * (many + 1))),
@@ -47,8 +47,8 @@ def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> Non
 def test_loads_that_one_process_waits_for(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Asking again for the same ones is no more of them; others wait for nobody else's."""
-    monkeypatch.setattr(limits, "MOST_QUEUED", 5)
+    """Asking again for the same ones is no more of them; others' loads do not count."""
+    monkeypatch.setattr(limits, "MAX_QUEUED", 5)
     one = inner(small_map.root)
     with one.loaders_standing_still():
         greedy, other = one.session(), one.session()

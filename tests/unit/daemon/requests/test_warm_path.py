@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nearly every request of a moving vehicle is answered the short way, with handles encoded before."""
+"""Nearly every request of a moving vehicle is answered from versions, with handles encoded before."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HALF = BoxMessage(-1e3, -1e3, -1.0, 1e3)
 
 
 class LongWay(Exception):
-    """The request took the way that covers everything."""
+    """The request was answered with what covers everything."""
 
 
 def long_way(*_: object) -> NoReturn:
@@ -48,7 +48,7 @@ def test_versions_of_a_warm_area_take_the_short_way(
     warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inner, everything = warm
-    monkeypatch.setattr(cell_requests, "lacking", long_way)
+    monkeypatch.setattr(cell_requests, "difference", long_way)
     held = [cell.version for cell in everything.cells]
     assert not differential(inner, 2, EVERYWHERE, held).cells
     assert len(differential(inner, 3, EVERYWHERE, held[2:]).cells) == 2
@@ -63,7 +63,7 @@ def test_what_the_short_way_cannot_answer_takes_the_long_one(
 ) -> None:
     """So that the test above is not true of everything."""
     inner, everything = warm
-    monkeypatch.setattr(cell_requests, "lacking", long_way)
+    monkeypatch.setattr(cell_requests, "difference", long_way)
     with pytest.raises(LongWay):  # no version is given
         differential(inner, 2, EVERYWHERE, [], held=(HeldCell(everything.cells[0].id),))
     with pytest.raises(LongWay):  # two layers
@@ -90,7 +90,7 @@ def test_a_full_cache_takes_the_short_way_too(
 ) -> None:
     """What is in memory may come to more than one session may have; what it has and gets does not."""
     inner, everything = warm
-    monkeypatch.setattr(cell_requests, "lacking", long_way)
+    monkeypatch.setattr(cell_requests, "difference", long_way)
     sizes = [cell.bytes for cell in everything.cells]
     inner.cells._quota.nbytes = sum(sizes[:2])
     assert inner.ledger.resident_bytes > inner.cells._quota.nbytes
