@@ -4,15 +4,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, Generic, TypeVar
 
-__all__ = ["TURN_S", "Pace", "Walk"]
+__all__ = ["BATCH", "TURN_S", "Pace", "Walk", "batched"]
 
 TURN_S: Final = 0.001
 """Time after which the rest is left to the next turn.  A request for some hundred cells needs less."""
 
+BATCH: Final = 32
+"""Things between two looks at the time, where each takes some microseconds."""
+
 Item = TypeVar("Item")
+
+
+def batched(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
+    """Return batches of many things, to look at the time before each of them."""
+    return (items[begin : begin + BATCH] for begin in range(0, len(items), BATCH))
 
 
 class Pace:

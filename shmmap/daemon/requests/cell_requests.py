@@ -20,7 +20,7 @@ import msgspec
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.pace import Pace
+from shmmap.daemon.pace import Pace, batched
 from shmmap.daemon.records import SPACE_CODES, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import difference, warm_difference
@@ -64,10 +64,6 @@ class _Answer:
     handles: list[bytes] = field(default_factory=list)
     pending: PackedArray = field(default_factory=PackedArray)
     failed: list[FailedCell] = field(default_factory=list)
-
-    def add(self, resident: Resident, handle: bytes) -> None:
-        self.residents.append(resident)
-        self.handles.append(handle)
 
 
 class CellRequests:
@@ -130,13 +126,14 @@ class CellRequests:
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
             found = wanted.found
-            for cell_id in message.ids:
+            for ids in batched(message.ids):
                 yield from wanted.pause()
-                index = self._cache.index_of(cell_id)
-                if index is not None:
-                    found.cells += [(index, layer) for layer in layers]
-                else:
-                    found.unknown += [(cell_id, layer) for layer in layers]
+                for cell_id in ids:
+                    index = self._cache.index_of(cell_id)
+                    if index is not None:
+                        found.cells += [(index, layer) for layer in layers]
+                    else:
+                        found.unknown += [(cell_id, layer) for layer in layers]
             found.covered = not found.unknown or self._cache.catalogue.complete
 
         wanted = self._pending(session, message, find, None, len(message.ids))
@@ -266,16 +263,18 @@ class CellRequests:
 
     def _have_loaded(self, wanted: PendingRequest, *, note: bool) -> Iterator[None]:
         """Request loads of what is cold; ``note`` which, so that the request waits for them."""
-        found, now_s = wanted.found, self._now_s()
+        cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
         found.refused.clear()
         cold: list[tuple[int, str]] = []
         sizes: list[int] = []
-        for index, layer in found.cells:
+        for cells in batched(found.cells):
             yield from wanted.pause()
-            resident = self._cache.find_warm(index, layer, now_s)
-            if resident is None:
-                cold.append((index, layer))
-            sizes.append(self._cache.estimate(index, layer) if resident is None else resident.nbytes)
+            for index, layer in cells:
+                resident = warm[layer].get(index) if layer in warm else None
+                resident = resident or cache.find_warm(index, layer, now_s)
+                if resident is None:
+                    cold.append((index, layer))
+                sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
         if not wanted.began_s:
             self._statistics.add("hits", len(found.cells) - len(cold))
         yield from self._quota.check(wanted, sizes)
@@ -288,20 +287,23 @@ class CellRequests:
     def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
         """Request loads; ``note`` which, so that the request waits for them."""
         warm, prefetcher, now_s = self._cache.warm, self._scheduler.prefetcher, self._now_s()
-        for (index, layer), distance in zip(cold, wanted.distances_m(cold), strict=True):
+        distances = wanted.distances_m(cold)
+        for cells in batched(list(zip(cold, distances, strict=True))):
             yield from wanted.pause()
-            key = self._cache.key(index, layer)
-            if key in wanted.found.refused or warm.get(index, layer) is not None:
-                continue  # another client may have had it loaded meanwhile
-            prefetcher.note_cold(wanted.session, key)
-            if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
-                self._waiting.wait_for(wanted, key)
+            for (index, layer), distance in cells:
+                key = self._cache.key(index, layer)
+                if key in wanted.found.refused or warm.get(index, layer) is not None:
+                    continue  # another client may have had it loaded meanwhile
+                prefetcher.note_cold(wanted.session, key)
+                if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
+                    self._waiting.wait_for(wanted, key)
 
     def _need(self, wanted: PendingRequest) -> Iterator[None]:
         """Keep all of what is asked for from being evicted until the answer is out."""
-        for index, layer in wanted.found.cells:
+        for cells in batched(wanted.found.cells):
             yield from wanted.pause()
-            self._waiting.need(wanted, self._cache.key(index, layer))
+            for index, layer in cells:
+                self._waiting.need(wanted, self._cache.key(index, layer))
 
     def _wait_for_pages(self, wanted: PendingRequest) -> None:
         """Let a request wait for its pages, without those that have settled since it was found."""
@@ -362,21 +364,25 @@ class CellRequests:
         MapChanged, NoSession
             See `PendingRequest.pause`; nothing was sent.
         """
-        found, now_s = wanted.found, self._now_s()
+        cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
         if wanted.area is not None and wanted.area.z is not None:
-            inside = set(self._cache.at_height([index for index, _ in found.cells], wanted.area.z))
+            inside = set(cache.at_height([index for index, _ in found.cells], wanted.area.z))
             found.cells = [cell for cell in found.cells if cell[0] in inside]
         answer = _Answer()
-        for cell_id, layer in found.unknown:
+        for unknown in batched(found.unknown):
             yield from wanted.pause()
-            answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
-        for index, layer in found.cells:
+            for cell_id, layer in unknown:
+                answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
+        for cells in batched(found.cells):
             yield from wanted.pause()
-            resident = self._cache.find_warm(index, layer, now_s)
-            if resident is not None and not found.refused:
-                answer.add(resident, resident.handle)
-            elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
-                self._answer_cold(wanted, index, layer, answer, now_s)
+            for index, layer in cells:
+                resident = warm[layer].get(index) if layer in warm else None
+                resident = resident or cache.find_warm(index, layer, now_s)
+                if resident is not None and not found.refused:
+                    answer.residents.append(resident)
+                    answer.handles.append(resident.handle)
+                elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
+                    self._answer_cold(wanted, index, layer, answer, now_s)
         if may_wait and wanted.waits:
             return True
         failed = yield from self._failed(wanted, answer.failed)
@@ -410,7 +416,8 @@ class CellRequests:
         resident = cache.resident(key)
         current = resident is not None and cache.is_current(resident)
         if resident is not None and not refused and (current or key not in found.held_old):
-            answer.add(resident, resident.handle if current else resident.stale_handle)
+            answer.residents.append(resident)
+            answer.handles.append(resident.handle if current else resident.stale_handle)
         if refused:
             mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
             box, holders = catalogue.box(index), (mine,) if mine.bytes else ()
@@ -433,9 +440,14 @@ class CellRequests:
             for _ in self._holders.look(holders):
                 yield from wanted.pause()
             most = tuple(islice(holders, MAX_HOLDERS))
-        for cell in failed:
+        for cells in batched(failed):
             yield from wanted.pause()
-            packed.add((msgspec.structs.replace(cell, holders=most) if cell.holders is _UNNAMED else cell,))
+            packed.add(
+                [
+                    msgspec.structs.replace(cell, holders=most) if cell.holders is _UNNAMED else cell
+                    for cell in cells
+                ]
+            )
         return packed
 
     def _reply(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.pace import batched
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.layers.spec import canonical_layers
@@ -111,38 +112,41 @@ def difference(
     inside = set(indices)
     has: dict[int, set[str]] = {}
     removed: dict[str, None] = {}
-    for cell in message.held:
+    for held in batched(message.held):
         yield from wanted.pause()
-        index = cache.index_of(cell.id)
-        if index is None or index not in inside:
-            if found.covered or index is not None:
-                removed[cell.id] = None
-            continue
-        named = layers if cell.layers is None else canonical_layers(cell.layers)
-        mine = [layer for layer in named if layer in layers]
-        if cell.version is not None:  # that of one of them; else it is an old one
-            current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
-            if not current_of:
-                found.held_old.update(cache.key(index, layer) for layer in mine)
-            mine = current_of
-        has.setdefault(index, set()).update(mine)
+        for cell in held:
+            index = cache.index_of(cell.id)
+            if index is None or index not in inside:
+                if found.covered or index is not None:
+                    removed[cell.id] = None
+                continue
+            named = layers if cell.layers is None else canonical_layers(cell.layers)
+            mine = [layer for layer in named if layer in layers]
+            if cell.version is not None:  # that of one of them; else it is an old one
+                current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
+                if not current_of:
+                    found.held_old.update(cache.key(index, layer) for layer in mine)
+                mine = current_of
+            has.setdefault(index, set()).update(mine)
     current: set[int] = set()
-    for index in indices:
+    for cells in batched(indices):
         yield from wanted.pause()
-        for layer in layers:
-            version = version_of(index, layer)
-            current.add(version)
-            if version not in packed and layer not in has.get(index, ()):
-                found.cells.append((index, layer))
+        for index in cells:
+            for layer in layers:
+                version = version_of(index, layer)
+                current.add(version)
+                if version not in packed and layer not in has.get(index, ()):
+                    found.cells.append((index, layer))
     gone = packed - current
-    for version in [*gone]:
+    for versions_gone in batched([*gone]):
         yield from wanted.pause()
-        key = of_version.get(version)
-        index = cache.index_of(key.cell_id) if key is not None else None
-        if key is not None and index in inside:
-            gone.discard(version)
-            found.held_old.add(key)
-        elif index is None and not found.covered:
-            gone.discard(version)
+        for version in versions_gone:
+            key = of_version.get(version)
+            index = cache.index_of(key.cell_id) if key is not None else None
+            if key is not None and index in inside:
+                gone.discard(version)
+                found.held_old.add(key)
+            elif index is None and not found.covered:
+                gone.discard(version)
     found.removed = tuple(removed)
     found.removed_packed = pack_versions(gone)

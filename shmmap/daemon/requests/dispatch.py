@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from shmmap.daemon.cache.holders import Survey, Usage
 from shmmap.daemon.host.defects import Defects
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
-from shmmap.daemon.pace import Pace
+from shmmap.daemon.pace import Pace, batched
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import check_intent
@@ -114,9 +114,9 @@ class Dispatch:
     def _release(self, session: Session, message: messages.Release) -> Iterator[None]:
         versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
         pace = Pace()
-        for version in versions:
+        for some in batched(versions):
             yield from pace.pause()
-            self.cells.release(session.drop((version,)))
+            self.cells.release(session.drop(some))
         session.connection.reply(encode(messages.Released(message.request)))
 
     def _answer_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:

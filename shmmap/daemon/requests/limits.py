@@ -15,6 +15,7 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
+from shmmap.daemon.pace import batched
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
@@ -90,9 +91,9 @@ def check_queue(loads: Loads, wanted: PendingRequest, cold: Sequence[tuple[int, 
     """
     if loads.queued_of(wanted.session.asker) < MAX_QUEUED:
         return
-    for index, layer in cold:
+    for cells in batched(cold):
         yield from wanted.pause()
-        if wanted.cache.key(index, layer) not in loads.by_key:
+        if any(wanted.cache.key(index, layer) not in loads.by_key for index, layer in cells):
             raise Busy(f"{MAX_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
@@ -177,10 +178,11 @@ class SessionQuota:
             for _ in survey.look_at(session, before_s, enough, keys):
                 yield from wanted.pause()
             too_much, _, _ = yield from self._excess(wanted, sizes)
-        for key in too_much:
+        for refused in batched(too_much):
             yield from wanted.pause()
-            wanted.found.refused.add(key)
-            events.refused_by_quota(key, self.clock())
+            for key in refused:
+                wanted.found.refused.add(key)
+                events.refused_by_quota(key, self.clock())
 
     def _excess(
         self, wanted: PendingRequest, sizes: Sequence[int]
@@ -191,16 +193,17 @@ class SessionQuota:
         too_much: list[Key] = []
         added = 0
         nearest: list[int] = np.argsort(wanted.distances_m(cells), kind="stable").tolist()
-        for position in nearest:
+        for positions in batched(nearest):
             yield from wanted.pause()
-            index, layer = cells[position]
-            key = self.cache.key(index, layer)
-            if key in counted:
-                continue
-            counted.add(key)
-            if self.cache.is_held(index, layer):
-                continue  # a session keeps it anyway, perhaps this one
-            added += sizes[position] - self.cache.replaced_bytes(session, key)
-            if session.exclusive_bytes + added > self.nbytes:
-                too_much.append(key)
+            for position in positions:
+                index, layer = cells[position]
+                key = self.cache.key(index, layer)
+                if key in counted:
+                    continue
+                counted.add(key)
+                if self.cache.is_held(index, layer):
+                    continue  # a session keeps it anyway, perhaps this one
+                added += sizes[position] - self.cache.replaced_bytes(session, key)
+                if session.exclusive_bytes + added > self.nbytes:
+                    too_much.append(key)
         return too_much, added, counted

@@ -25,6 +25,7 @@ def small_map(tmp_path: Path) -> DividedMap:
 def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """End each turn of work on many things after the first of them."""
     monkeypatch.setattr("shmmap.daemon.pace.TURN_S", 0.0)
+    monkeypatch.setattr("shmmap.daemon.pace.BATCH", 1)
 
 
 @pytest.fixture
