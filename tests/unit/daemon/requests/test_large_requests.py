@@ -143,7 +143,7 @@ def test_what_is_refused_costs_no_version(
     inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Finding the neighbours of a cell takes long."""
-    monkeypatch.setattr(limits, "MOST_CELLS", 2 * CELLS - 1)
+    monkeypatch.setattr(limits, "MAX_CELLS", 2 * CELLS - 1)
     one = inner(str(made.root))
     for message in (Area(1, EVERYWHERE, FAR), Differential(2, EVERYWHERE, FAR, packed=bytes(80))):
         with pytest.raises(BadRequest, match=f"more than {2 * CELLS - 1} cells"):
