@@ -123,15 +123,15 @@ def test_without_a_map_every_result_says_so(drive: TownDrive, daemon: DaemonFact
 
 # --- scans of a real street whose clock jumps, stands or runs back: each is found where it was taken -
 
-BEFORE, SCANS, PERIOD_S = 2, 5, 0.828  # 2.6 m apart
+JUMP, SCANS, PERIOD_S = 2, 5, 0.828  # 2.6 m apart
 
 
 def clocks() -> dict[str, NDArray[np.float64]]:
     at = PERIOD_S * np.arange(SCANS)
-    late = np.arange(SCANS) >= BEFORE
+    late = np.arange(SCANS) >= JUMP
     return {
         "set by decades": at + 1.7e9 * late,
-        "begins again": np.where(late, at - at[BEFORE], at + 1000.0),
+        "begins again": np.where(late, at - at[JUMP], at + 1000.0),
         "pause of 30 s": at + 30.0 * late,
         "zeros": np.zeros(SCANS),
         "an hour back": at - 3600.0 * late,

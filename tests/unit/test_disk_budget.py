@@ -102,11 +102,11 @@ def test_a_place_that_is_a_link_a_pipe_or_a_file_is_no_place(tmp_path: Path, nam
     kept = [outside.add(kind, 1) for kind in PLACES]
     place = tmp_path / "cache" / name
     place.parent.mkdir()
-    makers: tuple[Callable[[], None], ...] = (
+    makers: list[Callable[[], object]] = [
         lambda: place.symlink_to(outside.path / name),
         lambda: os.mkfifo(place),
-        place.touch,
-    )
+        lambda: place.touch(),
+    ]
     for make in makers:
         make()
         assert DiskBudget(str(place.parent), 0).trim() == 0

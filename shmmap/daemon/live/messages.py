@@ -16,7 +16,6 @@ from shmmap.protocol.live import LiveMapRow
 
 __all__ = [
     "MAX_PER_SESSION",
-    "Answer",
     "Ask",
     "Begin",
     "Begun",
@@ -24,6 +23,7 @@ __all__ = [
     "End",
     "Ended",
     "FromLive",
+    "Reply",
     "Status",
     "ToLive",
     "Unsaved",
@@ -91,7 +91,7 @@ class Begun(msgspec.Struct, array_like=True, tag="begun"):
     hint: str = ""
 
 
-class Answer(msgspec.Struct, array_like=True, tag="answer"):
+class Reply(msgspec.Struct, array_like=True, tag="reply"):
     """The reply to a request."""
 
     ticket: int
@@ -119,7 +119,7 @@ class Ended(msgspec.Struct, array_like=True, tag="ended"):
 
 
 ToLive: TypeAlias = Begin | Ask | Disconnected | End
-FromLive: TypeAlias = Begun | Answer | Status | Ended
+FromLive: TypeAlias = Begun | Reply | Status | Ended
 
 MAX_PER_SESSION: Final = 64
 """Requests of one session that are passed on and not yet answered."""

@@ -131,19 +131,19 @@ def _outcomes(works: list[Callable[[], Any]]) -> list[Future[Any]]:
 
 
 class Observer(Protocol):
-    """What a live map reports to, in the thread of its turns."""
+    """Gets what happens to a live map, in the thread of its turns."""
 
     def scan_applied(self, scan: Scan) -> None:
-        """A scan is in memory that outlives this process."""
+        """Note that a scan is in memory that outlives this process."""
 
     def scan_durable(self, scan: Scan) -> None:
-        """A scan is on the disk."""
+        """Note that a scan is on the disk."""
 
     def chunk_changed(self, key: ChunkKey) -> None:
-        """A chunk came into memory, or was changed there."""
+        """Note that a chunk came into memory, or was changed there."""
 
     def chunk_gone(self, key: ChunkKey) -> None:
-        """A chunk left memory."""
+        """Note that a chunk left memory."""
 
 
 class _Part(NamedTuple):

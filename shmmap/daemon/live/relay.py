@@ -296,7 +296,7 @@ class LiveRelay:
         self._flush()
 
     def _take(self, message: messages.FromLive) -> None:
-        if isinstance(message, messages.Answer):
+        if isinstance(message, messages.Reply):
             session = self._tickets.take(message.ticket)
             if session is not None:
                 session.connection.reply(message.body)

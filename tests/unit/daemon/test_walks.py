@@ -164,7 +164,7 @@ def test_a_scan_into_a_live_map(tmp_path: Path) -> None:
                 worker.run_turn()
                 with contextlib.suppress(BlockingIOError):
                     found = live.decode_from_live(receive_packet(ours, packet_buffer())[0])
-                    if isinstance(found, live.Answer) and found.ticket == message.request:
+                    if isinstance(found, live.Reply) and found.ticket == message.request:
                         body = found.body
             return decode_reply(body)
 

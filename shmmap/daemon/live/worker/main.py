@@ -234,7 +234,7 @@ class _Worker:
             self._marks.on_disconnect(session)
 
     def _answer(self, ticket: int, reply: Any) -> None:
-        self._send(messages.Answer(ticket, encode(reply)))
+        self._send(messages.Reply(ticket, encode(reply)))
 
     def _send(self, message: messages.FromLive) -> None:
         self._channel.send(messages.encode(message))

@@ -348,7 +348,7 @@ def test_unreadable_chunk_overwritten(
 ) -> None:
     """v2: what could not be read was taken for a chunk of which nothing is known, and saved in its place.
 
-    More on damaged files: ``test_map_files.py``, ``test_live_map.py``; on which are: ``test_chunk_file.py``.
+    More on damaged files: ``test_map_files.py``; on which are: ``test_chunk_file.py``.
     """
     marks, at = crossing()[0]
     world = World(shm, folder := Folder(tmp_path))

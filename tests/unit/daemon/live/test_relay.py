@@ -28,7 +28,7 @@ from shmmap.daemon.live.relay import (
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet
-from shmmap.protocol.codec import decode_reply, encode
+from shmmap.protocol.codec import decode_reply
 from shmmap.protocol.live import LiveList, LiveListed, LiveMove
 
 if TYPE_CHECKING:
@@ -138,10 +138,10 @@ def test_each_gets_its_own_answer(world: World) -> None:
     first, second = world.heard()
     assert (first.session, first.uid, first.maps, first.body) == (1, 1000, True, b"11")
     assert (second.session, second.maps) == (2, False), "that one may not map"
-    world.say(messages.Answer(second.ticket, b"for b"))
-    world.say(messages.Answer(first.ticket, b"for a"))
-    world.say(messages.Answer(first.ticket, b"again"))
-    world.say(messages.Answer(999, b"for nobody"))
+    world.say(messages.Reply(second.ticket, b"for b"))
+    world.say(messages.Reply(first.ticket, b"for a"))
+    world.say(messages.Reply(first.ticket, b"again"))
+    world.say(messages.Reply(999, b"for nobody"))
     assert (a.answered, b.answered) == ([b"for a"], [b"for b"])
     assert len(world.relay._tickets) == 0
 
@@ -155,7 +155,7 @@ def test_a_session_that_has_ended_is_answered_nothing(world: World) -> None:
     assert world.heard() == [messages.Disconnected(1)], (
         "of one that asked for nothing the worker knows nothing"
     )
-    world.say(messages.Answer(asked.ticket, b"x"))
+    world.say(messages.Reply(asked.ticket, b"x"))
     assert a.answered == []
     assert (len(world.relay._tickets), world.relay._known_sessions) == (0, set())
 
@@ -355,21 +355,11 @@ def test_memory_that_is_kept_needs_no_worker(world: World) -> None:
     assert len(world.workers) == 1
 
 
-def test_where_there_are_no_live_maps() -> None:
-    asker: Any = Asker(1)
-    none = relay.NoLiveMaps()
-    none.ask(asker, LiveList(7), b"", 0.0)
-    assert asker.answered == [encode(LiveListed(7, ()))]
-    with pytest.raises(BadRequest, match="no live maps") as caught:
-        none.ask(asker, LiveMove(1, "lidar", (0.0, 0.0, 0.0)), b"", 0.0)
-    assert "--live NAME" in caught.value.hint
-
-
 def test_a_turn_of_the_loop_takes_a_bounded_number_of_messages(world: World) -> None:
     """Whatever the worker has to say, clients are heard in between."""
     worker = world.workers[0]
     for number in range(relay.MESSAGES_PER_TURN + 3):
-        worker.send(messages.encode(messages.Answer(10_000 + number, b"")))
+        worker.send(messages.encode(messages.Reply(10_000 + number, b"")))
     taken: list[object] = []
     hear = world.relay._take
     world.relay._take = lambda message: (taken.append(message), hear(message))[1]  # type: ignore[method-assign,func-returns-value]
@@ -410,7 +400,7 @@ def test_waiting_requests_are_bounded_by_session_by_process_and_in_all(world: Wo
     ask(one)
     with pytest.raises(Busy, match="64 requests of this session"):
         ask(one)
-    world.say(messages.Answer(asked[0].ticket, b"x"))
+    world.say(messages.Reply(asked[0].ticket, b"x"))
     ask(one, most=1)
     with pytest.raises(Busy, match="64 requests of this session"):
         ask(one)

@@ -354,7 +354,7 @@ def test_answers_wait_for_a_daemon_that_is_busy() -> None:
         hearing.join(0.2)  # until it can send no more
         for ticket in range(MESSAGES_PER_TURN):
             answer = worker_messages.decode_from_live(receive_packet(ours, buffer)[0])
-            assert isinstance(answer, worker_messages.Answer)
+            assert isinstance(answer, worker_messages.Reply)
             assert answer.ticket == ticket
             assert isinstance(decode_reply(answer.body), ErrorReply) != bool(ticket % 2)
         hearing.join()
