@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.events.log import nowhere
-from shmmap.daemon.events.publisher import EventPublisher, events_path
+from shmmap.daemon.events.log import EventPublisher, events_path
 from shmmap.daemon.host.instance import InstanceLock, make_runtime_dir, take_away
 from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
@@ -129,16 +128,18 @@ class Service:
         self._look_s = 0.0
         cache, sessions, statistics = memory.cache, memory.sessions, memory.statistics
         scheduler, watched = memory.scheduler, memory.watched
-        quota, budget = config.session_quota, cache.ledger.budget_bytes
+        survey, events, ledger = cache.survey, cache.events, cache.ledger
+        quota, budget = config.session_quota, ledger.budget_bytes
         self._inbox = Inbox(statistics)
         cells = CellRequests(
             cache,
             scheduler,
+            memory.waiting,
             quota_bytes=int(quota * budget) if quota <= 1 else int(quota),
             due=self._inbox.add_work,
             clock=time.monotonic,
         )
-        sampler = Sampler(cache, scheduler, memory.event_log, sessions, cells, self._beat)
+        sampler = Sampler(cache, survey, scheduler, statistics, memory.event_log, sessions, cells, self._beat)
         self._pins = OperatorPins(cache, scheduler)
         queries = MapQueries(
             config,
@@ -157,9 +158,9 @@ class Service:
             statistics,
             memory.event_log,
             operators,
-            cache.survey,
+            survey,
             live.on_disconnect,
-            cache.events.minutes,
+            events.minutes,
         )
         paging = Paging(
             cache, scheduler, memory.map_switch, cells, queries, memory.adoption, sessions, watched
@@ -175,14 +176,14 @@ class Service:
             operators,
             authorization,
             live,
-            cache.survey,
+            survey,
             sampler,
             defects,
             self._inbox.add_work,
         )
         tasks: deque[tuple[str, BackgroundTask]] = deque(
             [
-                ("usage", cache.survey),
+                ("usage", survey),
                 ("map", memory.map_switch),
                 ("map", paging),
                 ("memory", scheduler.prefetcher),
@@ -200,7 +201,8 @@ class Service:
             dispatch,
             operators,
             cells,
-            cache,
+            events,
+            survey,
             scheduler,
             tasks,
             statistics,
@@ -237,14 +239,14 @@ class Service:
                 self._publish_epoch("started")
                 self._live.begin_events()
                 memory.scheduler.start_loader()
-                cells = len(memory.cache.catalogue)
+                cells, ledger = len(memory.cache.catalogue), memory.cache.ledger
                 log.info(
                     "ready",
                     endpoint=self._socket_path,
                     instance=self._config.instance,
                     map=self._config.map_path,
                     cells=cells,
-                    budget_bytes=memory.cache.ledger.budget_bytes,
+                    budget_bytes=ledger.budget_bytes,
                     start_s=time.monotonic() - started_s,
                 )
                 self._manager.ready(f"serving {cells} cells")
@@ -275,12 +277,11 @@ class Service:
         step("daemon.bind")
         events = SocketFile(events_path(self._socket_path), self._gid)
         publisher = EventPublisher(
-            events.socket, memory.watched, self._connections, memory.statistics, memory.event_log.standing
+            events.socket, memory.watched, self._connections, memory.statistics, memory.event_log
         )
         self._sockets.append((events, publisher.listener))
         for _file, one in self._sockets:
             one.begin()
-        memory.event_log.send = publisher.send
 
     def _restore_sockets(self, now_s: float) -> None:
         """Make files of sockets again that another program removed; connections stay as they are."""
@@ -310,7 +311,7 @@ class Service:
         keep = self._signals.keep
         self._manager.stopping("keeping memory for the next start" if keep else "freeing memory")
         self._publish_epoch("stopping")
-        self._memory.event_log.send = nowhere
+        self._memory.event_log.close()
         self._connections.deliver(LAST_WORDS_S)
         for file, _listener in self._sockets:
             file.close()
@@ -321,9 +322,9 @@ class Service:
             file.remove()
 
     def _publish_epoch(self, what: str) -> None:
-        cache = self._memory.cache
+        catalogue, ledger = self._memory.cache.catalogue, self._memory.cache.ledger
         self._memory.event_log.publish(
-            Epoch, what, cache.catalogue.map_version, len(cache.catalogue), cache.ledger.resident_count
+            Epoch, what, catalogue.map_version, len(catalogue), ledger.resident_count
         )
 
     def _beat(self) -> None:
@@ -342,7 +343,8 @@ class Service:
         if self._elsewhere is not None:
             self._elsewhere.note_served(memory.cache.catalogue)
             self._published.look(self._elsewhere)
-        version = memory.cache.catalogue.map_version
+        catalogue = memory.cache.catalogue
+        version = catalogue.map_version
         if version != memory.identity.map_version:
             memory.identity = dataclasses.replace(memory.identity, map_version=version)
             memory.statistics.update_identity(memory.identity)
@@ -353,21 +355,21 @@ class Service:
         change.collect()
 
     def _status(self) -> str:
-        cache = self._memory.cache
+        memory, ledger = self._memory, self._memory.cache.ledger
         return status_line(
-            resident=cache.ledger.cell_count,
-            cells=len(cache.catalogue),
-            clients=len(self._memory.sessions),
-            used_bytes=cache.ledger.used_bytes,
-            budget_bytes=cache.ledger.budget_bytes,
-            failed=self._memory.statistics.values["loads_failed"],
+            resident=ledger.cell_count,
+            cells=len(memory.cache.catalogue),
+            clients=len(memory.sessions),
+            used_bytes=ledger.used_bytes,
+            budget_bytes=ledger.budget_bytes,
+            failed=memory.statistics.values["loads_failed"],
         )
 
     # --- reload -----------------------------------------------------------------------------------
 
     def _watch_map(self) -> None:
         if self._config.watch:
-            watch = FileWatch(self._directories(self._memory.cache.catalogue.id_prefix))
+            watch = FileWatch(self._directories(self._memory.cache.id_prefix))
             self._memory.watched.watch(watch.fd, lambda: watch.drain(time.monotonic()), "map")
             self._file_watch = watch
 

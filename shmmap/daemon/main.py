@@ -37,7 +37,7 @@ from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig, option_of
 from shmmap.daemon.config_live import state_directory
 from shmmap.daemon.events.live_events import LiveEvents
-from shmmap.daemon.events.publisher import events_path
+from shmmap.daemon.events.log import events_path
 from shmmap.daemon.host.instance import InstanceLock, lock_path, make_runtime_dir, stopped_early
 from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
@@ -166,7 +166,8 @@ def run(config: DaemonConfig) -> int:
             fetched = _fetched_from(elsewhere) if elsewhere is not None else None
             memory = MapInMemory(config, catalogue, directory, pins, path, mode, gid, early, fetched)
             stack.push(partial(_close, memory, signals))
-        check_file_size_limit(memory.cache.ledger.budget_bytes)
+        ledger = memory.cache.ledger
+        check_file_size_limit(ledger.budget_bytes)
         del catalogue  # a reload replaces it
         live = _live_maps(config, memory, gid)
         stack.push(partial(_close_live, live, signals))
@@ -259,12 +260,12 @@ def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay
     """Start the process that keeps the live maps, and wait for it a while."""
     if not config.live:
         return NoLiveMaps()
-    mappers = Authorization(config.live_group, "live_group")
+    mappers, ledger = Authorization(config.live_group, "live_group"), memory.cache.ledger
     begin = place_live_maps(
         config.live,
         instance=config.instance,
         cells=memory.directory,
-        cells_budget_bytes=memory.cache.ledger.budget_bytes,
+        cells_budget_bytes=ledger.budget_bytes,
         shm_dir=config.live_shm_dir,
         budget_bytes=config.live_budget_bytes,
         gid=gid,

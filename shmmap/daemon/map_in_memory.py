@@ -11,10 +11,8 @@ from functools import partial
 from typing import NamedTuple
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
-from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.memory import choose_budget, loader_bytes, memory_limit_bytes
@@ -26,6 +24,7 @@ from shmmap.daemon.loading.worker_pool import WorkerPool
 from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
+from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.sessions import Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
@@ -130,11 +129,12 @@ class MapInMemory:
             ledger.overhead_bytes = self.statistics.size_bytes
             self.event_log = EventLog(epoch)
             self.sessions = Sessions()
-            reclaimer = Reclaimer(ledger, directory, self.sessions, pins)
-            evictor = Evictor(reclaimer)
             self.cache = CellCache(
                 catalogue,
-                evictor,
+                ledger,
+                directory,
+                self.sessions,
+                pins,
                 self.statistics,
                 self.event_log,
                 instance=config.instance,
@@ -161,26 +161,21 @@ class MapInMemory:
                 places=origin.places if origin is not None else 1,
             )
             self.map_switch = MapSwitch(self.cache)
+            self.waiting = WaitingList(ledger)
             self.scheduler = Scheduler(
                 self.cache,
                 self.map_switch,
                 pool,
+                self.waiting,
                 clock=time.monotonic,
                 prefetch_share=config.prefetch_share,
                 outage_tolerance_s=config.outage_tolerance_s,
             )
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
             self.adoption.take_over(time.monotonic())
-            self.cache.tell_all()
-            self.watched.watch(reclaimer.closer.fd, self.scheduler.room.on_freed, "memory")
-            if pins.fd >= 0:
-                self.watched.watch(pins.fd, lambda: self.scheduler.room.on_closes(time.monotonic()), "memory")
-            if self.cache.names.fd >= 0:
-                self.watched.watch(
-                    self.cache.names.fd,
-                    lambda: self.scheduler.room.names_vanished(time.monotonic()),
-                    "memory",
-                )
+            events = self.cache.events
+            events.flush()
+            self.scheduler.room.watch(self.watched, time.monotonic)
             undo.pop_all()
 
     def close(self, *, keep: bool) -> None:

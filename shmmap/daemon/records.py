@@ -13,7 +13,7 @@ from shmmap.segment.version import Stamp
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired", "failure_code"]
 
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
-"""Failures for lack of memory: they pass when clients release cells."""
+"""Failures for lack of memory: they pass when memory is released."""
 
 
 def failure_code(error: OSError) -> str:
@@ -63,13 +63,13 @@ class Resident:
 class Retired:
     """A segment out of service; ``resident`` says what it was.
 
-    ``probe_after_s`` is when its use is next worth a look, ``condemned`` that no process had it open
+    ``probe_after_s`` is when its use is next worth a look, ``unopened`` that no process had it open
     at the last look, ``interval_s`` how long the last wait between two looks was; before ``tick_over_s``
-    a client may be just opening it.
+    a process may be just opening it.
     """
 
     resident: Resident
-    condemned: bool = False
+    unopened: bool = False
     probe_after_s: float = 0.0
     interval_s: float = 0.0
     tick_over_s: float = 0.0

@@ -16,7 +16,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.holders import Survey
+from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
@@ -68,7 +69,8 @@ class ServingLoop:
     dispatch: Dispatch
     operators: OperatorRequests
     cells: CellRequests
-    cache: CellCache
+    cell_events: CellEvents
+    survey: Survey
     scheduler: Scheduler
     tasks: deque[tuple[str, BackgroundTask]]
     statistics: StatisticsWriter
@@ -99,8 +101,8 @@ class ServingLoop:
         """Answer requests that still wait, unless they are left to the next run."""
         if self._answer_at_end:
             self.cells.answer_all()
-            while not self.cache.survey.idle:
-                self.cache.survey.step()
+            while not self.survey.idle:
+                self.survey.step()
 
     def turn(self) -> None:
         """Poll, then serve a request, or go on with all other work; clients first."""
@@ -153,7 +155,7 @@ class ServingLoop:
             self._guarded("requests", item.run_step)
         else:
             self._guarded("answers", item.run_step)
-        self._guarded("memory", self.cache.tell_all)
+        self._guarded("memory", self.cell_events.flush)
         took_s = time.monotonic() - begin_s
         self._requests_s -= took_s
         self.inbox.served(item, took_s)
@@ -166,6 +168,7 @@ class ServingLoop:
             yield
             self._ready.pop(fd, None)
             self._call(fd)
+            self._guarded("answers", self.cells.answer_finished)
         yield
         self._do_what_is_due(time.monotonic())
         yield
@@ -174,9 +177,9 @@ class ServingLoop:
         while True:
             yield
             self._guarded("memory", self.scheduler.pump, time.monotonic())
-            while self.cache.untold:
+            while self.cell_events.pending:
                 yield
-                self._guarded("memory", self.cache.tell_next)
+                self._guarded("memory", self.cell_events.flush_one)
             if not self.scheduler.unfinished or time.monotonic() >= end_s:
                 break
 

@@ -69,7 +69,7 @@ class Wanted:
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 class Machine(RuleBasedStateMachine):
-    """One life of ledger and loads; it hears of the reclaimer what leaves and what is freed."""
+    """One run of ledger and loads; it observes what the reclaimer retires and frees."""
 
     @initialize(elsewhere=st.booleans())
     def begin(self, elsewhere: bool) -> None:
@@ -82,14 +82,12 @@ class Machine(RuleBasedStateMachine):
         self.ledger.overhead_bytes = OVERHEAD_PAGES * PAGE
         self.sessions = Sessions()
         self.clients = [self.sessions.open(connections.of(), f"client {n}", 0.0) for n in range(2)]
-        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory))
+        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, PinWatch(self.directory), self)
         if elsewhere:
             self.reclaimer.closer.small_bytes = 0
         self.evictor = Evictor(self.reclaimer)
         self.names_retired: list[str] = []
         self.names_freed: list[str] = []
-        self.reclaimer.on_retired = lambda resident, _why: self.names_retired.append(resident.name)
-        self.reclaimer.on_gone = self.names_freed.append
         self.now_s = 100.0
         self.versions = dict.fromkeys(KEYS, 1)
         self.segments: dict[str, Segment] = {}
@@ -99,6 +97,12 @@ class Machine(RuleBasedStateMachine):
         self.names = 0
         self.orders = 0
         self.objects: dict[str, Resident] = {}
+
+    def segment_retired(self, resident: Resident, _why: str) -> None:
+        self.names_retired.append(resident.name)
+
+    def segment_gone(self, name: str) -> None:
+        self.names_freed.append(name)
 
     # --- what the model derives ---------------------------------------------------------------------
 
@@ -284,13 +288,13 @@ class Machine(RuleBasedStateMachine):
 
     @rule(draw=st.integers(0, 100), says=st.booleans())
     def unmap(self, draw: int, says: bool) -> None:
-        """A reader unmaps a segment, and tells or does not."""
+        """A reader unmaps a segment, and says so or does not."""
         mapped = [segment for segment in self.segments.values() if segment.maps]
         if mapped:
             segment = mapped[draw % len(mapped)]
             segment.maps.pop().close()
             if says:
-                self.let_go([self.objects[segment.name]])
+                self.release([self.objects[segment.name]])
 
     @rule(client=st.integers(0, 1), draw=st.integers(0, 100))
     def drop(self, client: int, draw: int) -> None:
@@ -298,10 +302,10 @@ class Machine(RuleBasedStateMachine):
         session = self.clients[client]
         versions = list(session.held)
         if versions:
-            self.let_go(session.drop([versions[draw % len(versions)], 12345]))
+            self.release(session.drop([versions[draw % len(versions)], 12345]))
 
-    def let_go(self, residents: list[Resident]) -> None:
-        self.reclaimer.let_go(residents, self.now_s)
+    def release(self, residents: list[Resident]) -> None:
+        self.reclaimer.release(residents, self.now_s)
         self.follow()
 
     # --- memory -------------------------------------------------------------------------------------
@@ -353,13 +357,13 @@ class Machine(RuleBasedStateMachine):
             select.select([self.reclaimer.closer.fd], [], [], 10.0)
             before = self.ledger.used_bytes
             freed = self.reclaimer.collect()
-            # what was counted before it was told is told in vain
+            # what is counted already is reported in vain
             assert freed == before - self.ledger.used_bytes >= 0
 
     @rule(pages=st.integers(1, BUDGET_PAGES))
     def make_room(self, pages: int) -> None:
         """Asked often enough it comes to an end, and to the right one."""
-        self.now_s += 0.25  # nobody remembers older looks at pins
+        self.now_s += 0.25  # older looks at pins are forgotten
         self.reclaimer.sweep(self.now_s)  # as the scheduler does before
         self.follow()
         mapped = sum(s.pages for s in self.segments.values() if s.maps)
@@ -385,7 +389,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule()
     def just_handed_out_is_safe(self) -> None:
-        """Whoever got a handle a moment ago can still open it, unless somebody evicted it on purpose."""
+        """A client that got a handle a moment ago can still open it, unless it was evicted on purpose."""
         for segment in self.of_state("resident"):
             if segment.last_use_s + HAND_OUT_GRACE_S > self.now_s:
                 self.evictor.free(BUDGET_PAGES * PAGE, self.now_s)
@@ -401,8 +405,8 @@ class Machine(RuleBasedStateMachine):
         assert ledger.resident_bytes == sum(s.pages for s in self.of_state("resident")) * PAGE
         zombie_bytes = ledger.retired_bytes - ledger.freeing_bytes
         assert zombie_bytes == sum(s.pages for s in self.of_state("zombie")) * PAGE
-        assert ledger.condemned_bytes == sum(
-            retired.resident.nbytes for retired in ledger.retired.values() if retired.condemned
+        assert ledger.unopened_bytes == sum(
+            retired.resident.nbytes for retired in ledger.retired.values() if retired.unopened
         )
         everything = [*ledger.residents(), *(retired.resident for retired in ledger.retired.values())]
         assert len(ledger.segments) == len(everything)
@@ -447,7 +451,7 @@ class Machine(RuleBasedStateMachine):
                 assert self.objects[segment.name] in holder.residents()
 
     def teardown(self) -> None:
-        """Once nobody maps or waits for anything, all memory can be had back."""
+        """Once nothing is mapped or waited for, all memory can be had back."""
         if not hasattr(self, "path"):
             return
         for segment in self.segments.values():

@@ -9,6 +9,7 @@ from typing import cast
 
 from shmmap.daemon.transport.connection import Connection, Peer
 from shmmap.daemon.transport.sessions import Session
+from shmmap.protocol.events import Event, decode_event
 from shmmap.protocol.messages import Intent
 
 
@@ -17,10 +18,22 @@ def of(peer: Peer | None = None, reply: Callable[[bytes], None] | None = None) -
     return cast("Connection", SimpleNamespace(peer=peer or Peer(), slot=0, reply=reply))
 
 
-# Clients that say where they are, without sockets
-
-
 def says(session: Session, intent: Intent, now_s: float) -> None:
     """Do what the daemon does when a request with an intent comes."""
     session.state_intent(intent)
     session.last_request_s = now_s
+
+
+class Subscriber:
+    """A subscriber of an event log that keeps all events."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def offer(self, body: bytes, _max_unread_bytes: int) -> None:
+        self.events.append(cast("Event", decode_event(body)))
+
+    def take(self) -> list[Event]:
+        """Return the events since the last call."""
+        events, self.events = self.events, []
+        return events

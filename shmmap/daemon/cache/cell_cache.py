@@ -2,36 +2,38 @@
 """The map in memory: finds cells, publishes, supersedes, adopts, evicts.
 
 The cache joins the pure ledger with what does the work: the catalogue, the index of warm cells and the
-shared-memory directory.  It never blocks, and knows neither loaders nor sockets: what is absent is asked
-of `shmmap.daemon.loading.scheduler`, which publishes here.
+shared-memory directory.  It never blocks, and knows neither loaders nor sockets: absent cells are requested
+from `shmmap.daemon.loading.scheduler`, which publishes here.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.daemon.cache.cell_rows import CellRows
 from shmmap.daemon.cache.evictor import Evictor
-from shmmap.daemon.cache.holders import Holders
-from shmmap.daemon.cache.segment_name_watch import LostSegments, SegmentNameWatch
-from shmmap.daemon.cache.survey import Survey
+from shmmap.daemon.cache.holders import Holders, Survey
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.lost_segments import LostSegments
+from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.cache.warm_index import Heights, WarmIndex
-from shmmap.daemon.events.cell_events import CellEvents
-from shmmap.daemon.events.log import EventLog, PressureEvents
-from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.events.cell_events import CellEvents, PressureEvents
+from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.map.catalogue_view import CatalogueView, Pages
+from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.failpoints import step
+from shmmap.geometry import Area
 from shmmap.large_tables import ShardedDict
 from shmmap.layers.points import LAYER
 from shmmap.layers.spec import layer_spec
 from shmmap.layers.versions import LayerVersions
 from shmmap.logfmt import log
+from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.header import PublishBlock
 from shmmap.segment.names import new_segment_name, segment_prefix
 from shmmap.statistics.writer import StatisticsWriter
@@ -40,8 +42,8 @@ __all__ = ["CellCache"]
 
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
-LOOKS_FOR_NAMES: Final = 64
-"""Names looked for per turn of the serving loop: a tenth of a millisecond."""
+SHOWN_PER_TURN: Final = 16
+"""Segments that were handed out, and whose rows are brought up to date in one turn: 0.1 ms."""
 
 
 class CellCache:
@@ -53,31 +55,36 @@ class CellCache:
         Part of every segment's name.
     mode, gid
         Access of published segments; ``gid`` -1 leaves the group alone.
-    event_log
-        Told what happens to cells.
 
     Attributes
     ----------
-    events, rows
-        Tells what happens to cells; shows segments to operators.
-    used : set
-        Segments handed out since the statistics last showed them.
+    catalogue
+        The state of the map that is served; another one after a reload.
+    layers
+        Versions of its cells' layers.
+    evictor, reclaimer
+        Make room; give memory back.
     holders, survey
         Who maps a segment; who maps how much in all.
+    events
+        Reports what happens to cells.
     warm
         The cells that are in memory at their current version.
     heights
         Of cells that were loaded since they changed.
     lost
-        Counts segments that other programs removed or cut short.
+        Finds segments that other programs removed or cut short.
     unentered : int
-        How many segments are still to be looked for in the state of the map that is served now.
+        Number of segments still to be looked for in the state of the map that is served now.
     """
 
     def __init__(
         self,
         catalogue: CatalogueView,
-        evictor: Evictor,
+        ledger: Ledger,
+        directory: ShmDirectory,
+        sessions: Sessions,
+        pins: PinWatch,
         statistics: StatisticsWriter,
         event_log: EventLog,
         *,
@@ -86,64 +93,55 @@ class CellCache:
         gid: int,
     ) -> None:
         self.catalogue = catalogue
-        self.evictor = evictor
-        self.reclaimer = reclaimer = evictor.reclaimer
-        self.ledger = reclaimer.ledger
-        self.directory = reclaimer.directory
-        self.layers = LayerVersions(lambda: self.catalogue)
-        self.holders = Holders(reclaimer)
-        self.survey = Survey(self.ledger, self.holders, in_service=self.is_in_service)
-        self.warm = WarmIndex()
-        self.id_prefix = catalogue.id_prefix
-        self.segment_prefix = segment_prefix(instance)
-        self.heights = Heights(len(catalogue))
-        self.unentered = 0
-        self.names = SegmentNameWatch(self.directory.path, self.segment_prefix)
-        self.lost = LostSegments()
-        pressure = PressureEvents(event_log, self._memory, reclaimer.sessions.largest_holder)
-        self.events = CellEvents(event_log, statistics, self.wire_id, pressure)
-        self.rows = CellRows(statistics, self.id_prefix, self.segment_prefix)
-        self.used: set[Resident] = set()
+        self.ledger = ledger
+        self.directory = directory
+        self.sessions = sessions
         self.statistics = statistics
         self.instance = instance
         self.epoch = event_log.epoch
         self.mode = mode
         self.gid = gid
-        self._unsure: Iterator[Resident] = iter(())
-        self._untold: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
-        reclaimer.on_retired = self._on_retired
-        reclaimer.on_gone = lambda name: self.tell(self.rows.hide, name)
+        self.id_prefix = catalogue.id_prefix
+        self.segment_prefix = segment_prefix(instance)
+        self.layers = LayerVersions(lambda: self.catalogue)
+        self.reclaimer = Reclaimer(ledger, directory, sessions, pins, self)
+        self.evictor = Evictor(self.reclaimer)
+        self.holders = Holders(self.reclaimer)
+        self.survey = Survey(self.holders, in_service=self.is_in_service)
+        self.lost = LostSegments(self.reclaimer, self.segment_prefix)
+        self.events = CellEvents(
+            event_log,
+            statistics,
+            PressureEvents(event_log, self._memory, sessions.largest_holder),
+            id_prefix=self.id_prefix,
+            segment_prefix=self.segment_prefix,
+        )
+        self.warm = WarmIndex()
+        self.heights = Heights(len(catalogue))
+        self.unentered = 0
+        self._used: set[Resident] = set()  # handed out since the statistics last showed them
 
-    # --- names --------------------------------------------------------------------------------
+    # --- the map --------------------------------------------------------------------------------
 
     def index_of(self, cell: str) -> int | None:
-        """Catalogue index of an id: whole, without the prefix, or a unique base name."""
+        """Return the catalogue index of an id: whole, without the prefix, or a unique base name."""
         index = self.catalogue.find(cell)
         if index is None and not cell.startswith("/"):
             index = self.catalogue.find(self.id_prefix + cell)
         return index
 
     def wire_id(self, cell_id: str) -> str:
-        """An id as replies carry it: without the prefix, whole where it does not start with it."""
-        return cell_id[len(self.id_prefix) :] if cell_id.startswith(self.id_prefix) else cell_id
+        """Return an id as replies carry it: without the prefix, whole where it does not start with it."""
+        return cell_id.removeprefix(self.id_prefix)
 
-    # --- finding --------------------------------------------------------------------------------
+    def key(self, index: int, layer: str) -> Key:
+        """Return the key of a layer of a cell."""
+        return Key(self.catalogue.id(index), layer)
 
-    def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
-        """The current version of a cell, if it is in memory (retired ones are put back in service)."""
-        resident = self.warm.get(index, layer)
-        if resident is None and self.unentered:
-            resident = self.ledger.by_key.get(Key(self.catalogue.id(index), layer))
-            if resident is not None and not self.enter_if_current(resident, index):
-                resident = None
-        if resident is None and self.ledger.retired:
-            key = Key(self.catalogue.id(index), layer)
-            if self.reclaimer.may_revive(key):
-                resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
-            if resident is not None:
-                self.enter(resident, index)
-                self.tell(self.events.revived, resident)
-        return resident
+    @property
+    def pages(self) -> Pages | None:
+        """Pages of the list of cells; None where the list is whole."""
+        return self.catalogue.pages
 
     def at_height(self, indices: list[int], z: tuple[float, float] | None) -> list[int]:
         """Leave out cells whose heights, known once they were loaded, lie outside the range."""
@@ -151,8 +149,15 @@ class CellCache:
             return indices
         return self.heights.overlapping(indices, z)
 
+    def pages_around(self, area: Area, layers: Iterable[str]) -> Sequence[int]:
+        """Return the pages that list an area's cells, and the cells around it that these layers look into."""
+        pages = self.pages
+        if pages is None:
+            return ()
+        return pages.of_area(area.around(*area.center, self.layers.halo_m(layers)))
+
     def estimate(self, index: int, layer: str) -> int:
-        """Bytes to reserve before a load: what the origin says, or else a guess.
+        """Return the bytes to reserve before a load: what the origin says, or else a guess.
 
         `points` has its file's bytes, plus its header, at most.  Only for compressed and ASCII files can it
         be more; their worker asks for it, as does that of a computed layer.
@@ -165,19 +170,54 @@ class CellCache:
             size = int(self.catalogue.source_bytes(index) * share) + _HEADER_ALLOWANCE_BYTES
         return -(-size // _PAGE_BYTES) * _PAGE_BYTES
 
+    # --- finding --------------------------------------------------------------------------------
+
+    def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
+        """Return the current version of a cell, if it is in memory (a retired one is put back in service)."""
+        resident = self.warm.get(index, layer)
+        if resident is None and self.unentered:
+            resident = self.ledger.by_key.get(self.key(index, layer))
+            if resident is not None and not self.enter_if_current(resident, index):
+                resident = None
+        if resident is None and self.ledger.retired:
+            key = self.key(index, layer)
+            if self.reclaimer.may_revive(key):
+                resident = self.reclaimer.revive(key, self.layers.version(index, layer), now_s)
+            if resident is not None:
+                self._enter(resident, index)
+                self.events.emit(self.events.revived, resident)
+        return resident
+
     def is_current(self, resident: Resident) -> bool:
         """Whether a resident segment is the newest version of its cell."""
         index = self.index_of(resident.key.cell_id)
         return index is not None and self.layers.version(index, resident.key.layer) == resident.version
 
     def is_in_service(self, resident: Resident) -> bool:
-        """Whether a segment is handed out to whoever asks for its cell."""
+        """Whether a segment is what requests for its cell are answered with."""
         return self.ledger.resident_named(resident.name) is resident and self.is_current(resident)
+
+    def resident(self, key: Key) -> Resident | None:
+        """Return the segment of a key that can be handed out, current or not."""
+        resident = self.ledger.by_key.get(key)
+        return resident if resident is not None and resident.checked else None
+
+    def is_held(self, index: int, layer: str) -> bool:
+        """Whether a session holds the current version of a cell."""
+        resident = self.warm.get(index, layer)
+        return resident is not None and bool(resident.sessions)
+
+    def replaced_bytes(self, session: Session, key: Key) -> int:
+        """Return the bytes of an old version that a session holds: it is about to drop it for the new one."""
+        for known in (self.ledger.by_key.get(key), self.reclaimer.retired_of(key)):
+            if known is not None and session.slot in known.sessions and not self.is_current(known):
+                return known.nbytes
+        return 0
 
     # --- coming ---------------------------------------------------------------------------------
 
     def publish(self, fd: int, header_bytes: int, resident: Resident, index: int, now_s: float) -> int:
-        """Name a finished segment and hand it out from now on; returns the version it supersedes, 0 for none.
+        """Name a finished segment and hand it out from now on; return the version it supersedes, 0 for none.
 
         ``resident`` describes it; its name and bytes are known once it is published.
 
@@ -195,13 +235,13 @@ class CellCache:
         if old is not None:
             self.reclaimer.superseded(old, now_s)
         step("daemon.catalogue")
-        self.enter(resident, index)
+        self._enter(resident, index)
         return old.version if old is not None else 0
 
     def adopt(self, resident: Resident, index: int) -> None:
-        """Take a segment of an earlier life; it is handed out once a loader has checked it."""
+        """Take over a segment of a previous run; it is handed out once a loader has checked it."""
         self.ledger.enter(resident)
-        self.enter(resident, index)
+        self._enter(resident, index)
         self.statistics.add("adopted")
 
     def accept(self, resident: Resident) -> bool:
@@ -211,20 +251,20 @@ class CellCache:
             return False
         step("daemon.accept")
         self.ledger.checked(resident)
-        self.enter(resident, index)
+        self._enter(resident, index)
         return True
 
     def reject(self, resident: Resident, why: str, now_s: float) -> None:
         """Take an adopted segment that is not what it should be out of service, if it still is in it."""
         if self.ledger.resident_named(resident.name) is resident:
             self.statistics.add("adoptions_failed")
-            log.warning("segment of an earlier daemon not used", segment=resident.name, reason=why)
+            log.warning("leftover segment rejected", segment=resident.name, reason=why)
             self.reclaimer.retire(resident, now_s, "damaged")
 
-    def enter(self, resident: Resident, index: int) -> None:
-        """A resident can be handed out: encode its handle, find it by index if it is current.
+    def _enter(self, resident: Resident, index: int) -> None:
+        """Encode a segment's handle, and find it by index if it is current.
 
-        One that is not checked yet only shows: who holds its version need not be sent it again.
+        One that is not checked yet only shows: a client that holds its version need not be sent it again.
         """
         self.warm.note_version(resident)
         current = True
@@ -232,7 +272,7 @@ class CellCache:
             segment = resident.name.removeprefix(self.segment_prefix)
             self.warm.encode(resident, self.wire_id(resident.key.cell_id), segment)
             current = self.enter_if_current(resident, index)
-        self.tell(self.rows.show, resident, "resident" if current else "stale")
+        self.events.emit(self.events.show, resident, "resident" if current else "stale")
 
     def enter_if_current(self, resident: Resident, index: int) -> bool:
         """Whether a segment is of its cell's current version; then it is found by index from now on."""
@@ -266,29 +306,64 @@ class CellCache:
             self.heights.forget(changed)
         return left
 
-    # --- telling --------------------------------------------------------------------------------
+    # --- being used -----------------------------------------------------------------------------
 
-    def tell(self, how: Callable[..., None], *what: Any) -> None:
-        """Have listeners told of something once nobody waits for the loop, see `tell_all`."""
-        self._untold.append((how, what))
+    def hand_out(self, residents: Sequence[Resident], now_s: float) -> None:
+        """Note that segments are handed out: each is spared for as long as opening it takes."""
+        first_used = 0
+        for resident in residents:
+            resident.last_use_s = now_s
+            if not resident.hits:
+                first_used += resident.nbytes
+                if resident.prefetched:
+                    self.ledger.asked_for(resident)
+                    self.statistics.add("prefetch_used")
+            resident.hits += 1
+        self.statistics.add("bytes_used", first_used)
+        self._used.update(residents)
 
-    def tell_all(self) -> None:
-        """Tell what happened since the last time, in that order."""
-        while self.tell_next():
-            pass
+    def show_used(self, now_s: float) -> bool:
+        """Bring the rows of some segments that were handed out up to date; whether there are more.
 
-    def tell_next(self) -> bool:
-        """Tell the first thing that happened and was not told yet; False if there is none."""
-        if not self._untold:
-            return False
-        how, what = self._untold.popleft()
-        how(*what)
-        return True
+        One that others cut short is retired: its cell has failed at the client's, and is loaded again.
+        """
+        for _ in range(min(SHOWN_PER_TURN, len(self._used))):
+            resident = self._used.pop()
+            if self.lost.retire_if_lost(resident, now_s):
+                continue
+            if self.ledger.resident_named(resident.name) is resident:
+                self.events.show(resident, "resident" if self.is_current(resident) else "stale")
+        return bool(self._used)
 
-    @property
-    def untold(self) -> bool:
-        """Whether something is to be told."""
-        return bool(self._untold)
+    def report(self, now_s: float) -> None:
+        """Publish and log what is reported now and then; a few times a second."""
+        self.events.step(now_s)
+        self.lost.report(now_s)
+
+    def measure(self) -> None:
+        """Bring the gauges of memory and of the map up to date."""
+        ledger, statistics, pages = self.ledger, self.statistics, self.pages
+        ledger.overhead_bytes = statistics.size_bytes
+        found = ledger.unchecked_count + len(self.warm) + self.unentered
+        for name, value in (
+            ("cells_resident", ledger.resident_count),
+            ("stale_cells", max(0, ledger.resident_count - found)),
+            ("bytes_resident", ledger.resident_bytes),
+            ("zombies", len(ledger.retired)),
+            ("bytes_zombie", ledger.retired_bytes),
+            ("bytes_pinned", self.survey.usage.nbytes),
+            ("segments_pinned", self.survey.usage.count),
+            ("bytes_reserved", ledger.reserved_bytes),
+            ("bytes_statistics", statistics.size_bytes),
+            ("bytes_prefetched", ledger.prefetched_bytes),
+            ("budget_bytes", ledger.budget_bytes),
+            ("evictions", self.evictor.evicted_count),
+            ("map_cells", len(self.catalogue)),
+            ("map_cells_known", len(self.catalogue) if pages is None else pages.known_cells),
+            ("map_pages", 0 if pages is None else len(pages)),
+            ("map_pages_known", 0 if pages is None else pages.known_pages),
+        ):
+            statistics.set(name, value)
 
     def _memory(self) -> tuple[int, int, int, int]:
         """Budget, used, pinned and retired bytes."""
@@ -297,8 +372,8 @@ class CellCache:
 
     # --- leaving --------------------------------------------------------------------------------
 
-    def chill(self, index: int) -> None:
-        """What is resident of this cell is not its current version any more, nor are its heights.
+    def invalidate(self, index: int) -> None:
+        """Note that a cell has changed: what is resident of it is not current, and its heights are unknown.
 
         The same goes for its neighbours in layers that look into it.
         """
@@ -308,46 +383,33 @@ class CellCache:
             for cell in cells:
                 self.warm.leave(cell, layer)
 
-    def _on_retired(self, resident: Resident, why: str) -> None:
-        """Nobody finds it any more; its bytes still show."""
-        self.tell(self.events.retired, resident, why)
-        self.used.discard(resident)
+    def segment_retired(self, resident: Resident, why: str) -> None:
+        """Find a segment no more; its bytes still show."""
+        self.events.emit(self.events.retired, resident, why)
+        self._used.discard(resident)
         self.statistics.add("prefetch_in_vain", resident.prefetched)
         self.warm.note_retired(resident)
         index = self.index_of(resident.key.cell_id)
         if index is not None and self.warm.get(index, resident.key.layer) is resident:
             self.warm.leave(index, resident.key.layer)
-        self.tell(self.rows.show, resident, "zombie")
+        self.events.emit(self.events.show, resident, "zombie")
 
-    def names_vanished(self, now_s: float) -> bool:
-        """Retire segments whose names others removed; True if that released memory."""
-        names = self.names.gone()
-        if names is None:
-            self._unsure = self.ledger.segments.walk()
-            return False
-        return self._retire_lost(names, now_s)
+    def segment_gone(self, name: str) -> None:
+        """Show a segment no more."""
+        self.events.emit(self.events.hide, name)
 
-    def look_for_some(self, now_s: float) -> bool:
-        """Look for a few segments, after more names vanished than the kernel reported."""
-        return self._retire_lost([one.name for one in islice(self._unsure, LOOKS_FOR_NAMES)], now_s)
+    def reclaim(self, now_s: float) -> bool:
+        """Free some retired segments that are due, and look for lost ones; whether more may fit now."""
+        freed = bool(self.ledger.retired) and self.reclaimer.sweep(now_s) > 0
+        return (not self.lost.to_check.is_done and self.lost.check_some(now_s)) or freed
 
-    def _retire_lost(self, names: Iterable[str], now_s: float) -> bool:
-        residents = map(self.ledger.resident_named, names)
-        return sum(self.retire_if_lost(one, now_s) for one in residents if one is not None) > 0
-
-    def retire_if_lost(self, resident: Resident, now_s: float) -> bool:
-        """Retire a segment that others removed or cut short, so that its cell is loaded again."""
-        size = self.directory.size_of(resident.name)
-        if size >= resident.nbytes:
-            return False
-        self.lost.add(resident, removed=size < 0, now_s=now_s)
-        self.reclaimer.retire(resident, now_s, "damaged")
-        self.reclaimer.never_revive(resident.key)
-        return True
+    def next_reclaim_s(self) -> float:
+        """Return when `reclaim`, or making room, is worth another try although nothing has changed."""
+        return min(self.reclaimer.next_sweep_s(), self.evictor.wake_s)
 
     def close(self, *, keep: bool = False) -> None:
-        """Take every segment's name away, or leave the names to the next life."""
+        """Take every segment's name away, or leave the names to the next run."""
         if not keep:
             self.reclaimer.remove_all()
         self.reclaimer.close()
-        self.names.close()
+        self.lost.close()

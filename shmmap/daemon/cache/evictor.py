@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from shmmap.daemon.cache.eviction_order import BATCH, Score
 from shmmap.daemon.cache.reclaimer import (
     HAND_OUT_GRACE_S,
-    LOOKS_AT_ONCE,
+    LOOKS_PER_TURN,
     SHARE_S,
     WATCHED_INTERVAL_S,
     Reclaimer,
@@ -31,7 +31,7 @@ __all__ = ["Evictor", "eviction_scores"]
 PIN_MEMO_S: Final = 0.2
 """How long, at least, a segment found pinned is not considered again; longer and longer if the kernel
 reports when a process closes it."""
-PREFETCHED_AT_ONCE: Final = 64
+PREFETCHED_PER_TURN: Final = 64
 """Segments fetched ahead that are compared with a wish at a time: a tenth of a millisecond."""
 PRESSURE_S: Final = 10.0
 """How long scores are kept up to date after room was needed."""
@@ -39,7 +39,7 @@ REFRESH_S: Final = 0.004
 """How often a few scores are brought up to date."""
 ROUND_S: Final = 2.0
 """How often, at most, those of all segments, a few at a time."""
-WORK_AT_ONCE: Final = 4
+WORK_PER_TURN: Final = 4
 """Segments looked at by one `free`, 15 us each; to retire one is as much work."""
 PLACES_S: Final = 0.25
 """How often the places of clients that move are taken over."""
@@ -85,7 +85,11 @@ class Evictor:
     reclaimer: Reclaimer
     evicted_count: int = 0
     wake_s: float = math.inf
-    _waits: tuple[int, float, float] = (-1, -math.inf, -math.inf)  # all is as at so many changes, until then
+    _waits: tuple[int, float, float] = (
+        -1,
+        -math.inf,
+        -math.inf,
+    )  # at so many changes; all is as it was then, until when
     _score: Score = _UNTIL_CLIENTS_MOVE
     _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
     _round_version: int = 0
@@ -96,7 +100,7 @@ class Evictor:
     _new_ones: bool = False
 
     def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> bool:
-        """Retire segments until ``shortage`` bytes are about to be freed; False if all else is in use.
+        """Retire segments until ``shortage`` bytes are about to be freed; False if the rest is in use.
 
         True also means that calling again at ``wake_s`` helps.
 
@@ -132,12 +136,12 @@ class Evictor:
                 order.defer(resident, order.deferred, math.inf)
             elif graced_s > now_s:
                 order.defer(resident, order.in_grace, graced_s)
-            elif work >= WORK_AT_ONCE:
+            elif work >= WORK_PER_TURN:
                 break
             elif self._found_in_use(resident, now_s):
                 work += 1
             else:
-                work = WORK_AT_ONCE
+                work = WORK_PER_TURN
                 missing -= resident.nbytes
                 self.reclaimer.retire(resident, now_s, "room")
                 self.evicted_count += 1
@@ -156,26 +160,28 @@ class Evictor:
         Returns whether there was any; it looks at some of it, and at others the next time.
         """
         ledger = self.reclaimer.ledger
-        some = [one for one in islice(ledger.prefetched, PREFETCHED_AT_ONCE) if not ledger.is_needed(one.key)]
+        some = [
+            one for one in islice(ledger.prefetched, PREFETCHED_PER_TURN) if not ledger.is_needed(one.key)
+        ]
         for resident in some:  # to the end of the line
             del ledger.prefetched[resident]
             ledger.prefetched[resident] = None
         least, *scores = self._scored(now_s, 4.0 * PLACES_S).of([wished, *some])
         later = sorted((its, number) for number, its in enumerate(scores) if its > least)
-        work = WORK_AT_ONCE
+        work = WORK_PER_TURN
         while later and shortage > 0 and work:
             resident = some[later.pop()[1]]
             self.reclaimer.retire(resident, now_s, "room")
             self.evicted_count += 1
             shortage -= resident.nbytes
             work -= 1
-        return work < WORK_AT_ONCE
+        return work < WORK_PER_TURN
 
     def _is_any_soon_free(self, now_s: float) -> bool:
         """Whether a grace that will end is worth waiting for: no process has opened that segment yet."""
         ledger = self.reclaimer.ledger
         order = ledger.order
-        for _ in range(LOOKS_AT_ONCE):
+        for _ in range(LOOKS_PER_TURN):
             soon = order.in_grace.first()
             if soon is None:
                 return False
@@ -196,7 +202,7 @@ class Evictor:
         if not self.reclaimer.is_pinned(resident):
             return False
         order = self.reclaimer.ledger.order
-        longer_s = 2.0 * resident.deferred_s if self.reclaimer.pins.tell_once(resident.name) else 0.0
+        longer_s = 2.0 * resident.deferred_s if self.reclaimer.pins.watch_next_close(resident.name) else 0.0
         resident.deferred_s = min(max(PIN_MEMO_S, longer_s), WATCHED_INTERVAL_S)
         order.defer(resident, order.deferred, now_s + max(resident.deferred_s, SHARE_S * len(order.deferred)))
         return True
@@ -225,7 +231,7 @@ class Evictor:
             self._round, self._round_version = ledger.segments.walk(), score.version
 
     def _scored(self, now_s: float, age_s: float) -> Score:
-        """How segments are scored, by where clients are; if they move, were ``age_s`` ago at most."""
+        """Return how segments are scored, by where clients are now, or were ``age_s`` ago at most."""
         sessions = self.reclaimer.sessions
         if sessions.places_version != self._score.version and now_s - self._placed_s >= age_s:
             self._placed_s = now_s

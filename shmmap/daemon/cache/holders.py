@@ -1,43 +1,61 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who has a segment mapped: the sessions that hold their lock on it, and whoever is not known."""
+"""Who maps which segments, and how much memory that is: asked of the kernel, a turn's worth at a time.
+
+One look at a segment takes about 30 us, and there may be thousands.  One walk over all of them keeps the
+gauges of the statistics up to date, a turn a beat.  For a session that asks, a new walk begins and takes one
+turn of the loop after the other; all sessions that asked before it began get its result.  What a single
+session maps is looked up in the turns of its request, before it is refused what would exceed its quota.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
 
-from shmmap.daemon.cache.reclaimer import LOOKS_AT_ONCE, Reclaimer
+from shmmap.daemon.cache.reclaimer import Reclaimer
+from shmmap.daemon.pace import Walk
 from shmmap.daemon.pins.probe import PinSource
-from shmmap.daemon.records import Resident
+from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.transport.sessions import Session
+from shmmap.errors import Busy
 from shmmap.protocol.messages import Holder
 from shmmap.segment.pins import LOADER_SLOT, has_slot, holders
 
-__all__ = ["UNKNOWN_SLOT", "Holders"]
+__all__ = ["UNKNOWN_SLOT", "Holders", "Share", "Survey", "Usage"]
 
 HOLDERS_S: Final = 0.03
-"""Time of the processor that finding out who holds what may take for one reply."""
-MOST_SEGMENTS: Final = 512
+"""Processor time that finding the holders for one reply may take."""
+MAX_HOLDING_SEGMENTS: Final = 512
 """Segments looked at for one reply."""
 UNKNOWN_SLOT: Final = 0
-"""Stands for whoever uses a segment without being a session."""
+"""Stands for processes that use a segment and have no session."""
+ASKING_S: Final = 0.2
+"""Processor time that finding the holders may take in one walk; 2048 segments take 0.03 s."""
+LONG_STEP_S: Final = 0.003
+SHARE: Final = 0.1
+"""Part of the loop's time that steps get when they take long (a process holds very many locks)."""
+MAX_SEGMENTS: Final = 2048
+"""Segments of a walk for which a session waits: the largest; of one session's the oldest."""
+MAX_ASKED: Final = 16
+"""Results that one session may wait for."""
 
 
 @dataclass(eq=False, slots=True)
 class Holders:
-    """Asks the kernel who has segments locked, and the sessions who that is."""
+    """Finds who has segments locked, and which sessions these are."""
 
     reclaimer: Reclaimer
 
     @property
     def by_slot(self) -> bool:
-        """Whether the kernel tells which sessions use a segment."""
+        """Whether the kernel knows which sessions use a segment."""
         return self.reclaimer.pins.source is not PinSource.SESSIONS
 
     def slots_of(self, resident: Resident) -> list[int] | None:
-        """Slots that have a segment locked; None if its name is gone."""
+        """Return the slots that have a segment locked; None if its name is gone."""
         try:
             with self.reclaimer.pins.opened(self.reclaimer.name_on_disk(resident)) as fd:
                 return holders(fd)
@@ -53,10 +71,10 @@ class Holders:
             return True
 
     def users_among(self, resident: Resident, slots: Sequence[int]) -> list[int]:
-        """Slots of sessions, of those that have a segment locked, and 0 if somebody unknown uses it, too.
+        """Return the slots of sessions among those that have a segment locked, and 0 for unknown users.
 
-        Unknown is whose lock no session of ours has (a client of an earlier life that we have not heard
-        of), and a pin without any lock.  Our own loaders look at segments, too, and do not count.
+        Unknown are a lock that belongs to no session (of a client of a previous run that has not said hello
+        again), and a pin without any lock.  Loaders look at segments, too, and do not count.
         """
         known = [slot for slot in slots if self.reclaimer.sessions.by_slot(slot) is not None]
         ours = slots.count(LOADER_SLOT)
@@ -65,38 +83,190 @@ class Holders:
         return known
 
     def of(self, resident: Resident) -> tuple[Holder, ...]:
-        """Who keeps a segment; session 0 is "unknown": a pin without our lock."""
-        return tuple(self._told({slot: [resident.nbytes, 1] for slot in self._users_of(resident)}))
+        """Return who keeps a segment; session 0 is "unknown": a pin without our lock."""
+        return tuple(self._as_holders({slot: [resident.nbytes, 1] for slot in self._users_of(resident)}))
 
-    def look(self, residents: Iterable[Resident], holders: list[Holder]) -> Iterator[None]:
-        """Add who keeps these segments to ``holders``, largest first, when that is found out.
+    def look(self, found: list[Holder]) -> Iterator[None]:
+        """Find who keeps most memory, a segment a step, and add them to ``found`` in the end, largest first.
 
-        A bounded look: at so many segments, and for so long; a few a turn.
+        The number of segments is bounded, and so is the time that they take.
         """
-        spent_s, found = 0.0, dict[int, list[int]]()
-        for number, resident in enumerate(islice(residents, MOST_SEGMENTS)):
-            if number and number % LOOKS_AT_ONCE == 0:
-                yield
+        spent_s, sums_of = 0.0, dict[int, list[int]]()
+        for resident in islice(self.reclaimer.ledger.segments.walk(), MAX_HOLDING_SEGMENTS):
             begin_s = time.thread_time()
             for slot in self._users_of(resident):
-                sums = found.setdefault(slot, [0, 0])
+                sums = sums_of.setdefault(slot, [0, 0])
                 sums[0] += resident.nbytes
                 sums[1] += 1
             spent_s += time.thread_time() - begin_s
             if spent_s > HOLDERS_S:
                 break
-        holders += self._told(found)
+            yield
+        found += self._as_holders(sums_of)
 
     def _users_of(self, resident: Resident) -> list[int]:
         return self.users_among(resident, self.slots_of(resident) or ())
 
-    def _told(self, found: Mapping[int, Sequence[int]]) -> list[Holder]:
-        """By slot, bytes and segments: as a reply says it."""
-        holders = []
+    def _as_holders(self, found: Mapping[int, Sequence[int]]) -> list[Holder]:
+        """Make lines of a reply of bytes and segments by slot."""
+        lines = []
         for slot, (nbytes, cells) in sorted(found.items(), key=lambda item: -item[1][0]):
             session = self.reclaimer.sessions.by_slot(slot)
             if session is None:
-                holders.append(Holder(0, 0, -1, "unknown", nbytes, cells))
+                lines.append(Holder(0, 0, -1, "unknown", nbytes, cells))
             else:
-                holders.append(session.as_holder(nbytes, cells))
-        return holders
+                lines.append(session.as_holder(nbytes, cells))
+        return lines
+
+
+@dataclass(slots=True)
+class Share:
+    """What one session maps; ``superseded`` segments have left service or have a successor."""
+
+    mapped_bytes: int = 0
+    superseded: int = 0
+    superseded_bytes: int = 0
+
+
+@dataclass(slots=True)
+class Usage:
+    """How many segments are mapped, and their bytes; ``unknown`` are those mapped without a session's lock.
+
+    ``shares`` has the slots of sessions that map anything; it is empty unless the kernel knows them
+    (``by_slot``).
+    """
+
+    count: int = 0
+    nbytes: int = 0
+    unknown: int = 0
+    unknown_bytes: int = 0
+    shares: dict[int, Share] = field(default_factory=dict)
+    by_slot: bool = True
+
+
+Answer = Callable[[Usage], None]
+
+
+class Survey:
+    """Looks at all segments, some per `step`.
+
+    Parameters
+    ----------
+    in_service
+        Whether a segment is handed out.
+
+    Attributes
+    ----------
+    usage : Usage
+        The result of the last whole walk.
+    """
+
+    def __init__(self, holders: Holders, *, in_service: Callable[[Resident], bool]) -> None:
+        self._holders = holders
+        self._segments = holders.reclaimer.ledger.segments
+        self._in_service = in_service
+        self._asked: list[tuple[Session, Answer]] = []
+        self._running: list[tuple[Session, Answer]] = []
+        self._walk: Walk[Resident] | None = None
+        self.usage = self._found = Usage()
+        self._rests_until_s = 0.0
+        self._asking_s = 0.0
+
+    @property
+    def idle(self) -> bool:
+        """Whether no session waits for a result."""
+        return not (self._asked or self._running)
+
+    @property
+    def next_s(self) -> float:
+        """When `turn` has something to do: infinity for never."""
+        return float("inf") if self.idle else self._rests_until_s
+
+    def ask(self, session: Session, answer: Answer) -> None:
+        """Have ``answer`` called with the result of a walk that begins after now.
+
+        Raises
+        ------
+        Busy
+            The session waits for too many already.
+        """
+        if sum(asker is session for asker, _ in self._asked) >= MAX_ASKED:
+            raise Busy("this session waits for too many answers of this kind", hint="wait for them first")
+        self._asked.append((session, answer))
+
+    def run_step(self, now_s: float) -> None:
+        """Do a step if a session waits, unless the step before took so long that others come first."""
+        if self.idle or now_s < self._rests_until_s:
+            return
+        self.step()
+        took_s = time.monotonic() - now_s
+        self._rests_until_s = now_s + took_s / SHARE if took_s > LONG_STEP_S else 0.0
+
+    def look_at(
+        self, session: Session, before_s: float, enough: Callable[[], bool], wanted: Container[Key] = ()
+    ) -> Generator[None, None, None]:
+        """Drop what a session does not map any more, a look a step, until that is ``enough``.
+
+        What was handed out at ``before_s`` or later it may be about to open; what is ``wanted`` again
+        counts either way.
+        """
+        if not self._holders.by_slot:
+            return
+        looked = 0
+        for version in list(session.held):  # what was handed out longest ago first
+            for resident in list(session.held.get(version, ())):
+                if looked == MAX_SEGMENTS or enough():
+                    return
+                if resident.key in wanted:
+                    continue
+                looked += 1
+                if resident.last_use_s < before_s and not self._holders.has(resident, session.slot):
+                    session.drop_segment(resident)
+                yield
+
+    def step(self) -> None:
+        """Look at some segments, or hand the result to one session that asked."""
+        if self._asked and not self._running:
+            self._running, self._asked = self._asked[::-1], []
+            self._begin(MAX_SEGMENTS)
+        elif self._running and self._walk is None:
+            _, answer = self._running.pop()
+            answer(self.usage)
+            return
+        walk = self._walk or self._begin(None)
+        for resident in walk.for_a_turn():
+            self._look_at(resident)
+        if walk.is_done:
+            self._walk, self.usage = None, self._found
+
+    def _begin(self, most: int | None) -> Walk[Resident]:
+        self._walk = Walk(islice(self._segments.walk(), most))
+        self._found = Usage(by_slot=self._holders.by_slot)
+        self._asking_s = 0.0
+        return self._walk
+
+    def _slots_of(self, resident: Resident) -> list[int]:
+        """Return who has a segment locked, as far as there is time to ask: else its pin counts as unknown."""
+        if self._asking_s > ASKING_S:
+            return []
+        begin_s = time.thread_time()
+        slots = self._holders.slots_of(resident) or []
+        self._asking_s += time.thread_time() - begin_s
+        return slots
+
+    def _look_at(self, resident: Resident) -> None:
+        found = self._found
+        users = self._holders.users_among(resident, self._slots_of(resident))
+        if users:
+            found.count += 1
+            found.nbytes += resident.nbytes
+        for slot in users:
+            if slot == UNKNOWN_SLOT:
+                found.unknown += 1
+                found.unknown_bytes += resident.nbytes
+                continue
+            share = found.shares.setdefault(slot, Share())
+            share.mapped_bytes += resident.nbytes
+            if not self._in_service(resident):
+                share.superseded += 1
+                share.superseded_bytes += resident.nbytes

@@ -21,7 +21,7 @@ __all__ = ["Ledger", "Segments"]
 
 
 class Segments:
-    """All segments in memory, to go over a few at a time while they come and go."""
+    """All segments in memory, for walks that take several turns while segments come and go."""
 
     def __init__(self) -> None:
         self._by_size: list[list[Resident]] = [[] for _ in range(64)]
@@ -31,14 +31,14 @@ class Segments:
         return self._count
 
     def add(self, resident: Resident) -> None:
-        """One more."""
+        """Add a segment."""
         alike = self._by_size[resident.nbytes.bit_length()]
         resident.place = len(alike)
         alike.append(resident)
         self._count += 1
 
     def remove(self, resident: Resident) -> None:
-        """One less."""
+        """Remove a segment."""
         alike = self._by_size[resident.nbytes.bit_length()]
         last = alike.pop()
         if last is not resident:  # it takes the empty place
@@ -46,7 +46,7 @@ class Segments:
         self._count -= 1
 
     def walk(self) -> Iterator[Resident]:
-        """Go over all that are there now and stay, larger ones first (to a factor of two).
+        """Yield all that are there now and stay, larger ones first (to a factor of two).
 
         What comes meanwhile may be left out; what stays may come twice.
         """
@@ -76,16 +76,16 @@ class Ledger:
         In which order residents are evicted.
     retired_bytes, freeing_bytes
         Memory of what is out of service, and how much of it the kernel is taking back just now.
-    condemned_bytes
-        Bytes of retired segments that nobody had open at the last look.
+    unopened_bytes
+        Bytes of retired segments that no process had open at the last look.
     overhead_bytes
         What the daemon itself keeps in shared memory (its statistics); counts as used.
-    aside_bytes
-        Segments of an earlier run that cannot be judged before more of the map is known; counts as used.
+    set_aside_bytes
+        Segments of a previous run that cannot be judged before more of the map is known; counts as used.
     prefetched, prefetched_bytes
-        What was fetched ahead and no client has asked for yet, and its memory.
+        What was prefetched and no client has asked for yet, and its memory.
     unchecked_count
-        How many residents are of an earlier life and not yet checked.
+        How many residents are of a previous run and not yet checked.
     """
 
     def __init__(self, budget_bytes: int) -> None:
@@ -97,10 +97,10 @@ class Ledger:
         self.order = EvictionOrder()
         self.retired_bytes = 0
         self.freeing_bytes = 0
-        self.condemned_bytes = 0
+        self.unopened_bytes = 0
         self.reserved_bytes = 0
         self.overhead_bytes = 0
-        self.aside_bytes = 0
+        self.set_aside_bytes = 0
         self.prefetched_bytes = 0
         self.prefetched: dict[Resident, None] = {}
         self.unchecked_count = 0
@@ -112,8 +112,8 @@ class Ledger:
 
     @property
     def used_bytes(self) -> int:
-        """Resident, retired and reserved bytes together, what is set aside, and the daemon's own overhead."""
-        in_memory = self.resident_bytes + self.retired_bytes + self.aside_bytes
+        """Resident, retired and reserved bytes, what is set aside, and the daemon's own overhead."""
+        in_memory = self.resident_bytes + self.retired_bytes + self.set_aside_bytes
         return in_memory + self.reserved_bytes + self.overhead_bytes
 
     def shortage(self, nbytes: int) -> int:
@@ -126,48 +126,52 @@ class Ledger:
         self.reserved_bytes += nbytes if fits else 0
         return fits
 
+    def fits_at_all(self, nbytes: int) -> bool:
+        """Whether so many bytes fit beside the daemon's own overhead, once all else is evicted."""
+        return nbytes + self.overhead_bytes <= self.budget_bytes
+
     def add_overhead(self, nbytes: int) -> bool:
-        """The daemon itself keeps more; False if that does not fit."""
+        """Count more memory of the daemon itself; False if that does not fit."""
         fits = self.shortage(nbytes) <= 0
         self.overhead_bytes += nbytes if fits else 0
         return fits
 
     @property
     def resident_count(self) -> int:
-        """How many segments can be handed out."""
+        """Number of segments that can be handed out."""
         return len(self._by_name)
 
     def residents(self) -> Iterator[Resident]:
-        """All segments that can be handed out."""
+        """Return all segments that can be handed out."""
         return iter(self._by_name.values())
 
     def resident_named(self, name: str) -> Resident | None:
-        """The segment of that name, if it can be handed out."""
+        """Return the segment of that name, if it can be handed out."""
         return self._by_name.get(name)
 
     def of_cell(self, cell_id: str) -> list[Resident]:
-        """All layers of one cell that can be handed out."""
+        """Return all layers of one cell that can be handed out."""
         found = (self.by_key.get(Key(cell_id, layer)) for layer in self._layers)
         return [resident for resident in found if resident is not None]
 
     def layers(self) -> Iterable[str]:
-        """Layers of which there are segments that can be handed out."""
+        """Return layers of which there are segments that can be handed out."""
         return self._layers.keys()
 
     @property
     def cell_count(self) -> int:
-        """Of how many cells there are segments that can be handed out, of the layer that most have."""
+        """Number of cells with a segment that can be handed out, in the layer that most have."""
         return max(self._layers.values(), default=0)
 
     @property
     def coming_bytes(self) -> int:
         """Memory that is about to be free."""
-        return self.condemned_bytes + self.freeing_bytes
+        return self.unopened_bytes + self.freeing_bytes
 
     # --- being needed ---------------------------------------------------------------------------
 
     def need(self, key: Key) -> None:
-        """A waiting request or an operator's pin needs this: it is no candidate for eviction."""
+        """Keep this from being evicted: a waiting request or an operator's pin needs it."""
         self._needed[key] = self._needed.get(key, 0) + 1
 
     def need_no_more(self, key: Key) -> None:
@@ -179,17 +183,17 @@ class Ledger:
             self.order.reconsider(self.by_key[key])
 
     def needed(self) -> Iterable[Key]:
-        """Keys that requests or pins need."""
+        """Return the keys that requests or pins need."""
         return self._needed.keys()
 
     def is_needed(self, key: Key) -> bool:
-        """Whether somebody needs this."""
+        """Whether a request or pin needs this."""
         return key in self._needed
 
     # --- coming ---------------------------------------------------------------------------------
 
     def enter(self, resident: Resident) -> Resident | None:
-        """A segment is in service now; returns the version it supersedes, to be retired by name."""
+        """Put a segment into service; return the version it supersedes, to be retired by name."""
         old = self.by_key.get(resident.key)
         self.by_key[resident.key] = self._by_name[resident.name] = resident
         self._layers[resident.key.layer] += 1
@@ -206,12 +210,12 @@ class Ledger:
         return old
 
     def checked(self, resident: Resident) -> None:
-        """A segment of an earlier life is what it should be: it can be handed out."""
+        """Note that a segment of a previous run is what it should be: it can be handed out."""
         resident.checked = True
         self.unchecked_count -= 1
 
     def asked_for(self, resident: Resident) -> None:
-        """Note that a client asked for what was fetched ahead."""
+        """Note that a client asked for what was prefetched."""
         self._not_ahead(resident)
         resident.prefetched = False
 
@@ -235,14 +239,14 @@ class Ledger:
         self.retired[resident.name] = Retired(resident)
 
     def add_retired(self, resident: Resident) -> Retired:
-        """Count a segment that has been out of service since an earlier life of the daemon."""
+        """Count a segment that has been out of service since a previous run of the daemon."""
         self.segments.add(resident)
         self.retired_bytes += resident.nbytes
         retired = self.retired[resident.name] = Retired(resident)
         return retired
 
     def rename(self, resident: Resident, name: str) -> None:
-        """A segment has another name from now on."""
+        """Give a segment another name."""
         if resident.name in self._by_name:
             self._by_name[name] = self._by_name.pop(resident.name)
         else:
@@ -250,46 +254,46 @@ class Ledger:
         resident.name = name
 
     def retire(self, resident: Resident) -> None:
-        """Nobody gets this segment any more; its bytes count until `freed`."""
+        """Take a segment out of service; its bytes count until `freed`."""
         if self.by_key.get(resident.key) is resident:
             del self.by_key[resident.key]
         self._leave_service(resident)
 
     def revive(self, retired: Retired) -> Resident | None:
-        """A retired segment is wanted again and still whole: hand it out as before.
+        """Put a retired segment back into service.
 
-        Returns the version that it supersedes, to be retired by name (the map went back to an
+        Return the version that it supersedes, to be retired by name (the map went back to an
         earlier state).
         """
         self._gone(retired.resident.name)
         self.retired_bytes -= retired.resident.nbytes
         return self.enter(retired.resident)
 
-    def condemn(self, retired: Retired, condemned: bool) -> None:
-        """Nobody had this open at the last look, or somebody has."""
-        self.condemned_bytes += retired.resident.nbytes * (condemned - retired.condemned)
-        retired.condemned = condemned
+    def mark_unopened(self, retired: Retired, unopened: bool) -> None:
+        """Note whether no process had a retired segment open at the last look."""
+        self.unopened_bytes += retired.resident.nbytes * (unopened - retired.unopened)
+        retired.unopened = unopened
 
     def freed(self, name: str) -> int:
-        """A retired segment's memory is back with the kernel; returns its bytes."""
+        """Count out a retired segment whose memory is back with the kernel; return its bytes."""
         nbytes = self._gone(name)
         self.retired_bytes -= nbytes
         return nbytes
 
     def freeing(self, name: str) -> int:
-        """The kernel is about to take a retired segment's memory back: it counts until `closed`."""
+        """Note that the kernel is taking a retired segment's memory back: it counts until `closed`."""
         nbytes = self._gone(name)
         self.freeing_bytes += nbytes
         return nbytes
 
     def closed(self, nbytes: int) -> None:
-        """So many bytes that were being freed are back with the kernel."""
+        """Count out bytes that were being freed and are back with the kernel."""
         self.freeing_bytes -= nbytes
         self.retired_bytes -= nbytes
 
     def _gone(self, name: str) -> int:
         retired = self.retired[name]
-        self.condemn(retired, False)
+        self.mark_unopened(retired, False)
         del self.retired[name]
         self.segments.remove(retired.resident)
         return retired.resident.nbytes

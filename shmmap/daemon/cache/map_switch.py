@@ -6,13 +6,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Any, Final
 
 import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_view import CatalogueView
+from shmmap.daemon.pace import Walk
 from shmmap.daemon.records import Resident
 from shmmap.large_tables import ShardedDict
 from shmmap.origin.catalogue_change import CatalogueChange
@@ -22,16 +22,13 @@ __all__ = ["MapSwitch"]
 
 STATES_REMEMBERED: Final = 64
 CELLS_REMEMBERED: Final = 2048
-"""Changes of cells, in all states that are remembered; who asks for changes before reads the whole list."""
-SEGMENTS_A_STEP: Final = 16
-ENTRIES_A_STEP: Final = 512
-"""Segments looked at, and entries of tables freed, in one turn: less than a millisecond."""
+"""Changes of cells, in all states that are remembered; for changes before them the whole list is read."""
 
 
 class MapSwitch:
     """Changes the catalogue that the cache serves, and remembers the changes.
 
-    To change over takes one short step.  What is in memory is then looked at little by little, in `turn`; a
+    To change over takes one short step.  What is in memory is then looked at some segments a `turn`; a
     cell that is asked for meanwhile is looked for at once (`CellCache.find_warm`).
     """
 
@@ -39,11 +36,12 @@ class MapSwitch:
         self._cache = cache
         self._history: deque[tuple[int, frozenset[str], tuple[str, ...]]] = deque(maxlen=STATES_REMEMBERED)
         self._remembered = 0
-        self._unseen: Iterator[Resident] | None = None
+        self._unseen: Walk[Resident] | None = None
         self._leftovers: list[ShardedDict[int, Any]] = []
+        self._to_free: Walk[None] | None = None
 
     def changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
-        """Ids that changed or appeared, and that vanished, since a map version; None: not known."""
+        """Return ids that changed or appeared, and that vanished, since a map version; None: not known."""
         if map_version == self._cache.catalogue.map_version:
             return set(), []
         history = list(self._history)
@@ -81,7 +79,7 @@ class MapSwitch:
         return True
 
     def learn(self, index: int, stamp: Stamp) -> None:
-        """A loader found that a cell's file is in this state."""
+        """Take over that a loader found a cell's file in this state."""
         cache = self._cache
         if cache.catalogue.stamp(index) == stamp:
             return
@@ -89,8 +87,8 @@ class MapSwitch:
         self._remember({cell_id}, ())
         cache.statistics.map_changed()
         cache.catalogue.set_stamp(index, stamp)
-        cache.chill(index)
-        cache.tell(cache.events.changed, cell_id, cache.catalogue.version(index))
+        cache.invalidate(index)
+        cache.events.emit(cache.events.changed, cell_id, cache.catalogue.version(index))
 
     def switch(self, new: CatalogueView, change: CatalogueChange) -> None:
         """Serve another state of the map; ``change`` is what it differs in from the one served now."""
@@ -105,18 +103,18 @@ class MapSwitch:
         changed = np.concatenate((change.changed, change.moved))
         cache.statistics.map_changed()
         self._leftovers += cache.serve(new, changed if change.same_cells else None)
-        self._unseen = cache.ledger.segments.walk()
-        cache.unentered = cache.ledger.resident_count
+        self._to_free = self._to_free or Walk(self._free_leftovers())
+        self.recheck()
 
     def recheck(self) -> None:
-        """More of the map is known: segments whose current version was not may be current."""
-        self._unseen = self._cache.ledger.segments.walk()
+        """Look at all segments again: more of the map is known, and those that were not current may be."""
+        self._unseen = Walk(self._cache.ledger.segments.walk())
         self._cache.unentered = self._cache.ledger.resident_count
 
     @property
     def busy(self) -> bool:
         """Whether `turn` has something to do."""
-        return bool(self._unseen or self._leftovers)
+        return self._unseen is not None or self._to_free is not None
 
     @property
     def next_s(self) -> float:
@@ -124,23 +122,29 @@ class MapSwitch:
         return 0.0 if self.busy else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Look at some of what is in memory: it is right, out of date, or of no cell of the map any more."""
+        """Look at some segments: each is current, out of date, or of a cell that left the map."""
         cache = self._cache
         if self._unseen is not None:
-            some = list(islice(self._unseen, SEGMENTS_A_STEP))
-            for resident in some:
+            for resident in self._unseen.for_a_turn():
+                cache.unentered = max(1, cache.unentered - 1)
                 if cache.ledger.resident_named(resident.name) is resident:
                     self._look_at(resident, now_s)
-            cache.unentered = max(1, cache.unentered - len(some))
-            if len(some) < SEGMENTS_A_STEP:
+            if self._unseen.is_done:
                 self._unseen, cache.unentered = None, 0
-        for _ in range(ENTRIES_A_STEP):
-            if not self._leftovers:
-                break
+        elif self._to_free is not None:
+            for _ in self._to_free.for_a_turn():
+                pass
+            if self._to_free.is_done:
+                self._to_free = None
+
+    def _free_leftovers(self) -> Iterator[None]:
+        """Free tables that are not used any more, an entry a step: many at once take long."""
+        while self._leftovers:
             if self._leftovers[-1]:
                 self._leftovers[-1].popitem()
             else:
                 self._leftovers.pop()
+            yield
 
     def _look_at(self, resident: Resident, now_s: float) -> None:
         cache, cell = self._cache, resident.key.cell_id
@@ -148,9 +152,9 @@ class MapSwitch:
         if index is None or cache.catalogue.box(index) != resident.box:
             cache.reclaimer.retire(resident, now_s, "map")
         elif cache.enter_if_current(resident, index):
-            cache.tell(cache.rows.show, resident, "resident")
+            cache.events.emit(cache.events.show, resident, "resident")
         elif resident.checked:
-            cache.tell(cache.rows.show, resident, "stale")
+            cache.events.emit(cache.events.show, resident, "stale")
         elif not cache.is_current(resident) and cache.layers.version(index, resident.key.layer):
             cache.reclaimer.retire(resident, now_s, "map")
 

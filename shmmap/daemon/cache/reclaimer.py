@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Getting memory back: retire a segment by renaming it, free it once the kernel says nobody has it.
+"""Getting memory back: retire a segment by renaming it, free it once the kernel says that no process has it.
 
-A bounded number of segments is looked at per turn of the serving loop; a longer way goes on in the next.
+The number of segments looked at in one turn of the serving loop is bounded; the rest follows in the next.
 
-Renaming first means that nobody new can open the segment; looking again on a later tick catches
-whoever was just opening it.  A retired segment that is still mapped stays in the ledger, and is
-looked at again when its reader says that it let go, when the kernel reports that somebody closed it,
+Renaming first means that no other process can open the segment; looking again on a later tick catches
+a process that was just opening it.  A retired segment that is still mapped stays in the ledger, and is
+looked at again when its reader says that it has released it, when the kernel reports a close,
 or when a client's session ends; on a timer only as a precaution.
 """
 
@@ -14,12 +14,12 @@ from __future__ import annotations
 import contextlib
 import heapq
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import islice
-from typing import Final
+from typing import Final, Protocol
 
 from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.pace import Walk
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
@@ -42,26 +42,26 @@ SHARE_S: Final = 0.0005
 """With very many of them each is looked at less often: at most one per this time (a look takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0
 """A segment just handed out is not evicted for this long, so that its reader can open it."""
-LOOKS_AT_ONCE: Final = 8
+LOOKS_PER_TURN: Final = 8
 """Segments looked at, retired or freed per turn: a look takes 15 us, retiring 50."""
+
+
+class RetirementObserver(Protocol):
+    """Follows segments that leave."""
+
+    def segment_retired(self, resident: Resident, why: str) -> None:
+        """Follow a segment that left service; ``why`` as in `Reclaimer.retire`."""
+
+    def segment_gone(self, name: str) -> None:
+        """Follow a name under which there is no segment any more: it was freed, or has another name."""
 
 
 @dataclass(eq=False, slots=True)
 class Reclaimer:
     """Retires segments, and gives their memory back.
 
-    Parameters
-    ----------
-    pins
-        Asks the kernel, and hears from it.
-
     Attributes
     ----------
-    on_retired
-        Called with a segment that left service, and why: for ``room``, ``request``, ``map``, ``superseded``
-        or ``damaged``.
-    on_gone
-        Called with a name under which there is no segment any more: it was freed, or has another.
     closer
         Closes what takes long to close.
     """
@@ -70,40 +70,45 @@ class Reclaimer:
     directory: ShmDirectory
     sessions: Sessions
     pins: PinWatch
-    on_retired: Callable[[Resident, str], None] = field(init=False)
-    on_gone: Callable[[str], None] = field(init=False)
+    observer: RetirementObserver
     closer: Closer = field(default_factory=Closer)
     _by_key: dict[Key, Retired] = field(default_factory=dict)
     _due: list[tuple[float, int, Retired]] = field(default_factory=list)
     _number: int = 0
-    _unheard: Iterator[Resident] = field(default_factory=lambda: iter(()))
+    _to_check: Walk[Resident] = field(default_factory=Walk)
 
     # --- retiring -----------------------------------------------------------------------------
 
     def name_on_disk(self, resident: Resident) -> str:
-        """The name of a segment's file: a retired one has another."""
+        """Return the name of a segment's file: a retired one has another."""
         return retired_name(resident.name) if resident.name in self.ledger.retired else resident.name
 
     def is_pinned(self, resident: Resident) -> bool | None:
-        """What the kernel says of a segment; None if its name is gone."""
+        """Whether a process uses a segment, as the kernel says; None if its name is gone."""
         if self.pins.source is PinSource.SESSIONS:
             return bool(resident.sessions)
         return self.pins.is_used(self.name_on_disk(resident))
 
     def retire(self, resident: Resident, now_s: float, why: str = "request") -> bool:
-        """Take a segment out of service; True if nobody has it mapped, so that it is freed soon."""
+        """Take a segment out of service; True if no process has it mapped, so that it is freed soon.
+
+        Parameters
+        ----------
+        why
+            ``room``, ``request``, ``map``, ``superseded`` or ``damaged``.
+        """
         found = self._hide(resident)
         self.ledger.retire(resident)
         return self._watch(resident, now_s, why, found=found)
 
     def superseded(self, old: Resident, now_s: float) -> None:
-        """The ledger took an old version out of service; do the same with its name."""
+        """Retire the name of an old version that the ledger took out of service."""
         self._watch(old, now_s, "superseded", found=self._hide(old))
 
     def _hide(self, resident: Resident) -> bool:
         """Give a segment the name of a retired one; False if it is gone.
 
-        Where everybody may make files somebody may have taken that name: then it is a name nobody knows.
+        Where any user may make files that name may be taken: then it is a name that cannot be guessed.
         """
         try:
             return self.directory.rename(resident.name, retired_name(resident.name))
@@ -112,43 +117,46 @@ class Reclaimer:
             log.warning("segment not renamed", old=old, new=retired_name(old), error=error.strerror)
             found = self.directory.rename(old, retired_name(new))
             self.ledger.rename(resident, new)
-            self.on_gone(old)
+            self.observer.segment_gone(old)
             return found
 
     def _watch(self, resident: Resident, now_s: float, why: str, *, found: bool) -> bool:
-        """Have an eye on a segment out of service; True if nobody has it mapped."""
+        """Follow a segment out of service until it can be freed; True if no process has it mapped."""
         retired = self.ledger.retired[resident.name]
-        self.on_retired(resident, why)
+        self.observer.segment_retired(resident, why)
         if not found:
             self._vanished(retired)
             return True
         if resident.checked:
             self._by_key[resident.key] = retired
-        condemned = self.is_pinned(resident) is False
-        if not condemned:
+        unopened = self.is_pinned(resident) is False
+        if not unopened:
             self.pins.keep(retired_name(resident.name))
-        self.ledger.condemn(retired, condemned)
+        self.ledger.mark_unopened(retired, unopened)
         self._begin_tick(retired, now_s)
-        return condemned
+        return unopened
 
-    def adopt(self, resident: Resident, now_s: float) -> None:
-        """Watch a retired segment of an earlier life of the daemon."""
-        self._begin_tick(self.ledger.add_retired(resident), now_s)
+    def adopt(self, resident: Resident, now_s: float, *, hidden: bool) -> None:
+        """Follow a segment of a previous run that cannot serve; its file may be ``hidden`` already."""
+        retired = self.ledger.add_retired(resident)
+        if not hidden:
+            self._hide(resident)
+        self._begin_tick(retired, now_s)
         self.pins.keep(retired_name(resident.name))
 
     def _begin_tick(self, retired: Retired, now_s: float) -> None:
-        """It may be freed when nobody can be just opening it."""
+        """Let it be freed only when no process can be just opening it."""
         retired.tick_over_s = now_s + TICK_S
         self._look_at(retired, retired.tick_over_s)
 
     def _look_at(self, retired: Retired, when_s: float) -> None:
-        """A retired segment is worth a look then."""
+        """Have a retired segment looked at then."""
         retired.probe_after_s = when_s = max(when_s, retired.tick_over_s)
         self._number += 1
         heapq.heappush(self._due, (when_s, self._number, retired))
 
     def retired_of(self, key: Key) -> Resident | None:
-        """The last segment of a key that left service, while there is one."""
+        """Return the last segment of a key that left service, while there is one."""
         retired = self._by_key.get(key)
         return retired.resident if retired is not None else None
 
@@ -164,7 +172,7 @@ class Reclaimer:
         name = retired.resident.name
         try:
             found = self.directory.rename(retired_name(name), name)
-        except OSError as error:  # somebody else has taken its name: the cell is loaded anew
+        except OSError as error:  # another program has taken its name: the cell is loaded again
             log.warning("segment not renamed", old=retired_name(name), new=name, error=error.strerror)
             self.never_revive(key)
             return None
@@ -179,7 +187,7 @@ class Reclaimer:
         return retired.resident
 
     def never_revive(self, key: Key) -> None:
-        """What is retired of this key must not be handed out again."""
+        """Do not hand out again what is retired of this key."""
         self._by_key.pop(key, None)
 
     def _vanished(self, retired: Retired) -> None:
@@ -191,7 +199,7 @@ class Reclaimer:
         self.ledger.freed(retired.resident.name)
 
     def _forget(self, retired: Retired) -> None:
-        """There is no such segment any more, or only its memory."""
+        """Forget a segment that is no more, or of which only memory is left."""
         resident = retired.resident
         self.pins.release(retired_name(resident.name))
         if self._by_key.get(resident.key) is retired:
@@ -200,29 +208,30 @@ class Reclaimer:
             session = self.sessions.by_slot(slot)
             if session is not None:
                 session.drop_segment(resident)
-        self.on_gone(resident.name)
+        self.observer.segment_gone(resident.name)
 
     # --- freeing ------------------------------------------------------------------------------
 
     def sweep(self, now_s: float) -> int:
-        """Look at some retired segments that are due and free those nobody has; returns the bytes freed.
+        """Look at some retired segments that are due, free those that no process has, return the bytes freed.
 
         Those whose memory is being freed in another thread do not count, see `collect`.
         """
         freed = 0
-        for _ in range(LOOKS_AT_ONCE):
+        for _ in range(LOOKS_PER_TURN):
             retired = self._next_due(now_s)
             if retired is None:
                 break
             freed += self._probe(retired, now_s)  # if that fails, its time has still come
-        for resident in islice(self._unheard, LOOKS_AT_ONCE):
-            retired = self.ledger.retired.get(resident.name)
-            if retired is not None:
-                self._look_at(retired, min(now_s, retired.probe_after_s))
+        if not self._to_check.is_done:
+            for resident in self._to_check.for_a_turn():
+                retired = self.ledger.retired.get(resident.name)
+                if retired is not None:
+                    self._look_at(retired, min(now_s, retired.probe_after_s))
         return freed
 
     def _next_due(self, now_s: float = math.inf) -> Retired | None:
-        """The retired segment that is to be looked at next, if its time has come."""
+        """Return the retired segment that is to be looked at next, if its time has come."""
         while self._due and self._due[0][0] <= now_s:
             when_s, _, retired = self._due[0]
             known = self.ledger.retired.get(retired.resident.name)
@@ -232,36 +241,36 @@ class Reclaimer:
         return None
 
     def next_sweep_s(self) -> float:
-        """When the next look at a retired segment is due; infinity when there is none."""
+        """Return when the next look at a retired segment is due; infinity when there is none."""
         retired = self._next_due()
         return retired.probe_after_s if retired is not None else math.inf
 
-    def let_go(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Somebody dropped these: what nobody else has is freed soon."""
+    def release(self, residents: Iterable[Resident], now_s: float) -> None:
+        """Have segments looked at that a client has dropped: what no other has is freed soon."""
         for resident in residents:
             retired = self.ledger.retired.get(resident.name)
             if retired is None:
                 self.ledger.order.reconsider(resident)
-            elif retired.probe_after_s > now_s and not retired.condemned:
+            elif retired.probe_after_s > now_s and not retired.unopened:
                 self._look_at(retired, now_s)
 
     def _probe(self, retired: Retired, now_s: float) -> int:
-        """Look at a retired segment whose tick is over; returns the bytes that were freed."""
+        """Look at a retired segment whose tick is over; return the bytes that were freed."""
         if self.is_pinned(retired.resident):
-            self.ledger.condemn(retired, False)
+            self.ledger.mark_unopened(retired, False)
             name = retired_name(retired.resident.name)
             if not self.pins.keeps(name):
                 self.pins.keep(name)
             self._look_at(retired, now_s + self._interval_s(retired))
             return 0
         if self.closer.full:
-            self.ledger.condemn(retired, True)
+            self.ledger.mark_unopened(retired, True)
             self._look_at(retired, now_s + TICK_S)
             return 0
         return self._free(retired)
 
     def _free(self, retired: Retired) -> int:
-        """Remove a segment that nobody has; a large one's memory goes back in another thread."""
+        """Remove a segment that no process has; a large one's memory goes back in another thread."""
         resident = retired.resident
         name = retired_name(resident.name)
         fd = -1
@@ -276,24 +285,24 @@ class Reclaimer:
         return 0
 
     def collect(self) -> int:
-        """Count memory that the other thread has freed since the last time; returns its bytes."""
+        """Count memory that the other thread has freed since the last time; return its bytes."""
         nbytes = self.closer.closed()
         self.ledger.closed(nbytes)
         return nbytes
 
     def _interval_s(self, retired: Retired) -> float:
-        """When to look again at a segment that was found in use."""
+        """Return how long to wait with the next look at a segment that was found in use."""
         if self.pins.keeps(retired_name(retired.resident.name)):
             retired.interval_s = min(max(TICK_S, 2 * retired.interval_s), WATCHED_INTERVAL_S)
             return retired.interval_s
         return max(RETIRED_INTERVAL_S, SHARE_S * len(self.ledger.retired))
 
-    def hear(self, now_s: float) -> bool:
-        """Somebody closed something: have a look at it; whether anything may fit that did not."""
+    def on_closes(self, now_s: float) -> bool:
+        """Have segments looked at that processes have closed; whether anything may fit that did not."""
         names = self.pins.closed()
         if names is None:
             self.ledger.order.reconsider_all()
-            self._unheard = self.ledger.segments.walk()
+            self._to_check = Walk(self.ledger.segments.walk())
             return True
         changed = False
         for name in names:
@@ -301,7 +310,7 @@ class Reclaimer:
             resident = self.ledger.resident_named(name)
             if retired is not None:
                 retired.interval_s = 0.0
-                if not retired.condemned:
+                if not retired.unopened:
                     self._look_at(retired, now_s)
             elif resident is not None:
                 changed |= self.ledger.order.reconsider(resident)
@@ -310,7 +319,7 @@ class Reclaimer:
     # --- the end --------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Let go of every descriptor."""
+        """Close every descriptor."""
         self.closer.end()
         self.pins.close()
 

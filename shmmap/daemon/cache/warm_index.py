@@ -20,10 +20,10 @@ __all__ = ["Heights", "WarmIndex"]
 
 
 TABLES_BYTES: Final = 64 << 20
-"""A table takes 8 bytes for every cell of the map, as far as they are in memory; so much for all of them."""
+"""Of all tables; one takes 8 bytes for every cell of the map, as far as they are in memory."""
 LEAST_TABLES: Final = 4
 RETIRED_REMEMBERED: Final = 1 << 14
-"""Versions out of service; who holds an older one is told to drop it, as if the daemon had been restarted."""
+"""Versions out of service; a client that holds an older one has to drop it, as after a restart."""
 
 
 class Heights:
@@ -40,23 +40,23 @@ class Heights:
         self._known = sparse_zeros(cells, np.bool_)
 
     def learn(self, index: int, z_min: float, z_max: float) -> None:
-        """A cell was loaded."""
+        """Note the heights of a cell that was loaded."""
         self._z[index] = z_min, z_max
         self._known[index] = True
 
     def forget(self, indices: NDArray[np.intp]) -> None:
-        """Cells have changed."""
+        """Forget the heights of cells that have changed."""
         self._known[indices] = False
 
     def get(self, index: int) -> tuple[float, float] | None:
-        """Lowest and highest z of a cell; None where they are not known."""
+        """Return the lowest and highest z of a cell; None where they are not known."""
         if not self._known[index]:
             return None
         z_min, z_max = self._z[index].tolist()
         return z_min, z_max
 
     def overlapping(self, indices: list[int], z: tuple[float, float]) -> list[int]:
-        """Those cells of which it is not known that they lie outside a range."""
+        """Return the cells of which it is not known that they lie outside a range."""
         cells = np.array(indices, dtype=np.intp)
         z_min, z_max = self._z[cells].T
         outside = self._known[cells] & ((z_max < z[0]) | (z_min > z[1]))
@@ -66,7 +66,7 @@ class Heights:
 
 @dataclass(eq=False, slots=True)
 class WarmIndex:
-    """The same twice: to be looked up one by one, and a whole area at once.
+    """Two indices of the same segments: for single cells, and for a whole area at once.
 
     The latter takes a table as long as the map, which only the layers with the most segments have.
 
@@ -92,12 +92,12 @@ class WarmIndex:
         return self._count
 
     def get(self, index: int, layer: str) -> Resident | None:
-        """The segment of a cell, if it is warm."""
+        """Return the segment of a cell, if it is warm."""
         found = self.layers.get(layer)
         return found.get(index) if found is not None else None
 
     def versions(self, layer: str, cells: NDArray[np.intp]) -> list[int] | None:
-        """Versions of cells, by catalogue index: 0 where one is not in memory; None if none is."""
+        """Return the versions of cells by catalogue index: 0 where one is not in memory; None if none is."""
         table = self.tables.get(layer)
         if table is not None:
             return cast("list[int]", table[cells].tolist())
@@ -123,7 +123,7 @@ class WarmIndex:
         resident.stale_handle = encode_handle(msgspec.structs.replace(handle, stale=True))
 
     def enter(self, resident: Resident, index: int, cells: int) -> None:
-        """A segment has the current version of its cell, one of so many ``cells`` of the map."""
+        """Enter a segment with the current version of its cell; ``cells`` is how many the map has."""
         layer = resident.key.layer
         found = self.layers.get(layer)
         if found is None:
@@ -137,7 +137,7 @@ class WarmIndex:
             self._make_table(layer, cells)
 
     def _make_table(self, layer: str, cells: int) -> None:
-        """Make a layer's table if there is room, or a layer with a quarter of its segments has one."""
+        """Make a layer's table if there is room, or if a layer with a quarter of its segments has one."""
         found = self.layers[layer]
         if len(found).bit_count() != 1:
             return  # it is tried again when they have doubled
@@ -151,19 +151,19 @@ class WarmIndex:
             table[index] = resident.version
 
     def note_version(self, resident: Resident) -> None:
-        """What a segment's version is of."""
+        """Remember which cell and layer a segment's version is of."""
         self.of_version[resident.version] = resident.key
         self.retired.pop(resident.version, None)
 
     def note_retired(self, resident: Resident) -> None:
-        """A segment is out of service; what its version is of is forgotten some day."""
+        """Note that a segment is out of service: what its version is of is forgotten in time."""
         self.retired[resident.version] = None
         if len(self.retired) > RETIRED_REMEMBERED:
             oldest, _ = self.retired.popitem(last=False)
             self.of_version.pop(oldest, None)
 
     def leave(self, index: int, layer: str) -> None:
-        """The cell has another version now, or its segment is retired."""
+        """Remove a cell whose version is another now, or whose segment is retired."""
         found = self.layers.get(layer)
         if found is None or found.pop(index, None) is None:
             return

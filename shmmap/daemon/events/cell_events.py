@@ -1,26 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of cells: loads, evictions, failures, prefetch misses; and what was loaded again after eviction."""
+"""What happens to cells, reported: as events, log lines, counters, and rows of the statistics.
+
+Nothing is reported while a client waits for the loop: `CellEvents.emit` keeps it, `CellEvents.flush` reports.
+"""
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
-from typing import Final
+from typing import Any, Final
 
-from shmmap.daemon.events.log import EventLog, MinuteLog, PressureEvents
+from shmmap.daemon.events.log import EventLog, MinuteLog
 from shmmap.daemon.records import SPACE_CODES, Failure, Key, Resident
 from shmmap.daemon.transport.sessions import Session
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.protocol import events
+from shmmap.protocol.rows import CellRow, CellState
 from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["CellEvents", "EvictionHistory", "PrefetchMisses"]
+__all__ = ["CellEvents", "EvictionHistory", "PrefetchMisses", "PressureEvents"]
 
 MAX_EVICTED: Final = 1 << 14
 """Segments evicted to make room that are remembered."""
+PRESSURE_S: Final = 1.0
+LOG_S: Final = 60.0
+_SETTINGS: Final = {
+    "over_budget": "budget (--budget): raise it, or have clients hold less",
+    "quota": "session_quota (--session-quota): raise it, or have this client hold less",
+    "no_space": "shm_dir (--shm-dir): its file system is full, or smaller than the budget",
+}
+"""What an operator can change, by the code of a refusal."""
+
+
+class PressureEvents:
+    """Cells refused for lack of memory: an event a second and a log line a minute, however many there are.
+
+    Parameters
+    ----------
+    memory
+        Gives budget, used, pinned and zombie bytes.
+    holder
+        Describes the session that holds most of the memory.
+    """
+
+    def __init__(
+        self,
+        event_log: EventLog,
+        memory: Callable[[], tuple[int, int, int, int]],
+        holder: Callable[[], str] = str,
+    ) -> None:
+        self._event_log = event_log
+        self._memory = memory
+        self._holder = holder
+        self._refused = 0
+        self._unlogged = 0
+        self._last: tuple[str, str, str] = ("", "", "")
+        self._published_s = self._logged_s = float("-inf")
+
+    def refused(self, cell_id: str, layer: str, code: str, now_s: float) -> None:
+        """Note that a cell was refused."""
+        self._refused += 1
+        self._unlogged += 1
+        self._last = (cell_id, layer, code)
+        self.step(now_s)
+
+    def step(self, now_s: float) -> None:
+        """Publish and log what has not been, if the last time is long enough ago."""
+        if self._refused and now_s - self._published_s >= PRESSURE_S:
+            self._event_log.publish(events.Pressure, *self._last, self._refused, *self._memory())
+            self._refused, self._published_s = 0, now_s
+        if self._unlogged and now_s - self._logged_s >= LOG_S:
+            cell, layer, code = self._last
+            budget, used, pinned, _ = self._memory()
+            log.warning(
+                "cells refused for lack of memory",
+                count=self._unlogged,
+                code=code,
+                last=cell,
+                layer=layer,
+                budget_bytes=budget,
+                used_bytes=used,
+                in_use_bytes=pinned,
+                most_is_held_by=self._holder() or None,
+                setting=_SETTINGS.get(code),
+            )
+            self._unlogged, self._logged_s = 0, now_s
 
 
 class EvictionHistory:
@@ -53,7 +120,7 @@ MAX_EVENTS_PER_TURN: Final = 16
 """Clients looked at in one turn: many of them must not drive all else out of the log."""
 MAX_MISSED_CELLS: Final = 1 << 12
 MAX_WAITING_CLIENTS: Final = 1 << 8
-"""Cells that are remembered as waited for, and clients that wait for one."""
+"""Cells that clients wait for, and clients that wait for one of them, that are remembered."""
 
 
 @dataclass(eq=False, slots=True)
@@ -127,65 +194,119 @@ class PrefetchMisses:
                 del self._waited[slot]
 
 
-@dataclass(eq=False, slots=True)
 class CellEvents:
-    """Publishes what happens to cells, and counts it.
+    """Reports what happens to cells.
 
     Parameters
     ----------
-    wire_id
-        Makes of a cell id what replies and events carry.
     pressure
-        Events of cells that were refused for lack of memory.
+        Reports cells that were refused for lack of memory.
+    id_prefix, segment_prefix
+        What cell ids and segment names are shown without.
+
+    Attributes
+    ----------
+    minutes : MinuteLog
+        Log lines about what happens often.
     """
 
-    event_log: EventLog
-    statistics: StatisticsWriter
-    wire_id: Callable[[str], str]
-    pressure: PressureEvents
-    prefetch_misses: PrefetchMisses = field(init=False)
-    minutes: MinuteLog = field(default_factory=MinuteLog)
-    _history: EvictionHistory = field(default_factory=EvictionHistory)
+    def __init__(
+        self,
+        event_log: EventLog,
+        statistics: StatisticsWriter,
+        pressure: PressureEvents,
+        *,
+        id_prefix: str,
+        segment_prefix: str,
+    ) -> None:
+        self._log = event_log
+        self._statistics = statistics
+        self._pressure = pressure
+        self._id_prefix, self._segment_prefix = id_prefix, segment_prefix
+        self.minutes = MinuteLog()
+        self._misses = PrefetchMisses(event_log)
+        self._history = EvictionHistory()
+        self._pending: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
 
-    def __post_init__(self) -> None:
-        self.prefetch_misses = PrefetchMisses(self.event_log)
+    # --- after clients have been answered -----------------------------------------------------------
+
+    def emit(self, report: Callable[..., None], *what: Any) -> None:
+        """Have something reported once no client waits for the loop, in order; see `flush`."""
+        self._pending.append((report, what))
+
+    @property
+    def pending(self) -> bool:
+        """Whether something is still to be reported."""
+        return bool(self._pending)
+
+    def flush_one(self) -> None:
+        """Report the first thing that is pending, if there is one."""
+        if self._pending:
+            report, what = self._pending.popleft()
+            report(*what)
+
+    def flush(self) -> None:
+        """Report all that is pending."""
+        while self._pending:
+            self.flush_one()
+
+    def step(self, now_s: float) -> None:
+        """Publish and log what is reported now and then; a few times a second."""
+        self._pressure.step(now_s)
+        self.minutes.step(now_s)
+        self._misses.turn(now_s)
+
+    # --- what happens -------------------------------------------------------------------------------
+
+    def _id(self, cell_id: str) -> str:
+        """Return a cell id as replies and events carry it."""
+        return cell_id.removeprefix(self._id_prefix)
 
     def loaded(self, resident: Resident, took_ns: int, replaces: int, cached: bool, ahead: bool) -> None:
-        """A segment was loaded and published; ``took_ns`` from handing the load to a worker.
+        """Report that a segment was loaded and published; ``took_ns`` from handing the load to a worker.
 
-        ``cached`` says that it came out of the disk cache, ``ahead`` that nobody had asked for it yet.
+        ``cached`` says that it came out of the disk cache, ``ahead`` that no client had asked for it yet.
         """
         again = self._publish_loaded(resident, resident.load_ns, replaces, ahead)
-        self.prefetch_misses.arrived(self.wire_id(resident.key.cell_id), resident.key.layer)
+        self._misses.arrived(self._id(resident.key.cell_id), resident.key.layer)
         points = resident.key.layer == LAYER
         source = "load_cached" if cached else "load_points" if points else "load_computed"
-        self.statistics.add_duration(source, resident.load_ns)
-        self.statistics.add("loads_from_cache", cached)
-        self.statistics.add("layers_computed", source == "load_computed")
-        self.statistics.add("loads_finished")
-        self.statistics.add("bytes_loaded", resident.nbytes)
-        self.statistics.add("loads_after_eviction", again)
-        self.statistics.add_duration("load", took_ns)
+        statistics = self._statistics
+        statistics.add_duration(source, resident.load_ns)
+        statistics.add("loads_from_cache", cached)
+        statistics.add("layers_computed", source == "load_computed")
+        statistics.add("loads_finished")
+        statistics.add("bytes_loaded", resident.nbytes)
+        statistics.add("loads_after_eviction", again)
+        statistics.add_duration("load", took_ns)
 
     def revived(self, resident: Resident) -> None:
-        """A retired segment is in service again, without a load."""
+        """Report that a retired segment is in service again, without a load."""
         self._publish_loaded(resident, 0, 0, ahead=False)
 
     def _publish_loaded(self, resident: Resident, load_ns: int, replaces: int, ahead: bool) -> bool:
         """Publish that a segment is in service; return whether it had been evicted to make room."""
         again = self._history.loaded(resident.key, resident.version)
-        self.event_log.publish(
-            events.Loaded, self.wire_id(resident.key.cell_id), resident.key.layer, resident.version,
-            resident.nbytes, resident.points, load_ns, again, replaces, ahead,
-        )  # fmt: skip
+        self._log.publish(
+            events.Loaded,
+            self._id(resident.key.cell_id),
+            resident.key.layer,
+            resident.version,
+            resident.nbytes,
+            resident.points,
+            load_ns,
+            again,
+            replaces,
+            ahead,
+        )
         return again
 
     def changed(self, cell_id: str, version: int) -> None:
-        """A load found that a cell's file is not the one the catalogue knows."""
-        self.event_log.publish(events.Changed, self.wire_id(cell_id), version, "changed")
+        """Report that a load found a cell's file in another state than the catalogue knows."""
+        self._log.publish(events.Changed, self._id(cell_id), version, "changed")
 
     def retired(self, resident: Resident, why: str) -> None:
-        """A segment left service; of superseded ones their successor's event tells."""
+        """Report that a segment left service; of a superseded one its successor's event is enough."""
         if why == "room":
             self._history.evicted(resident.key, resident.version)
         if why != "superseded":
@@ -193,21 +314,59 @@ class CellEvents:
             reason = "budget" if why == "room" else why
             log.debug("evicted", cell=cell, layer=layer, bytes=resident.nbytes, reason=reason)
             self.minutes.count("cells evicted", reason, resident.nbytes)
-            self.event_log.publish(
-                events.Evicted, self.wire_id(cell), layer, resident.version, resident.nbytes, why
-            )
+            self._log.publish(events.Evicted, self._id(cell), layer, resident.version, resident.nbytes, why)
 
     def failed(self, key: Key, failure: Failure, now_s: float) -> None:
-        """A load ended without a segment."""
-        wire_id = self.wire_id(key.cell_id)
+        """Report that a load ended without a segment."""
         if failure.code in SPACE_CODES:
-            self.pressure.refused(wire_id, key.layer, failure.code, now_s)
+            self._pressure.refused(self._id(key.cell_id), key.layer, failure.code, now_s)
         else:
-            self.event_log.publish(
-                events.Failed, wire_id, key.layer, failure.code, failure.message, failure.delay_s
+            self._log.publish(
+                events.Failed,
+                self._id(key.cell_id),
+                key.layer,
+                failure.code,
+                failure.message,
+                failure.delay_s,
             )
 
     def retried(self, key: Key, failure: Failure) -> None:
-        """A cell that failed is about to be loaded again."""
+        """Report that a cell that failed is about to be loaded again."""
         if failure.code not in SPACE_CODES:
-            self.event_log.publish(events.Retried, self.wire_id(key.cell_id), key.layer, failure.code)
+            self._log.publish(events.Retried, self._id(key.cell_id), key.layer, failure.code)
+
+    def refused_by_quota(self, key: Key, now_s: float) -> None:
+        """Count and report a cell that would exceed its session's quota."""
+        self._statistics.add("refused_quota")
+        self._pressure.refused(self._id(key.cell_id), key.layer, "quota", now_s)
+
+    def prefetch_missed(self, session: Session, key: Key) -> None:
+        """Count and report that a moving client has to wait for a cell, unless it waits already."""
+        self._statistics.add("prefetch_misses", self._misses.note(session, self._id(key.cell_id), key.layer))
+
+    # --- rows of the statistics ---------------------------------------------------------------------
+
+    def show(self, resident: Resident, state: CellState) -> None:
+        """Show a segment as it is now."""
+        self._statistics.cell_changed(resident.name, self.row(resident, state))
+
+    def row(self, resident: Resident, state: CellState) -> CellRow:
+        """Return the row of a segment."""
+        return CellRow(
+            self._id(resident.key.cell_id),
+            resident.key.layer,
+            resident.version,
+            resident.name.removeprefix(self._segment_prefix),
+            state,
+            resident.nbytes,
+            resident.points,
+            resident.box,
+            resident.hits,
+            int(resident.last_use_s * 1e9),
+            resident.load_ns,
+            ahead=resident.prefetched and state == "resident",
+        )
+
+    def hide(self, name: str) -> None:
+        """Remove the row of a segment that is no more."""
+        self._statistics.cell_removed(name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps as events and in the statistics: what changed since the last look."""
+"""What happens to live maps, as events and in the statistics: what changed since the last look."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ _CHUNK: Final = re.compile(r"chunk -?\d+_-?\d+_-?\d+")
 
 @dataclass(eq=False, slots=True)
 class LiveEvents:
-    """Hears how live maps are, and of the process that keeps them, and tells of it.
+    """Reports how live maps are, and the process that keeps them.
 
-    Until `begin` nothing is an event: the first one tells of the daemon's start.
+    Until `begin` nothing is an event: the first one is that of the daemon's start.
     """
 
     event_log: EventLog
     statistics: StatisticsWriter
     _rows: dict[str, LiveMapRow] = field(default_factory=dict)
-    _told: dict[str, LiveMapRow] = field(default_factory=dict)
+    _published: dict[str, LiveMapRow] = field(default_factory=dict)
     _adopted: int = 0
     _begun: bool = False
 
     def begin(self, maps: int) -> None:
-        """Tell events from now on, beginning with how things are with so many maps."""
+        """Publish events from now on, beginning with how things are with these ``maps`` (their number)."""
         self._begun = True
         self.started(maps, self._adopted)
-        self._tell()
+        self._publish_changes()
 
     def started(self, maps: int, adopted: int) -> None:
-        """The process serves so many maps, of which so many chunks were in memory."""
+        """Report that the process serves ``maps``, of which ``adopted`` chunks were in memory (numbers)."""
         self._adopted = adopted
         if self._begun:
             self.event_log.publish(events.LiveStarted, maps, adopted)
 
     def ended(self, restarts: int) -> None:
-        """The process ended, for the ``restarts``-th time."""
+        """Report that the process ended, for the ``restarts``-th time."""
         self.statistics.set("live_restarts", restarts)
         if self._begun:
             self.event_log.publish(events.LiveEnded, restarts)
@@ -55,16 +55,16 @@ class LiveEvents:
         self.statistics.beat()
 
     def told(self, rows: Sequence[LiveMapRow]) -> None:
-        """This is how the maps are now."""
+        """Report how the maps are now."""
         self._rows = {row.name: row for row in rows}
         self.statistics.show_live_maps(rows)
         if self._begun:
-            self._tell()
+            self._publish_changes()
 
-    def _tell(self) -> None:
-        """Tell what is different from what was told last."""
+    def _publish_changes(self) -> None:
+        """Publish what is different from what was published last."""
         for name, row in self._rows.items():
-            before = self._told.get(name)
+            before = self._published.get(name)
             known = before.damaged if before is not None else ()
             for what in row.damaged:
                 if what not in known:
@@ -73,9 +73,9 @@ class LiveEvents:
                 self.event_log.publish(events.LiveProblem, name, row.problem)
             if before is not None and row.change != before.change:
                 self.event_log.mention(events.LiveChanged, name, row.change)
-        self._told = self._rows
+        self._published = self._rows
 
 
 def _cause(problem: str) -> str:
-    """What is wrong, whichever chunk met it first."""
+    """Return what is wrong, whichever chunk met it first."""
     return _CHUNK.sub("chunk", problem)

@@ -1,42 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happened in this life of the daemon, numbered; the last of it is remembered.
+"""What happened in this run of the daemon, numbered; the last of it is remembered, and sent to subscribers.
 
-Publishing costs some microseconds whoever listens: the log neither waits nor knows for whom.
+Events leave by an XPUB socket beside that of requests.  A subscriber that does not keep up loses events and
+notices by their numbers; the log waits for none of them.
 """
 
 from __future__ import annotations
 
 import itertools
+import socket
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 import msgspec
 
+from shmmap.daemon.transport.connection import Connection, Connections, Listener
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.protocol.events import EventPage, Recent, encode_event
+from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["EventLog", "MinuteLog", "PressureEvents", "nowhere"]
+__all__ = ["EventLog", "EventPublisher", "MinuteLog", "events_path"]
 
 REMEMBERED: Final = 4096
-"""Events kept for who asks later: under a megabyte."""
+"""Events kept for later questions: under a megabyte."""
 PAGE_EVENTS: Final = 500
-PRESSURE_S: Final = 1.0
 LOG_S: Final = 60.0
+MAX_UNREAD_BYTES: Final = 1 << 20
+"""Of events kept for a subscriber that does not read; it loses further ones."""
+MAX_SUBSCRIPTION_BYTES: Final = 64
 _NAMED: Final = 3
-_SETTINGS: Final = {
-    "over_budget": "budget (--budget): raise it, or have clients hold less",
-    "quota": "session_quota (--session-quota): raise it, or have this client hold less",
-    "no_space": "shm_dir (--shm-dir): its file system is full, or smaller than the budget",
-}
-"""What an operator can change, by the code of a refusal."""
+_SUBSCRIBE: Final = b"\x01"  # and a prefix
 
 
-def nowhere(data: bytes) -> None:
-    """Take an event's bytes when nobody can listen."""
-    del data
+class Subscriber(Protocol):
+    """A receiver of all events."""
+
+    def offer(self, body: bytes, max_unread_bytes: int, /) -> None:
+        """Send a message, unless that much is unread already."""
 
 
 class EventLog:
@@ -45,24 +49,35 @@ class EventLog:
     Parameters
     ----------
     epoch
-        This life of the daemon.
+        This run of the daemon.
     clock_ns
         Wall clock, nanoseconds.
 
     Attributes
     ----------
-    send : callable
-        Given each event's bytes.
     last : int
         Number of the last event, 0 before the first.
     """
 
     def __init__(self, epoch: int, *, clock_ns: Callable[[], int] = time.time_ns) -> None:
         self.epoch = epoch
-        self.send: Callable[[bytes], None] = nowhere
         self.last = 0
         self._clock_ns = clock_ns
         self._kept: deque[tuple[int, bytes]] = deque(maxlen=REMEMBERED)  # (unix_ns, event)
+        self._subscribers: dict[Subscriber, None] = {}
+
+    def subscribe(self, subscriber: Subscriber) -> None:
+        """Send all events to a subscriber from now on; first it is sent the number of the last event."""
+        self._subscribers[subscriber] = None
+        subscriber.offer(self._event(events.Beat), MAX_UNREAD_BYTES)
+
+    def unsubscribe(self, subscriber: Subscriber) -> None:
+        """Send no more events to a subscriber."""
+        self._subscribers.pop(subscriber, None)
+
+    def close(self) -> None:
+        """Send no more events."""
+        self._subscribers.clear()
 
     def publish(self, kind: Callable[..., events.Event], *fields: object) -> None:
         """Number, remember and send an event made of ``kind`` and its own fields."""
@@ -70,22 +85,25 @@ class EventLog:
         now_ns = self._clock_ns()
         data = encode_event(kind(self.last, self.epoch, now_ns, *fields))
         self._kept.append((now_ns, data))
-        self.send(data)
+        self._send(data)
 
     def mention(self, kind: Callable[..., events.Event], *fields: object) -> None:
-        """Send an event that takes no number to those who listen now."""
-        self.send(encode_event(kind(self.last, self.epoch, self._clock_ns(), *fields)))
-
-    def standing(self) -> bytes:
-        """Return the number of the last event, as an event."""
-        return encode_event(events.Beat(self.last, self.epoch, self._clock_ns()))
+        """Send an event that takes no number and is not remembered."""
+        self._send(self._event(kind, *fields))
 
     def beat(self) -> None:
         """Send the number of the last event."""
         self.mention(events.Beat)
 
+    def _event(self, kind: Callable[..., events.Event], *fields: object) -> bytes:
+        return encode_event(kind(self.last, self.epoch, self._clock_ns(), *fields))
+
+    def _send(self, data: bytes) -> None:
+        for one in self._subscribers:
+            one.offer(data, MAX_UNREAD_BYTES)
+
     def page(self, message: Recent) -> EventPage:
-        """Answer who asks for events again."""
+        """Answer a request for past events."""
         first = self.last - len(self._kept) + 1
         skip = min(max(0, message.after + 1 - first), len(self._kept))
         limit = max(0, min(message.limit, PAGE_EVENTS))
@@ -96,8 +114,45 @@ class EventLog:
         )
 
 
+def events_path(request_path: str) -> str:
+    """Return where the events of the daemon at this request socket are."""
+    return request_path.removesuffix(".sock") + ".events.sock"
+
+
+class EventPublisher:
+    """The socket of the event log: a client subscribes to all events, or to none.
+
+    Parameters
+    ----------
+    listening
+        A socket that listens.
+    """
+
+    def __init__(
+        self,
+        listening: socket.socket,
+        watched: WatchedDescriptors,
+        connections: Connections,
+        statistics: StatisticsWriter,
+        event_log: EventLog,
+    ) -> None:
+        self._log = event_log
+        self.listener = Listener(
+            listening, watched, connections, statistics, b"XPUB", b"SUB", MAX_SUBSCRIPTION_BYTES,
+            self._on_message, event_log.unsubscribe,
+        )  # fmt: skip
+
+    def _on_message(self, connection: Connection, body: bytes, several: bool) -> None:
+        if several or body not in (_SUBSCRIBE, b"\x00"):
+            connection.cut("it subscribed to some of the events: only all can be subscribed to")
+        elif body == _SUBSCRIBE:
+            self._log.subscribe(connection)
+        else:
+            self._log.unsubscribe(connection)
+
+
 class MinuteLog:
-    """Log lines about what happens often: the first at once, then one a minute with the sum."""
+    """Log lines about frequent things: the first at once, then one a minute with the sum."""
 
     def __init__(self) -> None:
         self._counts: dict[str, Counter[str]] = {}
@@ -117,52 +172,3 @@ class MinuteLog:
             more = f" and {len(of) - _NAMED} more" if len(of) > _NAMED else ""
             log.info(event, count=of.total(), bytes=self._bytes.pop(event), of=most + more)
             self._due_s[event] = now_s + LOG_S
-
-
-class PressureEvents:
-    """Cells refused for lack of memory: an event a second and a log line a minute, however many there are.
-
-    Parameters
-    ----------
-    memory
-        Gives budget, used, pinned and zombie bytes.
-    holder
-        Says who has most of the memory.
-    """
-
-    def __init__(
-        self,
-        event_log: EventLog,
-        memory: Callable[[], tuple[int, int, int, int]],
-        holder: Callable[[], str] = str,
-    ) -> None:
-        self._event_log = event_log
-        self._memory = memory
-        self._holder = holder
-        self._refused = 0
-        self._unlogged = 0
-        self._last: tuple[str, str, str] = ("", "", "")
-        self._told_s = self._logged_s = float("-inf")
-
-    def refused(self, cell_id: str, layer: str, code: str, now_s: float) -> None:
-        """Note that a cell was refused."""
-        self._refused += 1
-        self._unlogged += 1
-        self._last = (cell_id, layer, code)
-        self.step(now_s)
-
-    def step(self, now_s: float) -> None:
-        """Publish and log what has not been, if the last time is long enough ago."""
-        if self._refused and now_s - self._told_s >= PRESSURE_S:
-            self._event_log.publish(events.Pressure, *self._last, self._refused, *self._memory())
-            self._refused, self._told_s = 0, now_s
-        if self._unlogged and now_s - self._logged_s >= LOG_S:
-            cell, layer, code = self._last
-            budget, used, pinned, _ = self._memory()
-            log.warning(
-                "cells refused for lack of memory", count=self._unlogged, code=code, last=cell, layer=layer,
-                budget_bytes=budget, used_bytes=used, in_use_bytes=pinned,
-                most_is_held_by=self._holder() or None,
-                setting=_SETTINGS.get(code),
-            )  # fmt: skip
-            self._unlogged, self._logged_s = 0, now_s

@@ -35,7 +35,7 @@ from shmmap.logfmt import log
 from shmmap.segment.directory import measured_bytes
 from shmmap.segment.header import read_header
 from shmmap.segment.layout import SegmentHeader
-from shmmap.segment.names import another_name, is_retired, retired_name, segment_prefix, statistics_name
+from shmmap.segment.names import is_retired, retired_name, segment_prefix, statistics_name
 
 __all__ = ["Adoption"]
 
@@ -62,8 +62,8 @@ class Adoption:
     def take_over(self, now_s: float) -> None:
         """Look at every name once."""
         counts = dict.fromkeys(("taken_over", "set_aside", "still_in_use", "dropped"), 0)
-        instance = self.cache.instance
-        for name in self.cache.directory.names(segment_prefix(instance)):
+        directory, instance = self.cache.directory, self.cache.instance
+        for name in directory.names(segment_prefix(instance)):
             if name != statistics_name(instance):
                 counts[self._take(name, now_s)] += 1
         step("daemon.adopted")
@@ -81,11 +81,12 @@ class Adoption:
         self._judge(list(self._deferred), now_s)
 
     def _judge(self, names: Iterable[str], now_s: float) -> None:
+        ledger = self.cache.ledger
         for name in names:
             area, nbytes = self._deferred[name]
             if not self._wait_for_page(name, area):
                 del self._deferred[name]
-                self.cache.ledger.aside_bytes -= nbytes
+                ledger.set_aside_bytes -= nbytes
                 self._take(name, now_s)
 
     def close(self, *, keep: bool) -> None:
@@ -96,7 +97,7 @@ class Adoption:
 
     def _absent_page(self, area: Box) -> int | None:
         """Return a page of an area that is not here; None if all are."""
-        pages = self.cache.catalogue.pages
+        pages = self.cache.pages
         if pages is None:
             return None
         return next((page for page in pages.of_area(area) if not pages.is_here(page)), None)
@@ -110,25 +111,28 @@ class Adoption:
 
     def _may_become_known(self, resident: Resident) -> Box | None:
         """Return the area by which a segment is judged, if pages of it are absent; else None."""
-        if self.cache.catalogue.complete or is_retired(resident.name):
+        catalogue, layers = self.cache.catalogue, self.cache.layers
+        if catalogue.complete or is_retired(resident.name):
             return None
         min_x, min_y, max_x, max_y = resident.box
-        halo_m = self.cache.layers.halo_m((resident.key.layer,))
+        halo_m = layers.halo_m((resident.key.layer,))
         area = Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
         return area if self._absent_page(area) is not None else None
 
     def _defer(self, name: str, area: Box, nbytes: int) -> None:
+        ledger = self.cache.ledger
         self._deferred[name] = area, nbytes
-        self.cache.ledger.aside_bytes += nbytes
+        ledger.set_aside_bytes += nbytes
         self._wait_for_page(name, area)
-        pages = self.cache.catalogue.pages
+        pages = self.cache.pages
         if pages is not None:
             pages.want(pages.of_area(area), ADOPTED)
 
     def _take(self, name: str, now_s: float) -> str:
         """Decide about a name; returns what became of it."""
+        directory = self.cache.directory
         try:
-            fd = self.cache.directory.open(name)
+            fd = directory.open(name)
         except OSError as error:
             self._remove(name, str(error.strerror))
             return "dropped"
@@ -141,7 +145,8 @@ class Adoption:
                 self._defer(name, area, resident.nbytes)
                 return "set_aside"
             if self._is_used(fd):
-                self._keep_for_readers(name, resident, now_s)
+                reclaimer = self.cache.reclaimer
+                reclaimer.adopt(resident, now_s, hidden=is_retired(name))
                 return "still_in_use"
             self._remove(name, why_not)
             return "dropped"
@@ -171,7 +176,7 @@ class Adoption:
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, resident: Resident) -> str:
         """Return why a whole segment cannot be served; empty if it can."""
-        cache, catalogue = self.cache, self.cache.catalogue
+        catalogue, ledger, layers = self.cache.catalogue, self.cache.ledger, self.cache.layers
         if is_retired(name):
             return "it was retired"
         if status.st_mode & 0o222 or status.st_nlink != 1:
@@ -185,13 +190,13 @@ class Adoption:
         index = catalogue.find(header.cell_id)
         if index is None:
             return NOT_IN_MAP
-        if resident.key in cache.ledger.by_key:
+        if resident.key in ledger.by_key:
             return "there is another one"
-        if resident.version != cache.layers.version(index, header.layer):
+        if resident.version != layers.version(index, header.layer):
             return CHANGED
         if header.frame_id != catalogue.frame_id:
             return "it is in another frame"
-        if cache.ledger.shortage(status.st_blocks * 512) > 0:
+        if ledger.shortage(status.st_blocks * 512) > 0:
             return "it does not fit in the budget"
         return ""
 
@@ -210,24 +215,16 @@ class Adoption:
         self.loads.check(resident)
 
     def _is_used(self, fd: int) -> bool:
+        reclaimer = self.cache.reclaimer
         try:
-            return os.fstat(fd).st_uid == os.geteuid() and self.cache.reclaimer.pins.is_used_elsewhere(fd)
+            return os.fstat(fd).st_uid == os.geteuid() and reclaimer.pins.is_used_elsewhere(fd)
         except OSError:  # nothing that has leases
             return False
 
-    def _keep_for_readers(self, name: str, resident: Resident, now_s: float) -> None:
-        """Watch a segment in use as a retired one."""
-        if not is_retired(name):
-            try:
-                self.cache.directory.rename(name, retired_name(name))
-            except OSError:  # another process has taken that name
-                resident.name = another_name(name)
-                self.cache.directory.rename(name, retired_name(resident.name))
-        self.cache.reclaimer.adopt(resident, now_s)
-
     def _remove(self, name: str, why: str) -> None:
+        directory = self.cache.directory
         try:
-            self.cache.directory.unlink(name)
+            directory.unlink(name)
         except OSError as error:
             # in a sticky directory only a file's owner may remove it; a directory is no segment
             report = log.info if error.errno == errno.EISDIR else log.warning

@@ -56,7 +56,8 @@ class Prefetcher:
         self, cache: CellCache, loads: Loads, pool: WorkerPool, *, share: float, outage_tolerance_s: float
     ) -> None:
         self._cache, self._loads, self._pool = cache, loads, pool
-        self._sessions = cache.reclaimer.sessions
+        self._sessions, self._ledger, self._evictor = cache.sessions, cache.ledger, cache.evictor
+        self._layers, self._events, self._statistics = cache.layers, cache.events, cache.statistics
         self.cold: deque[tuple[Session, Key]] = deque(maxlen=MAX_COLD)
         self.ended: deque[tuple[Load, bool, float, bool]] = deque(maxlen=MAX_ENDED)
         self.share, self.outage_tolerance_s = share, outage_tolerance_s
@@ -69,16 +70,24 @@ class Prefetcher:
         self._running: dict[Load, int] = {}
         self._no_room = False
 
+    @property
+    def budget_bytes(self) -> float:
+        """Memory that prefetched cells may take until a client asks for them."""
+        return self.share * self._ledger.budget_bytes
+
+    def note_cold(self, session: Session, key: Key) -> None:
+        """Note that a client is the first to ask for a cell, and that it is not in memory."""
+        load = self._loads.by_key.get(key)
+        if load is None or load.prefetch:
+            self.cold.append((session, key))
+            self._statistics.add("prefetch_overtaken", load is not None and load.running)
+
     def restart(self) -> None:
         """Look along all paths from the start: what is known of the map or its origin has changed."""
         self.prefetch.restart()
         self._next_s = -math.inf
 
     # --- clients ----------------------------------------------------------------------------------
-
-    def note_cold(self, session: Session, key: Key) -> None:
-        """Note a cell that a client asked for and that was not fetched ahead."""
-        self.cold.append((session, key))
 
     def _follow(self, session: Session) -> None:
         """Follow a client that has moved, asked for another area, or gone."""
@@ -90,17 +99,13 @@ class Prefetcher:
 
     def _count_misses(self) -> None:
         """Count prefetch misses: cells that moving clients wait for; the first request and jumps are none."""
-        cache = self._cache
         for _ in range(min(MISSES_PER_TURN, len(self.cold))):
             session, key = self.cold[0]
             if session in self._sessions.moved:
                 break  # first where it is
             self.cold.popleft()
             if session.motion.travelled_m > 0.0:
-                cell_id = cache.wire_id(key.cell_id)
-                cache.statistics.add(
-                    "prefetch_misses", cache.events.prefetch_misses.note(session, cell_id, key.layer)
-                )
+                self._events.prefetch_missed(session, key)
 
     # --- a background task of the serving loop ----------------------------------------------------
 
@@ -149,14 +154,14 @@ class Prefetcher:
             # the last ones wait for demands, until a load ends or a client comes nearer
             self._next_s = now_s + wish.needed_in_s - URGENT_S
             return
-        key, nbytes = Key(cache.catalogue.id(wish.cell), wish.layer), cache.estimate(wish.cell, wish.layer)
-        taken = cache.ledger.prefetched_bytes + sum(self._running.values())
-        self._no_room = taken + nbytes > self.share * cache.ledger.budget_bytes
+        key, nbytes = cache.key(wish.cell, wish.layer), cache.estimate(wish.cell, wish.layer)
+        taken = self._ledger.prefetched_bytes + sum(self._running.values())
+        self._no_room = taken + nbytes > self.budget_bytes
         if self._no_room:
-            shortage = int(taken + nbytes - self.share * cache.ledger.budget_bytes)
+            shortage = int(taken + nbytes - self.budget_bytes)
             self._next_s = now_s if self._swap(key, wish.cell, nbytes, shortage) else math.inf
         else:
-            computed = cache.layers.is_computed(wish.cell, wish.layer)
+            computed = self._layers.is_computed(wish.cell, wish.layer)
             self._loads.prefetch(key, nbytes, wish.needed_in_s, computed=computed)
             self._next_s = now_s
 
@@ -164,9 +169,7 @@ class Prefetcher:
         """Give up what was fetched ahead and is needed later, for a wish that their share has no room for."""
         if self._now_s < self._swapped_s + SWAP_S:
             return False  # the next move of a client asks again
-        swapped = self._cache.evictor.give_up_prefetched(
-            shortage, self._now_s, self._wished(key, index, nbytes)
-        )
+        swapped = self._evictor.give_up_prefetched(shortage, self._now_s, self._wished(key, index, nbytes))
         if not swapped:
             self._swapped_s = self._now_s
         return swapped
@@ -178,11 +181,11 @@ class Prefetcher:
 
     def _is_absent(self, index: int, layer: str) -> bool:
         """Whether a cell could be fetched ahead; one that is larger than the share never can."""
-        key = Key(self._cache.catalogue.id(index), layer)
+        key = self._cache.key(index, layer)
         if self._cache.find_warm(index, layer, self._now_s) is not None or key in self._loads.by_key:
             return False
         failure = self._loads.failures.get(key)
-        may_fit = self._cache.estimate(index, layer) <= self.share * self._cache.ledger.budget_bytes
+        may_fit = self._cache.estimate(index, layer) <= self.budget_bytes
         return may_fit and (failure is None or self._now_s >= failure.retry_at_s)
 
     # --- loads ------------------------------------------------------------------------------------
@@ -192,7 +195,7 @@ class Prefetcher:
         index = self._cache.index_of(load.key.cell_id)
         if index is not None:
             wished = self._wished(load.key, index, load.estimate)
-            if self._cache.evictor.free(shortage, now_s, rather_than=wished):
+            if self._evictor.free(shortage, now_s, rather_than=wished):
                 return True
         self.full(now_s)
         return False
@@ -207,7 +210,7 @@ class Prefetcher:
 
     def started(self, load: Load) -> None:
         """Note that a loader has a wish."""
-        self._cache.statistics.add("prefetch_started", load not in self._running)
+        self._statistics.add("prefetch_started", load not in self._running)
         self._running[load] = load.estimate
 
     def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
@@ -230,7 +233,6 @@ class Prefetcher:
 
     def shortage(self, now_s: float) -> int:
         """Return what keeps cells from being fetched: 0 nothing, 1 their share is full, 2 the budget is."""
-        ledger = self._cache.ledger
-        if ledger.prefetched_bytes + sum(self._running.values()) >= self.share * ledger.budget_bytes:
+        if self._ledger.prefetched_bytes + sum(self._running.values()) >= self.budget_bytes:
             return 1 if self.share else 0
         return 2 if now_s < self._full_until_s else 0

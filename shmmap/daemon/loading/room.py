@@ -3,16 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.evictor import Evictor
+from shmmap.daemon.cache.ledger import Ledger
+from shmmap.daemon.cache.lost_segments import LostSegments
+from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load, Resident
+from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.quantities import format_bytes
 
 __all__ = ["Room"]
@@ -25,9 +29,12 @@ AGAIN_S: Final = 0.05
 
 @dataclass(eq=False, slots=True)
 class Room:
-    """Asks the cache for room on behalf of loads."""
+    """Has room made for loads, and tries again what was refused when memory may be free."""
 
-    cache: CellCache
+    ledger: Ledger
+    evictor: Evictor
+    reclaimer: Reclaimer
+    lost: LostSegments
     loads: Loads
     pool: WorkerPool
     prefetcher: Prefetcher
@@ -36,41 +43,51 @@ class Room:
     _waited_at: tuple[int, ...] = ()
     _waited_until_s: float = 0.0
 
+    def watch(self, watched: WatchedDescriptors, clock: Callable[[], float]) -> None:
+        """Be called when the kernel reports what may free memory."""
+        for fd, call in (
+            (self.reclaimer.closer.fd, self.on_freed),
+            (self.reclaimer.pins.fd, lambda: self.on_closes(clock())),
+            (self.lost.fd, lambda: self.on_names_vanished(clock())),
+        ):
+            if fd >= 0:
+                watched.watch(fd, call, "memory")
+
     def on_closes(self, now_s: float) -> None:
-        """Handle the kernel's report that segments were closed."""
-        if self.cache.reclaimer.hear(now_s):
+        """Follow the kernel's report that segments were closed."""
+        if self.reclaimer.on_closes(now_s):
             self.loads.forget_refusals()
 
-    def names_vanished(self, now_s: float) -> None:
-        """Handle the kernel's report that names of segments were removed."""
-        if self.cache.names_vanished(now_s):
+    def on_names_vanished(self, now_s: float) -> None:
+        """Follow the kernel's report that names of segments were removed."""
+        if self.lost.retire_vanished(now_s):
             self.loads.forget_refusals()
 
     def on_freed(self) -> None:
         """Count memory that is back with the kernel."""
-        if self.cache.reclaimer.collect():
+        if self.reclaimer.collect():
             self.loads.forget_refusals()
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Note that clients dropped segments: what was refused for lack of memory may fit now."""
-        self.cache.reclaimer.let_go(residents, now_s)
+        """Release segments that a client has dropped: what was refused for lack of memory may fit now."""
+        self.reclaimer.release(residents, now_s)
         self.loads.forget_refusals()
 
     def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> str:
         """Make room for a load; returns why there is none, or nothing where it is on its way.
 
-        What is evicted is free a moment later.  At the same time more is, for the loads of ``behind`` bytes
-        that come next: else each of them would have to wait for a moment of its own.
+        What is evicted is free a moment later.  At the same time more is evicted, for the loads of
+        ``behind`` bytes that come next: else each of them would have to wait for a moment of its own.
         """
-        ledger = self.cache.ledger
+        ledger = self.ledger
         if load.prefetch:
             has_room = self.prefetcher.make_room(load, shortage, now_s)
             return "" if has_room else "it will be needed later than others"
-        if load.estimate + ledger.overhead_bytes > ledger.budget_bytes:
+        if not ledger.fits_at_all(load.estimate):
             needed, budget = format_bytes(load.estimate), format_bytes(ledger.budget_bytes)
             return f"the cell needs {needed}, the whole budget is {budget}"
         more = min(behind, ledger.budget_bytes // AHEAD_SHARE)
-        free = self.cache.evictor.free
+        free = self.evictor.free
         if free(shortage + more, now_s) or free(shortage, now_s) or self._may_be_given_back():
             return ""
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
@@ -82,13 +99,13 @@ class Room:
 
     def still_waited_for(self, running: int, now_s: float) -> bool:
         """Whether nothing has changed since a load began to wait; else it is worth another try."""
-        until_s = min(self._waited_until_s, self.cache.evictor.wake_s)
+        until_s = min(self._waited_until_s, self.evictor.wake_s)
         self.waited_for = now_s < until_s and self._waited_at == self._state(running)
         return self.waited_for
 
     def _state(self, running: int) -> tuple[int, ...]:
         """Return what differs whenever there may be room, or another load comes next."""
-        ledger = self.cache.ledger
+        ledger = self.ledger
         return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, self.loads.changes, running
 
     def ask(self, worker: Worker, message: Need) -> None:
@@ -101,17 +118,17 @@ class Room:
 
     def grant(self, jobs: Mapping[int, Load], now_s: float) -> None:
         """Grant, hold or refuse the extra bytes that workers asked for; ``jobs`` are loads by job number."""
-        ledger = self.cache.ledger
+        ledger = self.ledger
         for number, (worker, nbytes) in list(self.awaiting_grant.items()):
             load = jobs.get(number)
             if load is not None:
                 granted = self.loads.grow(load, nbytes)
-                if not granted and nbytes + ledger.overhead_bytes <= ledger.budget_bytes:
+                if not granted and ledger.fits_at_all(nbytes):
                     shortage = ledger.shortage(nbytes - load.reserved)
                     if load.prefetch:
                         freed = self.prefetcher.make_room(load, shortage, now_s)
                     else:
-                        freed = self.cache.evictor.free(shortage, now_s) or self._may_be_given_back()
+                        freed = self.evictor.free(shortage, now_s) or self._may_be_given_back()
                     if freed:
                         continue
                 self.pool.answer(worker, Decision(granted))

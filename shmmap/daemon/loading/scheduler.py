@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Hashable
-from typing import Final
+from typing import Final, Protocol
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.map_switch import MapSwitch
@@ -87,6 +87,13 @@ class MisplacedCells:
         self._cache.statistics.set("cells_outside_box", len(self._versions))
 
 
+class LoadObserver(Protocol):
+    """Follows loads."""
+
+    def load_finished(self, key: Key) -> None:
+        """Follow a load that ended, in whichever way."""
+
+
 class Scheduler:
     """Carries out loads.
 
@@ -106,8 +113,6 @@ class Scheduler:
     prefetcher, room, misplaced, lost
         Loads what was not asked for yet; asks the cache for room; counts cells with points outside
         their box; replaces workers.
-    ended
-        Keys whose loads have ended, in whichever way, since `take_ended`.
     unfinished : bool
         Whether there may be more for `pump` to do at once.
     """
@@ -117,15 +122,17 @@ class Scheduler:
         cache: CellCache,
         map_switch: MapSwitch,
         make_pool: Callable[[Callable[[Worker], None]], WorkerPool],
+        observer: LoadObserver,
         *,
         clock: Callable[[], float],
         prefetch_share: float = 0.0,
         outage_tolerance_s: float = 0.0,
     ) -> None:
-        self._cache, self._map_switch, self._statistics = cache, map_switch, cache.statistics
+        self._cache, self._map_switch, self._observer = cache, map_switch, observer
+        self._ledger, self._layers = cache.ledger, cache.layers
+        self._events, self._statistics = cache.events, cache.statistics
         self.loads = Loads(cache.ledger)
         self.pool = pool = make_pool(lambda worker: self.on_worker(worker, clock()))
-        self.ended: list[Key] = []
         self._jobs: dict[int, Load] = {}
         self._to_recheck: deque[Key] = deque()
         self._for_pages: dict[Load, None] = {}  # that wait until it is known which cells they look into
@@ -133,18 +140,15 @@ class Scheduler:
         self.prefetcher = Prefetcher(
             cache, self.loads, pool, share=prefetch_share, outage_tolerance_s=outage_tolerance_s
         )
-        self.room = Room(cache, self.loads, pool, self.prefetcher)
+        self.room = Room(
+            cache.ledger, cache.evictor, cache.reclaimer, cache.lost, self.loads, pool, self.prefetcher
+        )
         self.misplaced = MisplacedCells(cache)
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
     def start_loader(self) -> None:
         """Start a loader before there is a load."""
         self.pool.start_one()
-
-    def take_ended(self) -> list[Key]:
-        """Return the keys whose loads have ended since the last call, without those that are loaded again."""
-        ended, self.ended = self.ended, []
-        return [key for key in ended if key not in self.loads.by_key]
 
     # --- requests -------------------------------------------------------------------------------
 
@@ -157,13 +161,13 @@ class Scheduler:
         known for which state of the file it failed.
         """
         cache = self._cache
-        key = Key(cache.catalogue.id(index), layer)
+        key = cache.key(index, layer)
         failure = self.loads.failures.get(key)
         if failure is not None and key not in self.loads.by_key and now_s >= failure.retry_at_s:
-            cache.tell(cache.events.retried, key, failure)
+            self._events.emit(self._events.retried, key, failure)
             failure = None
         if failure is None or key in self.loads.by_key:
-            computed = cache.layers.is_computed(index, layer)
+            computed = self._layers.is_computed(index, layer)
             return self.loads.want(key, cache.estimate(index, layer), priority, asker, computed=computed)
         if failure.code in SPACE_CODES or failure.stamp is None:
             return None
@@ -188,11 +192,11 @@ class Scheduler:
 
     def _waits_for_pages(self, load: Load, now_s: float) -> bool:
         """Whether a load cannot be begun because it is not known yet which cells it looks into."""
-        cache, pages = self._cache, self._cache.catalogue.pages
+        cache, pages = self._cache, self._cache.pages
         if pages is None or load.unless is not None or load.adopted is not None:
             return False
         index = cache.index_of(load.key.cell_id)
-        area = cache.layers.looks_into(index, load.key.layer) if index is not None else None
+        area = self._layers.looks_into(index, load.key.layer) if index is not None else None
         absent = [] if area is None else [page for page in pages.of_area(area) if not pages.is_here(page)]
         if not absent:
             return False
@@ -226,15 +230,13 @@ class Scheduler:
             key = self._to_recheck.popleft()
             if self._cache.index_of(key.cell_id) is None:
                 self.loads.cancel(key)
-                self.ended.append(key)
+                self._observer.load_finished(key)
 
     # --- handing out jobs -----------------------------------------------------------------------
 
     def free(self, now_s: float) -> None:
         """Free what is due: what was refused for lack of memory may fit now."""
-        if self._cache.ledger.retired and self._cache.reclaimer.sweep(now_s):
-            self.loads.forget_refusals()
-        if self._cache.look_for_some(now_s):
+        if self._cache.reclaim(now_s):
             self.loads.forget_refusals()
 
     def pump(self, now_s: float) -> None:
@@ -255,7 +257,7 @@ class Scheduler:
             return False
         if load.computed and self._waits_for_pages(load, now_s):
             return True
-        estimate, shortage = load.estimate, self._cache.ledger.shortage(load.estimate)
+        estimate, shortage = load.estimate, self._ledger.shortage(load.estimate)
         if estimate and shortage > 0:
             refusal = self.room.refusal(load, shortage, self.loads.bytes_behind(), now_s)
             if refusal:
@@ -293,7 +295,7 @@ class Scheduler:
         if load.unless is not None:
             return Check(number, catalogue.source(index), "", load.unless)
         if load.adopted is not None:
-            if cache.ledger.resident_named(load.adopted.name) is load.adopted:
+            if self._ledger.resident_named(load.adopted.name) is load.adopted:
                 return Check(number, catalogue.source(index), load.adopted.name, catalogue.stamp(index))
             load.adopted = None  # it was retired before its turn came
             if not load.wanted:
@@ -301,10 +303,11 @@ class Scheduler:
             load.estimate = cache.estimate(index, load.key.layer)
         layer = load.key.layer
         ready = catalogue.ready(index, layer)
-        around = cache.layers.neighbours(index, layer)
+        around = self._layers.neighbours(index, layer)
         load.sources = tuple(map(catalogue.stamp, (index, *around)))
-        load.version = cache.layers.version(index, layer)
-        points = cache.warm.get(index, LAYER) if layer != LAYER else None
+        load.version = self._layers.version(index, layer)
+        warm = cache.warm
+        points = warm.get(index, LAYER) if layer != LAYER else None
         return Job(
             number,
             load.key.cell_id,
@@ -326,8 +329,7 @@ class Scheduler:
         """Return when there is something to do although nothing arrives; infinity for never."""
         if self._to_recheck or self.unfinished:
             return 0.0
-        cache = self._cache
-        return min(cache.reclaimer.next_sweep_s(), cache.evictor.wake_s, self.pool.next_deadline_s())
+        return min(self._cache.next_reclaim_s(), self.pool.next_deadline_s())
 
     # --- messages of workers -----------------------------------------------------------------------
 
@@ -387,22 +389,22 @@ class Scheduler:
 
     def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
         """Have a finished segment handed out from now on."""
-        cache, key = self._cache, load.key
+        cache, catalogue, key = self._cache, self._cache.catalogue, load.key
         index = cache.index_of(key.cell_id)
         if index is None:
             self._statistics.add("loads_failed")
             self._end(load)
             return
-        if done.version != cache.layers.version(index, key.layer):
+        if done.version != self._layers.version(index, key.layer):
             # its file, or one around it, changed while it was made; or the map did
             reads = (done.stamp, *done.neighbours)
             if reads == load.sources and done.version != load.version:
                 message = f"the loader builds {key.layer} otherwise than the daemon knows: restart it"
                 self._fail(load, "load_failed", message, None, now_s)
                 return
-            cells = (index, *cache.layers.neighbours(index, key.layer))
+            cells = (index, *self._layers.neighbours(index, key.layer))
             self._map_switch.catch_up(cells, reads, load.sources)
-            if done.version != cache.layers.version(index, key.layer):
+            if done.version != self._layers.version(index, key.layer):
                 self.loads.requeue(load)
                 return
         resident = Resident(
@@ -411,7 +413,7 @@ class Scheduler:
             version=done.version,
             nbytes=0,
             points=done.points,
-            box=cache.catalogue.box(index),
+            box=catalogue.box(index),
             z_min=done.z_min,
             z_max=done.z_max,
             last_use_s=now_s,
@@ -428,7 +430,7 @@ class Scheduler:
             return
         self.misplaced.note(key.cell_id, index, done.outside)
         took_ns = int((now_s - load.started_s) * 1e9)
-        cache.tell(cache.events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)
+        self._events.emit(self._events.loaded, resident, took_ns, replaces, done.cached, load.prefetch)
         for warning in done.warnings:
             log.info("loaded with a warning", cell=key.cell_id, layer=key.layer, warning=warning)
         if done.dropped:
@@ -456,7 +458,7 @@ class Scheduler:
             return
         index = self._cache.index_of(load.key.cell_id)
         if failure is not None:
-            self._cache.tell(self._cache.events.retried, load.key, failure)
+            self._events.emit(self._events.retried, load.key, failure)
         if index is not None and message.stamp is not None:
             self._map_switch.learn(index, message.stamp)
         self._load_after_all(load)
@@ -489,7 +491,7 @@ class Scheduler:
             self._end(load)
             return
         failure = self.loads.failure(load.key, code, message, stamp, now_s)
-        self._cache.tell(self._cache.events.failed, load.key, failure, now_s)
+        self._events.emit(self._events.failed, load.key, failure, now_s)
         self._end(load, failure)
 
     def _end(self, load: Load, failure: Failure | None = None) -> None:
@@ -497,4 +499,4 @@ class Scheduler:
         out = failure is not None and (load.unread or failure.code == "load_timeout")
         self.prefetcher.note_end(load, load.took_s or load.spent_s, out=out)
         self.loads.finish(load, failure)
-        self.ended.append(load.key)
+        self._observer.load_finished(load.key)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well this machine tells who uses a segment: tried out, not guessed from versions.
+"""How well this machine knows who uses a segment: tried out, not guessed from versions.
 
-Three ways, the first that works is taken: leases (nobody is overlooked), the locks that the client
-library takes (who opens segments in another way is overlooked), and what sessions say they hold
-(who does not say is overlooked, too).  Whoever is overlooked keeps the bytes it maps, always; the
+Of three sources the first that works is taken: leases (no process is overlooked), the locks that the client
+library takes (a process that opens segments otherwise is overlooked), and what sessions say they hold
+(one that does not say is overlooked, too).  A process that is overlooked keeps the bytes it maps, always; the
 daemon then only believes to have more memory left than it has.
 """
 
@@ -26,7 +26,7 @@ _SLOT: Final = 12345
 
 
 class PinSource(enum.Enum):
-    """Where the word on who uses a segment comes from, best first; the value is for people."""
+    """Where it is known from who uses a segment, best first; the value is for people."""
 
     LEASES = "leases"
     LOCKS = "locks of clients"
@@ -39,11 +39,11 @@ class PinSupport(NamedTuple):
     Attributes
     ----------
     leases
-        A lease is granted exactly while nobody else has a file open or mapped.
+        A lease is granted exactly while no other process has a file open or mapped.
     locks
         A lock on an open file lasts as long as its mapping, and shows.
     close_events
-        inotify tells when somebody let go of a file.
+        inotify reports when a process closes a file.
     """
 
     leases: bool
@@ -52,7 +52,7 @@ class PinSupport(NamedTuple):
 
     @property
     def source(self) -> PinSource:
-        """The best way that works."""
+        """The best source that works."""
         return PinSource.LEASES if self.leases else PinSource.LOCKS if self.locks else PinSource.SESSIONS
 
 
@@ -96,7 +96,7 @@ def _locks_tell(fd: int, path: str) -> bool:
 
 
 def _mapped(path: str, slot: int | None = None) -> mmap.mmap:
-    """Map a file anew, as a reader does (Python's mapping keeps a descriptor: the same open file)."""
+    """Map a file as a reader does (Python's mapping keeps a descriptor: the same open file)."""
     other = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         if slot is not None:

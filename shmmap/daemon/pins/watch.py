@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking the kernel who uses a segment, and hearing from it when somebody let go.
+"""Asking the kernel who uses a segment, and having it report when a process closes one.
 
 A retired segment that is still mapped stays open here (our own descriptor is the one that the lease
-is asked for, so it does not count), and the kernel is asked to tell when anybody else closes or
-unmaps it.  So nothing of ours ever looks like a close, and nobody has to look now and then.
+is asked for, so it does not count), and the kernel is asked to report when any process closes or
+unmaps it.  So nothing of ours ever looks like a close, and no timer has to look now and then.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["PinWatch"]
 KEPT_OPEN: Final = 1024
 """Most retired segments that are kept open; further ones are looked at now and then."""
 KEPT_SHARE: Final = 8
-"""Of the descriptors this process may have, one in so many at most: clients need them more."""
+"""A part of the descriptors this process may have at most, an eighth: clients need them more."""
 
 
 class PinWatch:
@@ -33,14 +33,14 @@ class PinWatch:
     Parameters
     ----------
     source
-        Whose word is taken; for `PinSource.SESSIONS` the caller asks the sessions.
+        Which source is asked; for `PinSource.SESSIONS` the caller asks the sessions.
     events
         Whether to have closes reported.
 
     Attributes
     ----------
     fd
-        Readable when `closed` has something to tell; -1 where nothing is reported.
+        Readable when `closed` has something to report; -1 where nothing is reported.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class PinWatch:
         self.fd = self._inotify.fd if self._inotify is not None else -1
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Close everything."""
         for name in list(self._kept):
             self.release(name)
         if self._inotify is not None:
@@ -68,37 +68,37 @@ class PinWatch:
 
     @contextlib.contextmanager
     def opened(self, name: str) -> Iterator[int]:
-        """Give a descriptor of a segment, the kept one or one for the moment; OSError as from opening."""
+        """Yield a descriptor of a segment, the kept one or one for the moment; OSError as from opening."""
         kept = self._kept.get(name)
         if kept is not None:
             yield kept[0]
             return
         once = self._once.pop(name, -1)
-        if once >= 0 and self._inotify is not None:  # or what follows would be reported as somebody's close
+        if once >= 0 and self._inotify is not None:  # or what follows would be reported as a close
             self._inotify.remove(once)
         with self._directory.opened(name) as fd:
             yield fd
         if once >= 0:
-            self.tell_once(name)
+            self.watch_next_close(name)
 
     def is_used_elsewhere(self, fd: int) -> bool:
-        """Whether anybody else uses an open segment, according to the kernel; False where it gives none."""
+        """Whether another process uses an open segment, as the kernel says; False where it does not know."""
         if self.source is PinSource.LEASES:
             return in_use(fd)
         return self.source is PinSource.LOCKS and bool(holders(fd, limit=1))
 
     def is_used(self, name: str) -> bool | None:
-        """Whether anybody uses a segment; None if its name is gone."""
+        """Whether a process uses a segment; None if its name is gone."""
         try:
             with self.opened(name) as fd:
                 return self.is_used_elsewhere(fd)
         except FileNotFoundError:
             return None
         except OSError:
-            return True  # out of descriptors, say: who cannot look must not take it for free
+            return True  # out of descriptors, say: what cannot be looked at must not count as free
 
     def keep(self, name: str) -> bool:
-        """Keep a retired segment open and hear when others let go of it; False if that cannot be."""
+        """Keep a retired segment open and have its closes reported; False if that cannot be."""
         if self._inotify is None or len(self._kept) >= self._most_kept:
             return False
         try:
@@ -110,7 +110,7 @@ class PinWatch:
         except OSError:
             os.close(fd)
             return False
-        self._once.pop(self._names.get(watch, ""), None)  # what told once is now kept
+        self._once.pop(self._names.get(watch, ""), None)  # what was to be reported once is now kept
         self._kept[name] = fd, watch
         self._names[watch] = name
         return True
@@ -128,8 +128,8 @@ class PinWatch:
             self._names.pop(watch, None)
             os.close(fd)
 
-    def tell_once(self, name: str) -> bool:
-        """Hear when somebody next lets go of a segment in service; False if that cannot be."""
+    def watch_next_close(self, name: str) -> bool:
+        """Have the next close of a segment in service reported; False if that cannot be."""
         if self._inotify is None:
             return False
         try:
@@ -140,7 +140,7 @@ class PinWatch:
         return True
 
     def closed(self) -> set[str] | None:
-        """Names that somebody let go of since the last call; None: any of them, too many to tell."""
+        """Return the names that were closed since the last call; None: any of them, the kernel lost some."""
         if self._inotify is None:
             return set()
         names: set[str] = set()
@@ -150,7 +150,7 @@ class PinWatch:
             name = self._names.get(event.watch)
             if name is None:
                 continue
-            if event.mask & ENDED:  # it has told, or was ended by our own look; what came before that counts
+            if event.mask & ENDED:  # it was reported, or ended by our own look; what came before that counts
                 del self._names[event.watch]
                 if self._once.get(name) == event.watch:
                     del self._once[name]

@@ -2,52 +2,68 @@
 """Requests for cells: area, differential and selected.
 
 A request first becomes a `PendingRequest`: which cells in which order, minus what the client holds.  If all
-of it is warm the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the
-answer (`cell_replies`) leaves when the last one settled or the client's patience ends, whichever is
-first.  What concerns many cells is done in parts, a turn of the loop each.
+of it is warm the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the answer
+leaves when the last one has ended or the client's time is up, whichever is first: a handle for each cell that
+is in memory, and for each other why not.  What concerns many cells takes several turns of the loop.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Generator, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+import msgspec
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.pace import Pace, batched
+from shmmap.daemon.records import SPACE_CODES, Resident
 from shmmap.daemon.requests import limits
-from shmmap.daemon.requests.cell_replies import Answer, CellReplies
-from shmmap.daemon.requests.differential import lacking, warm_difference
-from shmmap.daemon.requests.pending_request import (
-    LOADS_A_STEP,
-    MapChanged,
-    PendingRequest,
-    WaitingList,
-    parts,
-)
+from shmmap.daemon.requests.differential import difference, warm_difference
+from shmmap.daemon.requests.pending_request import Found, MapChanged, PendingRequest, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, ShmmapError
 from shmmap.geometry import Area
 from shmmap.protocol import messages
+from shmmap.protocol.codec import PackedArray, encode_cells
+from shmmap.protocol.messages import FailedCell, Holder, PendingCell
 
 __all__ = ["CellRequests"]
 
 MAX_WAIT_S: Final = 3600.0
-MOST_AT_ONCE: Final = 4096
+MAX_AT_ONCE: Final = 4096
 """Cells of an area that are compared with what a client holds in one turn, if all are in memory."""
-MOST_LOOKED_AT: Final = 20_000
+MAX_LOOKED_AT: Final = 20_000
 """Cells of requests that are looked through before a page of the map is given up."""
-PACKED_A_CELL: Final = 256
-HELD_A_CELL: Final = 2
+PACKED_PER_CELL: Final = 256
+HELD_PER_CELL: Final = 2
 """Bytes of packed versions, and cells held by name, of a request that waits: they take a cell's memory."""
+MAX_HOLDERS: Final = 16
+"""Named beside each cell that does not fit: those that have most."""
+NOTED_PER_STEP: Final = 256
+"""Cells handed out that are noted as held between two looks at the time."""
+PROMISED: Final = 1e9
+"""Priority of a load that only a "pending" promises: behind the distances of all that is asked for."""
+
+_UNNAMED: Final = (Holder(0, 0, -1, "", 0, 0),)
+"""Stands for the holders of memory until they are found."""
 
 Result = TypeVar("Result")
+
+
+@dataclass(eq=False, slots=True)
+class _Answer:
+    """What a reply says of cells; ``failed`` is still without the holders of memory."""
+
+    residents: list[Resident] = field(default_factory=list)
+    handles: list[bytes] = field(default_factory=list)
+    pending: PackedArray = field(default_factory=PackedArray)
+    failed: list[FailedCell] = field(default_factory=list)
 
 
 class CellRequests:
@@ -55,6 +71,8 @@ class CellRequests:
 
     Parameters
     ----------
+    waiting
+        Requests that wait; it observes the ends of loads.
     quota_bytes
         Most bytes one session may keep that no other session also holds.
     due
@@ -67,6 +85,7 @@ class CellRequests:
         self,
         cache: CellCache,
         scheduler: Scheduler,
+        waiting: WaitingList,
         *,
         quota_bytes: int,
         due: Callable[[Connection, Iterator[None]], None],
@@ -74,90 +93,103 @@ class CellRequests:
     ) -> None:
         self._cache = cache
         self._scheduler = scheduler
-        self._statistics = cache.statistics
+        self._statistics, self._holders = cache.statistics, cache.holders
         self._due = due
         self._now_s = clock
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
-        self._answers = CellReplies(cache, scheduler)
         self._open: dict[PendingRequest, None] = {}  # that are not answered yet
-        self._patient = WaitingList(cache.ledger, self._answer_in_turn, self.let_go)
+        self._waiting = waiting
 
     def __len__(self) -> int:
-        return len(self._patient)
+        return len(self._waiting)
 
     # --- the three verbs ------------------------------------------------------------------------
 
     def area(self, session: Session, message: messages.Area) -> Iterator[None]:
-        """All cells that touch an area."""
+        """Answer with all cells that touch an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        layers = limits.admitted_layers(self._cache, message.layers)
+        layers = self._layers(message.layers)
         _note_area(session, area, layers)
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            found = self._known(wanted, area, layers)
-            indices = self._cache.at_height(found.tolist(), area.z)
-            wanted.cells = [(index, layer) for index in indices for layer in layers]
+            wanted.found.cells = [(index, layer) for index in self._known(wanted, layers) for layer in layers]
             yield from ()  # all at once
 
-        wanted = PendingRequest(session, message.request, limits.layers_named(message), find, area)
-        return self._serve(wanted, message.wait)
+        return self._serve(self._pending(session, message, find, area), message.wait)
 
     def selected(self, session: Session, message: messages.Selected) -> Iterator[None]:
-        """Cells by id, in the order asked for."""
+        """Answer with cells by id, in the order asked for."""
         _check_wait(message.wait)
-        cache = self._cache
-        layers = limits.admitted_layers(cache, message.layers)
+        layers = self._layers(message.layers)
         limits.check_count(len(message.ids) * len(layers))
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            for number, ids in enumerate(parts(message.ids)):
-                if number:
-                    yield from wanted.pause(cache)
-                indices = [cache.index_of(cell_id) for cell_id in ids]
-                wanted.cells += [(index, layer) for index in indices if index is not None for layer in layers]
-                absent = [cell_id for cell_id, index in zip(ids, indices, strict=True) if index is None]
-                wanted.unknown += [(cell_id, layer) for cell_id in absent for layer in layers]
-            wanted.covered = not wanted.unknown or cache.catalogue.complete
+            found = wanted.found
+            for ids in batched(message.ids):
+                yield from wanted.pause()
+                for cell_id in ids:
+                    index = self._cache.index_of(cell_id)
+                    if index is not None:
+                        found.cells += [(index, layer) for layer in layers]
+                    else:
+                        found.unknown += [(cell_id, layer) for layer in layers]
+            found.covered = not found.unknown or self._cache.catalogue.complete
 
-        wanted = PendingRequest(
-            session, message.request, limits.layers_named(message), find, message_cells=len(message.ids)
-        )
+        wanted = self._pending(session, message, find, None, len(message.ids))
         return self._serve(wanted, message.wait)
 
     def differential(self, session: Session, message: messages.Differential) -> Iterator[None]:
-        """Cells that touch an area, minus those the client holds."""
+        """Answer with the cells that touch an area, minus those the client holds."""
         limits.check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
-        cache = self._cache
-        layers = limits.admitted_layers(cache, message.layers)
-        _note_area(session, area, layers)
-        found, covered = cache.catalogue.query(area, limits.MOST_CELLS)
-        looks_around = cache.catalogue.pages is not None and cache.layers.halo_m(layers) > 0.0
+        layers = limits.layers_of(message.layers)
+        catalogue, versions = self._cache.catalogue, self._cache.layers
+        cells, covered = catalogue.query(area, limits.MAX_CELLS)
+        looks_around = catalogue.pages is not None and versions.halo_m(layers) > 0.0
         is_one = len(layers) == 1 and area.z is None
-        if is_one and covered and not looks_around and len(found) <= MOST_AT_ONCE:
-            warm = warm_difference(cache, message, found, layers[0])
+        if is_one and covered and not looks_around and len(cells) <= MAX_AT_ONCE:
+            warm = warm_difference(self._cache, message, cells, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
-                answer = Answer([resident.handle for resident in warm.residents], warm.residents)
-                self._answers.reply(
-                    session, message.request, answer, limits.layers_named(message),
-                    removed=warm.removed, removed_packed=warm.removed_packed,
-                )  # fmt: skip
+                _note_area(session, area, layers)
+                answer = _Answer(warm.residents, [resident.handle for resident in warm.residents])
+                found = Found(removed=warm.removed, removed_packed=warm.removed_packed)
+                self._reply(session, message.request, limits.layers_named(message.layers), answer, found)
                 # the bookkeeping can wait until the answer is out
                 self._statistics.add("hits", len(answer.handles))
-                return self._answers.hand_out(session, answer, self._now_s())
+                return self._hand_out(session, answer)
+        self._check_reach(layers)
+        _note_area(session, area, layers)
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            return lacking(cache, message, self._known(wanted, area, layers), layers, wanted)
+            return difference(wanted, message, self._known(wanted, layers), layers)
 
-        held_cells = len(message.packed) // PACKED_A_CELL + len(message.held) // HELD_A_CELL
-        wanted = PendingRequest(
-            session, message.request, limits.layers_named(message), find, area, held_cells
-        )
-        return self._serve(wanted, message.wait)
+        held_cells = len(message.packed) // PACKED_PER_CELL + len(message.held) // HELD_PER_CELL
+        return self._serve(self._pending(session, message, find, area, held_cells), message.wait)
 
-    def _known(self, wanted: PendingRequest, area: Area, layers: tuple[str, ...]) -> NDArray[np.intp]:
+    def _pending(
+        self,
+        session: Session,
+        message: messages.Area | messages.Differential | messages.Selected,
+        find: Callable[[PendingRequest], Iterator[None]],
+        area: Area | None,
+        message_cells: int = 0,
+    ) -> PendingRequest:
+        layers = limits.layers_named(message.layers)
+        return PendingRequest(self._cache, session, message.request, layers, find, area, message_cells)
+
+    def _layers(self, specs: tuple[str, ...]) -> tuple[str, ...]:
+        layers = limits.layers_of(specs)
+        self._check_reach(layers)
+        return layers
+
+    def _check_reach(self, layers: tuple[str, ...]) -> None:
+        versions = self._cache.layers
+        for layer in layers:
+            versions.check_reach(layer)
+
+    def _known(self, wanted: PendingRequest, layers: tuple[str, ...]) -> list[int]:
         """Find the known cells of an area; note whether these are all, and which pages may have others.
 
         A layer that looks into the cells around needs the pages of these, too.
@@ -167,23 +199,24 @@ class CellRequests:
         BadRequest
             They are too many.
         """
-        catalogue = self._cache.catalogue
+        area, found, catalogue = wanted.area, wanted.found, self._cache.catalogue
+        assert area is not None  # noqa: S101  only requests by ids have none
         pages = catalogue.pages
         if pages is not None:
             limits.check_count(pages.cells_surely_in(area) * len(layers))
-        found, wanted.covered = catalogue.query(area, limits.MOST_CELLS)
-        limits.check_count(len(found) * len(layers))
+        indices, found.covered = catalogue.query(area, limits.MAX_CELLS)
+        limits.check_count(len(indices) * len(layers))
         if pages is not None:
-            needed = pages.of_area(area.around(*area.center, self._cache.layers.halo_m(layers)))
+            needed = self._cache.pages_around(area, layers)
             absent = [page for page in needed if not pages.is_here(page)]
-            wanted.covered = not absent
-            wanted.pages = {page for page in absent if not pages.is_out_of_reach(page)}
-            wanted.reason = "offline" if len(wanted.pages) < len(absent) else ""
+            found.covered = not absent
+            found.pages = {page for page in absent if not pages.is_out_of_reach(page)}
+            found.reason = "offline" if len(found.pages) < len(absent) else ""
             pages.want(needed, 0.0)
-        return found
+        return self._cache.at_height(indices.tolist(), area.z)
 
-    def let_go(self, residents: Iterable[Resident]) -> None:
-        """Somebody dropped these."""
+    def release(self, residents: Iterable[Resident]) -> None:
+        """Release segments that a client has dropped."""
         self._scheduler.room.release(residents, self._now_s())
 
     # --- loading and waiting --------------------------------------------------------------------
@@ -195,156 +228,14 @@ class CellRequests:
         try:
             waits = yield from self._on_one_map(wanted, lambda: self._begin(wanted, wait_s))
             if not waits:
-                yield from self._answer(wanted)
+                yield from self._on_one_map(wanted, lambda: self._answer(wanted, may_wait=False))
         finally:
             if not waits:
                 self._end(wanted)
 
     def _end(self, wanted: PendingRequest) -> None:
         self._open.pop(wanted, None)
-        self._patient.let_go(wanted)
-
-    def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
-        """Have loaded what is cold of what was found; whether the request waits for that, or for more."""
-        now_s = self._now_s()
-        may_wait = bool(wait_s) and self._patient.has_room(wanted)
-        yield from self._have_loaded(wanted, note=may_wait)
-        wanted.is_new = False
-        if not (may_wait and wanted.waits):
-            return False
-        yield from self._need(wanted)
-        wanted.began_s, wanted.deadline_s = now_s, now_s + (wait_s or 0.0)
-        self._patient.add(wanted)
-        self._wait_for_pages(wanted)
-        if wanted.outdated or not wanted.waits:  # they came while the rest was gone through
-            self._answer_in_turn(wanted)
-        return True
-
-    def _have_loaded(self, wanted: PendingRequest, *, note: bool) -> Iterator[None]:
-        """Find what is warm and have the rest loaded; ``note`` what is, so that its end is noticed."""
-        cache, warm, now_s = self._cache, self._cache.warm.layers, self._now_s()
-        wanted.refused.clear()
-        cold: list[tuple[int, str]] = []
-        sizes: list[int] = []
-        for number, part in enumerate(parts(wanted.cells)):
-            if number:
-                yield from wanted.pause(cache)
-            for index, layer in part:
-                resident = warm[layer].get(index) if layer in warm else None
-                if resident is None:
-                    resident = cache.find_warm(index, layer, now_s)
-                if resident is None:
-                    cold.append((index, layer))
-                sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
-        if not wanted.began_s:
-            self._statistics.add("hits", len(wanted.cells) - len(cold))
-        yield from self._quota.check(wanted, sizes)
-        if cold:
-            yield from limits.check_queue(cache, self._scheduler.loads, wanted, cold)
-            self._statistics.add("misses", len(cold) * (not wanted.began_s))
-            yield from self._load(wanted, cold, note=note)
-
-    def _need(self, wanted: PendingRequest) -> Iterator[None]:
-        """Keep all of what is asked for from making room until the answer is out."""
-        for number, part in enumerate(parts(wanted.cells)):
-            if number:
-                yield from wanted.pause(self._cache)
-            for index, layer in part:
-                self._patient.need(wanted, Key(self._cache.catalogue.id(index), layer))
-
-    def _wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Let a request wait for its pages, without those that have settled since it was found."""
-        pages = self._cache.catalogue.pages
-        if pages is not None and wanted.pages:
-            come = {page for page in wanted.pages if pages.is_here(page)}
-            wanted.pages -= come | {page for page in wanted.pages if pages.is_out_of_reach(page)}
-            wanted.outdated = wanted.outdated or bool(come)
-            self._patient.wait_for_pages(wanted)
-
-    def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
-        """Ask for loads; ``note`` which ones, to be told when they end."""
-        cache, now_s = self._cache, self._now_s()
-        for part in parts(cold, LOADS_A_STEP):
-            if len(cold) > LOADS_A_STEP:
-                yield from wanted.pause(cache)  # before the first one, too: they were looked for until now
-            boxes = cache.catalogue.boxes_of(np.array([index for index, _ in part], dtype=np.intp))
-            for (index, layer), distance in zip(part, wanted.distances_m(boxes).tolist(), strict=True):
-                key = Key(cache.catalogue.id(index), layer)
-                if key in wanted.refused or cache.warm.get(index, layer) is not None:
-                    continue  # it may have come for somebody else
-                self._note_late(wanted, key)
-                if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
-                    self._patient.wait_for(wanted, key)
-
-    def _note_late(self, wanted: PendingRequest, key: Key) -> None:
-        """Count what nobody fetched ahead: if the client was on its way, it is late."""
-        load = self._scheduler.loads.by_key.get(key)
-        if load is None or load.prefetch:
-            self._scheduler.prefetcher.note_cold(wanted.session, key)
-            self._statistics.add("prefetch_overtaken", load is not None and load.running)
-
-    def settled(self, key: Key) -> None:
-        """A load ended: answer the requests it was the last one for."""
-        self._patient.settled(key)
-
-    def pages_settled(self, news: PageNews) -> None:
-        """Pages of the map have come, or cannot be had at present."""
-        for page in news.come:
-            self._patient.page_settled(page)
-        for page in news.out_of_reach:
-            self._patient.page_settled(page, "offline")
-
-    def map_changed(self) -> None:
-        """Another state of the map is served, with other pages."""
-        self._patient.map_changed()
-
-    def uses(self, page: int) -> bool:
-        """Whether a request that is not answered yet has cells of a page, or an area in it; or may have."""
-        pages = self._cache.catalogue.pages
-        if pages is None or sum(len(wanted.cells) for wanted in self._open) > MOST_LOOKED_AT:
-            return True
-        cells = pages.cells(page)
-        for wanted in self._open:
-            if any(index in cells for index, _layer in wanted.cells):
-                return True
-            if wanted.area is not None:
-                halo_m = self._cache.layers.halo_m(wanted.layers)
-                if page in pages.of_area(wanted.area.around(*wanted.area.center, halo_m)):
-                    return True
-        return False
-
-    def tidy(self) -> None:
-        """Do some of what requests and sessions that are over leave to do."""
-        self._patient.tidy()
-
-    def _answer_in_turn(self, wanted: PendingRequest) -> None:
-        """Answer a request that waits; what it asks for stays needed until then."""
-        if not wanted.due:
-            wanted.due = True
-            self._due(wanted.session.connection, self._answer_now(wanted))
-
-    def _answer_now(self, wanted: PendingRequest) -> Iterator[None]:
-        """Answer a request that waits, unless there is more to wait for."""
-        if wanted not in self._patient:  # its session has ended
-            return
-        over = True
-        try:
-            if (yield from self._on_one_map(wanted, lambda: self._goes_on_waiting(wanted))):
-                over = False
-                self._patient.again(wanted)
-                if wanted.outdated:  # more has come while it was gone through
-                    self._answer_in_turn(wanted)
-            else:
-                yield from self._answer(wanted)
-        except ShmmapError as error:
-            wanted.session.connection.refuse(wanted.request, error)
-        finally:
-            if over and wanted in self._patient:
-                self._patient.remove(wanted)
-                self._end(wanted)
-
-    def _answer(self, wanted: PendingRequest) -> Iterator[None]:
-        return self._on_one_map(wanted, lambda: self._answers.answer(wanted, self._now_s()))
+        self._waiting.release(wanted)
 
     def _on_one_map(
         self, wanted: PendingRequest, do: Callable[[], Generator[None, None, Result]]
@@ -352,70 +243,303 @@ class CellRequests:
         """Go through a request's cells, found again if the map has changed or more of it is known."""
         while True:
             with contextlib.suppress(MapChanged):
-                if wanted.outdated or wanted.catalogue is not self._cache.catalogue:
-                    yield from wanted.find_again(self._cache)
+                yield from wanted.find_again()
                 return (yield from do())
 
-    def _goes_on_waiting(self, wanted: PendingRequest) -> Generator[None, None, bool]:
-        """Whether there is more to wait for, and time.
+    def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
+        """Have loaded what is cold of what was found; whether the request waits for that, or for more."""
+        now_s = self._now_s()
+        may_wait = bool(wait_s) and self._waiting.has_room(wanted)
+        yield from self._have_loaded(wanted, note=may_wait)
+        if not (may_wait and wanted.waits):
+            return False
+        yield from self._need(wanted)
+        wanted.began_s, wanted.deadline_s = now_s, now_s + (wait_s or 0.0)
+        self._waiting.add(wanted)
+        self._wait_for_pages(wanted)
+        if wanted.outdated or not wanted.waits:  # they came while the rest was gone through
+            self._answer_in_turn(wanted)
+        return True
 
-        That is what was found again; or a cell that had settled and is cold again, or may fit now.
+    def _have_loaded(self, wanted: PendingRequest, *, note: bool) -> Iterator[None]:
+        """Request loads of what is cold; ``note`` which, so that the request waits for them."""
+        cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
+        found.refused.clear()
+        cold: list[tuple[int, str]] = []
+        sizes: list[int] = []
+        for cells in batched(found.cells):
+            yield from wanted.pause()
+            for index, layer in cells:
+                resident = warm[layer].get(index) if layer in warm else None
+                resident = resident or cache.find_warm(index, layer, now_s)
+                if resident is None:
+                    cold.append((index, layer))
+                sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
+        if not wanted.began_s:
+            self._statistics.add("hits", len(found.cells) - len(cold))
+        yield from self._quota.check(wanted, sizes)
+        if cold:
+            yield from limits.check_queue(self._scheduler.loads, wanted, cold)
+            self._statistics.add("misses", len(cold) * (not wanted.began_s))
+            yield from self._load(wanted, cold, note=note)
+        found.requested = True
+
+    def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
+        """Request loads; ``note`` which, so that the request waits for them."""
+        warm, prefetcher, now_s = self._cache.warm, self._scheduler.prefetcher, self._now_s()
+        distances = wanted.distances_m(cold)
+        for cells in batched(list(zip(cold, distances, strict=True))):
+            yield from wanted.pause()
+            for (index, layer), distance in cells:
+                key = self._cache.key(index, layer)
+                if key in wanted.found.refused or warm.get(index, layer) is not None:
+                    continue  # another client may have had it loaded meanwhile
+                prefetcher.note_cold(wanted.session, key)
+                if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
+                    self._waiting.wait_for(wanted, key)
+
+    def _need(self, wanted: PendingRequest) -> Iterator[None]:
+        """Keep all of what is asked for from being evicted until the answer is out."""
+        for cells in batched(wanted.found.cells):
+            yield from wanted.pause()
+            for index, layer in cells:
+                self._waiting.need(wanted, self._cache.key(index, layer))
+
+    def _wait_for_pages(self, wanted: PendingRequest) -> None:
+        """Let a request wait for its pages, without those that have settled since it was found."""
+        found, pages = wanted.found, self._cache.pages
+        if pages is not None and found.pages:
+            come = {page for page in found.pages if pages.is_here(page)}
+            found.pages -= come | {page for page in found.pages if pages.is_out_of_reach(page)}
+            wanted.outdated = wanted.outdated or bool(come)
+            self._waiting.wait_for_pages(wanted)
+
+    def _answer_in_turn(self, wanted: PendingRequest) -> None:
+        """Answer a request that waits; what it asks for stays needed until then."""
+        if self._waiting.take(wanted):
+            self._due(wanted.session.connection, self._answer_now(wanted))
+
+    def _answer_now(self, wanted: PendingRequest) -> Iterator[None]:
+        """Answer a request that waits, unless there is more to wait for."""
+        if wanted not in self._waiting:  # its session has ended
+            return
+        wanted.pace.begin()
+        waits = False
+        try:
+            waits = yield from self._on_one_map(wanted, lambda: self._look_again(wanted))
+            if waits:
+                self._waiting.put_back(wanted)
+                if wanted.outdated:  # more has come while it was gone through
+                    self._answer_in_turn(wanted)
+        except ShmmapError as error:
+            wanted.session.connection.refuse(wanted.request, error)
+        finally:
+            if not waits and wanted in self._waiting:
+                self._waiting.remove(wanted)
+                self._end(wanted)
+
+    def _look_again(self, wanted: PendingRequest) -> Generator[None, None, bool]:
+        """Answer a request, unless there is more to wait for; then return True.
+
+        That is what was found again; or a cell whose load had ended and that is cold again, or may fit now.
         """
-        in_time = self._now_s() < wanted.deadline_s
-        if wanted.is_new:
-            may_wait = self._patient.recount(wanted) and in_time
+        may_wait = self._now_s() < wanted.deadline_s
+        if not wanted.found.requested:
+            may_wait = self._waiting.recount(wanted) and may_wait
             yield from self._have_loaded(wanted, note=may_wait)
             if may_wait:
                 yield from self._need(wanted)
                 self._wait_for_pages(wanted)
-            wanted.is_new = False
-            return may_wait and (wanted.waits or wanted.outdated)
-        if not in_time:
+                if wanted.waits or wanted.outdated:
+                    return True
+        return (yield from self._answer(wanted, may_wait=may_wait))
+
+    # --- answers --------------------------------------------------------------------------------
+
+    def _answer(self, wanted: PendingRequest, *, may_wait: bool) -> Generator[None, None, bool]:
+        """Send what there is of what is wanted; with ``may_wait`` return True if there is more to wait for.
+
+        Raises
+        ------
+        MapChanged, NoSession
+            See `PendingRequest.pause`; nothing was sent.
+        """
+        cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
+        if wanted.area is not None and wanted.area.z is not None:
+            inside = set(cache.at_height([index for index, _ in found.cells], wanted.area.z))
+            found.cells = [cell for cell in found.cells if cell[0] in inside]
+        answer = _Answer()
+        for unknown in batched(found.unknown):
+            yield from wanted.pause()
+            for cell_id, layer in unknown:
+                answer.failed.append(FailedCell(cell_id, layer, "unknown_cell", "the map has no such cell"))
+        for cells in batched(found.cells):
+            yield from wanted.pause()
+            for index, layer in cells:
+                resident = warm[layer].get(index) if layer in warm else None
+                resident = resident or cache.find_warm(index, layer, now_s)
+                if resident is not None and not found.refused:
+                    answer.residents.append(resident)
+                    answer.handles.append(resident.handle)
+                elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
+                    self._answer_cold(wanted, index, layer, answer, now_s)
+        if may_wait and wanted.waits:
+            return True
+        failed = yield from self._failed(wanted, answer.failed)
+        self._reply(wanted.session, wanted.request, wanted.layers, answer, found, failed)
+        if wanted.began_s:
+            self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
+        yield from self._hand_out(wanted.session, answer)
+        return False
+
+    def _waits_for(self, wanted: PendingRequest, index: int, layer: str, now_s: float) -> bool:
+        """Whether a cold cell is loaded, once more if its load had ended, and the request waits for it."""
+        key, loads = self._cache.key(index, layer), self._scheduler.loads
+        if key in wanted.outstanding:
+            return True
+        if key in wanted.found.refused or key in loads.failures:
             return False
-        for number, part in enumerate(parts(wanted.cells)):
-            if number:
-                yield from wanted.pause(self._cache)
-            now_s = self._now_s()
-            if now_s >= wanted.deadline_s:
-                return False
-            for index, layer in part:
-                key = Key(self._cache.catalogue.id(index), layer)
-                if key in wanted.refused or self._cache.find_warm(index, layer, now_s) is not None:
-                    continue
-                if (
-                    key not in wanted.outstanding  # it may be asked for twice
-                    and key not in self._scheduler.loads.failures
-                    and self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker)
-                ):
-                    self._patient.wait_for(wanted, key)
-        return wanted.waits
+        if not self._scheduler.want(index, layer, 0.0, now_s, wanted.session.asker):
+            return False
+        self._waiting.wait_for(wanted, key)
+        return True
+
+    def _answer_cold(
+        self, wanted: PendingRequest, index: int, layer: str, answer: _Answer, now_s: float
+    ) -> None:
+        """Answer for one cell that is not simply warm."""
+        cache, found, loads = self._cache, wanted.found, self._scheduler.loads
+        key, catalogue = cache.key(index, layer), cache.catalogue
+        wire_id = cache.wire_id(key.cell_id)
+        failure, promised = loads.failures.get(key), loads.is_promised(key)
+        refused = key in found.refused
+        resident = cache.resident(key)
+        current = resident is not None and cache.is_current(resident)
+        if resident is not None and not refused and (current or key not in found.held_old):
+            answer.residents.append(resident)
+            answer.handles.append(resident.handle if current else resident.stale_handle)
+        if refused:
+            mine = wanted.session.as_holder(wanted.session.held_bytes, len(wanted.session.held))
+            box, holders = catalogue.box(index), (mine,) if mine.bytes else ()
+            message = self._quota.message
+            answer.failed.append(FailedCell(wire_id, layer, "over_budget", message, holders, box))
+        elif not current and failure is not None and not promised:
+            holders = _UNNAMED if failure.code in SPACE_CODES else ()
+            box = catalogue.box(index)
+            answer.failed.append(FailedCell(wire_id, layer, failure.code, failure.message, holders, box))
+        elif not current:
+            if not promised:  # evicted, or no longer out of room: "pending" promises a load
+                self._scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
+            answer.pending.add((PendingCell(wire_id, layer),))
+
+    def _failed(self, wanted: PendingRequest, failed: list[FailedCell]) -> Generator[None, None, PackedArray]:
+        """Encode what failed; name the holders of memory beside cells that there is no memory for."""
+        packed, most = PackedArray(), tuple[Holder, ...]()
+        if any(cell.holders is _UNNAMED for cell in failed):
+            holders: list[Holder] = []
+            for _ in self._holders.look(holders):
+                yield from wanted.pause()
+            most = tuple(islice(holders, MAX_HOLDERS))
+        for cells in batched(failed):
+            yield from wanted.pause()
+            packed.add(
+                [
+                    msgspec.structs.replace(cell, holders=most) if cell.holders is _UNNAMED else cell
+                    for cell in cells
+                ]
+            )
+        return packed
+
+    def _reply(
+        self,
+        session: Session,
+        request: int,
+        layers: tuple[str, ...],
+        answer: _Answer,
+        found: Found,
+        failed: PackedArray | None = None,
+    ) -> None:
+        """Send a reply; the bookkeeping follows in `_hand_out`, when it is on its way."""
+        cache = self._cache
+        map_version = cache.catalogue.map_version
+        reply = encode_cells(
+            request, cache.epoch, map_version, answer.handles, found.removed, found.removed_packed, layers,
+            found.covered, answer.pending, failed or PackedArray(), reason=found.reason,
+        )  # fmt: skip
+        session.connection.reply(reply)
+
+    def _hand_out(self, session: Session, answer: _Answer) -> Iterator[None]:
+        """Note what a session was given."""
+        residents, pace = answer.residents, Pace()
+        self._cache.hand_out(residents, self._now_s())
+        self._statistics.add("handles_sent", len(answer.handles))
+        for begin in range(0, len(residents), NOTED_PER_STEP):
+            session.hold(residents[begin : begin + NOTED_PER_STEP])
+            yield from pace.pause()
+            if not session.is_connected:
+                return
+
+    # --- what happens meanwhile -----------------------------------------------------------------
+
+    def pages_settled(self, news: PageNews) -> None:
+        """Follow pages of the map that have come, or cannot be had at present."""
+        for page in news.come:
+            self._waiting.page_finished(page)
+        for page in news.out_of_reach:
+            self._waiting.page_finished(page, "offline")
+
+    def map_changed(self) -> None:
+        """Follow another state of the map, with other pages."""
+        self._waiting.map_changed()
+
+    def uses(self, page: int) -> bool:
+        """Whether a request that is not answered yet has cells of a page, or an area in it; or may have."""
+        pages = self._cache.pages
+        if pages is None or sum(len(wanted.found.cells) for wanted in self._open) > MAX_LOOKED_AT:
+            return True
+        cells = pages.cells(page)
+        return any(
+            any(index in cells for index, _layer in wanted.found.cells)
+            or (wanted.area is not None and page in self._cache.pages_around(wanted.area, wanted.layers))
+            for wanted in self._open
+        )
 
     def next_deadline_s(self) -> float:
-        """When there is something to do: when the next client's patience ends; infinity when nobody waits."""
-        return 0.0 if self._scheduler.ended else self._patient.next_deadline_s()
+        """Return when there is something to do: at once, or when a client's time is up; else infinity."""
+        return self._waiting.next_deadline_s()
+
+    def answer_finished(self) -> None:
+        """Answer requests whose last load or page has come; do some of what is left to do."""
+        for wanted in self._waiting.tidy():
+            self._answer_in_turn(wanted)
 
     def answer_overdue(self, now_s: float) -> None:
-        """Answer those who waited long enough, with what there is; see to what is left to tidy."""
-        for key in self._scheduler.take_ended():
-            self.settled(key)
-        for wanted in self._patient.overdue(now_s):
+        """Answer requests whose time is up, too."""
+        self.answer_finished()
+        for wanted in self._waiting.overdue(now_s):
             self._answer_in_turn(wanted)
-        self.tidy()
 
-    def forget(self, session: Session) -> None:
-        """The session ended: nobody waits for its requests any more."""
-        for wanted in self._patient.of(session):
-            self._patient.remove(wanted)
+    def on_disconnect(self, session: Session) -> None:
+        """Drop the requests of a session whose connection has ended."""
+        for wanted in self._waiting.of(session):
+            self._waiting.remove(wanted)
             self._end(wanted)
 
-    def left(self, session: Session) -> None:
-        """The session is no more: what it held may be free now."""
-        self.forget(session)
-        self._patient.left(session)
+    def on_session_end(self, session: Session) -> None:
+        """Release what a session held, which has ended."""
+
+        def steps() -> Iterator[None]:
+            for resident in session.residents():
+                session.drop_segment(resident)
+                self.release((resident,))
+                yield
+
+        self.on_disconnect(session)
+        self._waiting.do_later(steps())
 
     def answer_all(self) -> None:
-        """Answer everybody now (the daemon stops)."""
-        for wanted in self._patient:
+        """Answer all requests now (the daemon stops)."""
+        for wanted in self._waiting:
             wanted.deadline_s = 0.0
             for _ in self._answer_now(wanted):
                 pass
@@ -427,7 +551,7 @@ def _check_wait(wait_s: float | None) -> None:
 
 
 def _note_area(session: Session, area: Area, layers: tuple[str, ...]) -> None:
-    """A session asks for an area: in the middle of it is where it is, unless it says."""
+    """Note the area that a session asks for: in the middle of it is where it is, unless it says."""
     session.area, session.layers = area, layers
     if not session.says_where:
         session.intent = session.new_intent = messages.Intent(*area.center)

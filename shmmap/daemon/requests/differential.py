@@ -2,31 +2,28 @@
 """What a client lacks, and what it should drop: the set arithmetic of a differential request.
 
 Versions do the work: one names a layer of a cell *and* its state, so that a client that holds exactly the
-current versions of an area lacks nothing.  `warm_difference` is the way of nearly every request of
-a moving vehicle and is kept short; `difference` covers everything, a part a turn.
+current versions of an area lacks nothing.  Nearly every request of a moving vehicle is answered with
+`warm_difference`, which is kept short; `difference` covers everything, in as many turns as it needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Final, cast
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.records import Key, Resident
-from shmmap.daemon.requests.pending_request import PendingRequest, parts
+from shmmap.daemon.pace import batched
+from shmmap.daemon.records import Resident
+from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell
 
-__all__ = ["Difference", "WarmDifference", "difference", "lacking", "warm_difference"]
-
-UNKNOWN_A_STEP: Final = 16
-"""Versions of layers with a halo that are found in one turn: half a millisecond."""
+__all__ = ["WarmDifference", "difference", "warm_difference"]
 
 
 @dataclass(eq=False, slots=True)
@@ -45,7 +42,8 @@ def warm_difference(
 
     ``found`` are the catalogue indices of the area's cells, ascending.
     """
-    versions = cache.warm.versions(layer, found)
+    index = cache.warm
+    versions = index.versions(layer, found)
     if versions is None:
         return None
     packed = unpack_versions(message.packed)
@@ -58,7 +56,7 @@ def warm_difference(
         held.update(cast("list[int]", given))
     if 0 in current:
         return None  # 0 stands for "not in memory"
-    warm = cache.warm.layers[layer]
+    warm = index.layers[layer]
     cells = zip(found.tolist(), versions, strict=True)
     lacks = [warm[cell] for cell, version in cells if version not in held]
     removed: tuple[str, ...] = ()
@@ -66,11 +64,11 @@ def warm_difference(
     gone = held - current
     if gone:
         # an old version of a cell inside the area is replaced, not removed; another layer of one stays
-        of_version, index_of = cache.warm.of_version, cache.catalogue.find
-        suspects = gone if len(cache.warm.layers) > 1 else gone & cache.warm.retired.keys()
+        of_version, catalogue = index.of_version, cache.catalogue
+        suspects = gone if len(index.layers) > 1 else gone & index.retired.keys()
         known = ((version, key) for version in suspects if (key := of_version.get(version)) is not None)
-        of_cells = ((version, index_of(key.cell_id)) for version, key in known)
-        inside = ((version, warm.get(index)) for version, index in of_cells if index is not None)
+        of_cells = ((version, catalogue.find(key.cell_id)) for version, key in known)
+        inside = ((version, warm.get(cell)) for version, cell in of_cells if cell is not None)
         gone.difference_update([v for v, now in inside if now is not None and now.version in current])
         if named:
             removed = _removed_names(cache, named, gone, current, layer)
@@ -83,69 +81,43 @@ def _removed_names(
     cache: CellCache, named: Sequence[HeldCell], gone: set[int], current: set[int], layer: str
 ) -> tuple[str, ...]:
     """Held ids to drop, in the order given; one whose cell is in the area at another version stays."""
-    removed: dict[str, None] = {}
+    removed, warm = dict[str, None](), cache.warm
     for cell_id in [cell.id for cell in named if cell.version in gone]:
         index = cache.index_of(cell_id)
-        resident = cache.warm.get(index, layer) if index is not None else None
+        resident = warm.get(index, layer) if index is not None else None
         if resident is None or resident.version not in current:
             removed[cell_id] = None
     return tuple(removed)
 
 
-@dataclass(eq=False, slots=True)
-class Difference:
-    """The difference of any request.
-
-    Attributes
-    ----------
-    cells
-        Catalogue index and layer of everything to send, in reply order.
-    removed, removed_packed
-        What to drop, as the reply says it.
-    old
-        Layers of cells in the area that the client holds in an older version.
-    """
-
-    cells: list[tuple[int, str]] = field(default_factory=list)
-    removed: tuple[str, ...] = ()
-    removed_packed: bytes = b""
-    old: set[Key] = field(default_factory=set)
-
-
 def difference(
-    cache: CellCache,
-    message: Differential,
-    indices: Sequence[int],
-    layers: tuple[str, ...],
-    covered: bool,
-    pause: Callable[[], Iterator[None]],
-) -> Generator[None, None, Difference]:
-    """Find what the client lacks of the area's cells ``indices``, whether in memory or not.
+    wanted: PendingRequest, message: Differential, indices: list[int], layers: tuple[str, ...]
+) -> Generator[None, None, None]:
+    """Note as found what the client lacks of the area's cells ``indices``, whether in memory or not.
 
-    Parameters
-    ----------
-    covered
-        Whether these are all; else a cell that is not known may lie in the area.
-    pause
-        Lets others have a turn: called before each part but the first.
+    Where these are not all, a cell that is not known may lie in the area.
+
+    Raises
+    ------
+    MapChanged, NoSession
+        See `PendingRequest.pause`.
     """
-    version_of, id_of = cache.layers.version, cache.catalogue.id
-    for number, unknown in enumerate(cache.layers.unknown(indices, layers)):
-        if number and number % UNKNOWN_A_STEP == 0:
-            yield from pause()
+    cache, found = wanted.cache, wanted.found
+    versions, of_version = cache.layers, cache.warm.of_version
+    version_of = versions.version
+    for unknown in versions.unknown(indices, layers):
+        yield from wanted.pause()
         version_of(*unknown)
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
-    result = Difference()
     has: dict[int, set[str]] = {}
     removed: dict[str, None] = {}
-    for number, some in enumerate(parts(message.held)):
-        if number:
-            yield from pause()
-        for cell in some:
+    for held in batched(message.held):
+        yield from wanted.pause()
+        for cell in held:
             index = cache.index_of(cell.id)
             if index is None or index not in inside:
-                if covered or index is not None:
+                if found.covered or index is not None:
                     removed[cell.id] = None
                 continue
             named = layers if cell.layers is None else canonical_layers(cell.layers)
@@ -153,51 +125,28 @@ def difference(
             if cell.version is not None:  # that of one of them; else it is an old one
                 current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
                 if not current_of:
-                    result.old.update(Key(id_of(index), layer) for layer in mine)
+                    found.held_old.update(cache.key(index, layer) for layer in mine)
                 mine = current_of
             has.setdefault(index, set()).update(mine)
     current: set[int] = set()
-    for number, inner in enumerate(parts(indices)):
-        if number:
-            yield from pause()
-        for index in inner:
+    for cells in batched(indices):
+        yield from wanted.pause()
+        for index in cells:
             for layer in layers:
                 version = version_of(index, layer)
                 current.add(version)
                 if version not in packed and layer not in has.get(index, ()):
-                    result.cells.append((index, layer))
+                    found.cells.append((index, layer))
     gone = packed - current
-    for number, outdated in enumerate(parts([*gone])):
-        if number:
-            yield from pause()
-        for version in outdated:
-            key = cache.warm.of_version.get(version)
+    for versions_gone in batched([*gone]):
+        yield from wanted.pause()
+        for version in versions_gone:
+            key = of_version.get(version)
             index = cache.index_of(key.cell_id) if key is not None else None
             if key is not None and index in inside:
                 gone.discard(version)
-                result.old.add(key)
-            elif index is None and not covered:
+                found.held_old.add(key)
+            elif index is None and not found.covered:
                 gone.discard(version)
-    result.removed = tuple(removed)
-    result.removed_packed = pack_versions(gone)
-    return result
-
-
-def lacking(
-    cache: CellCache, message: Differential, found: NDArray[np.intp], layers: tuple[str, ...],
-    wanted: PendingRequest,
-) -> Generator[None, None, None]:  # fmt: skip
-    """Note in ``wanted`` what a client lacks of an area whose known cells are ``found``, a part a turn.
-
-    Raises
-    ------
-    MapChanged, NoSession
-        See `PendingRequest.pause`.
-    """
-    z = wanted.area.z if wanted.area is not None else None
-    indices = cache.at_height(found.tolist(), z)
-    lacks = yield from difference(
-        cache, message, indices, layers, wanted.covered, partial(wanted.pause, cache)
-    )
-    wanted.cells, wanted.held_old = lacks.cells, lacks.old
-    wanted.removed, wanted.removed_packed = lacks.removed, lacks.removed_packed
+    found.removed = tuple(removed)
+    found.removed_packed = pack_versions(gone)

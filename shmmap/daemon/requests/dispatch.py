@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the bytes of a request to whom they concern: decoded, authorised, routed or refused."""
+"""From the bytes of a request to what answers it: decoded, authorised, routed or refused."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from shmmap.daemon.cache.survey import Survey, Usage
+from shmmap.daemon.cache.holders import Survey, Usage
 from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
+from shmmap.daemon.pace import Pace, batched
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import check_intent
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
-from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import WorkItem
@@ -64,12 +64,12 @@ class Dispatch:
                 yield from work
         except ShmmapError as error:
             item.connection.refuse(request or request_number(data), error)
-        except Exception:  # noqa: BLE001  a defect met by one request must not end everybody's
+        except Exception:  # noqa: BLE001  a defect met by one request must not end the others'
             self.defects.record()
             item.connection.refuse(request, InternalError("the daemon failed on this request"))
 
     def _route(self, connection: Connection, message: messages.Request, body: bytes) -> Iterator[None] | None:
-        """Do what is asked for; what takes longer is returned."""
+        """Do what is asked for; return what takes longer."""
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
             entered = self.handshake.enter(connection, message, now_s)
@@ -103,7 +103,7 @@ class Dispatch:
         elif isinstance(message, messages.Stats):
             self.handshake.look_after_departed()
             self.survey.ask(
-                session, lambda usage: self.due(connection, self._tell_stats(session, message, usage))
+                session, lambda usage: self.due(connection, self._answer_stats(session, message, usage))
             )
         else:
             connection.reply(encode(self.queries.answer(message)))
@@ -111,13 +111,13 @@ class Dispatch:
 
     def _release(self, session: Session, message: messages.Release) -> Iterator[None]:
         versions = list(session.held) if message.packed is None else unpack_versions(message.packed)
-        for number, some in enumerate(parts(versions)):
-            if number:
-                yield
-            self.cells.let_go(session.drop(some))
+        pace = Pace()
+        for some in batched(versions):
+            yield from pace.pause()
+            self.cells.release(session.drop(some))
         session.connection.reply(encode(messages.Released(message.request)))
 
-    def _tell_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:
+    def _answer_stats(self, session: Session, message: messages.Stats, usage: Usage) -> Iterator[None]:
         self.sampler.measure()
         reply = yield from self.queries.stats(message, usage)
         session.connection.reply(encode(reply))

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from shmmap.daemon.cache.survey import Survey, Usage
+from shmmap.daemon.cache.holders import Survey, Usage
 from shmmap.daemon.events.log import EventLog, MinuteLog
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
@@ -24,7 +24,7 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["Handshake"]
 
 LOOKED_AT: Final = 64
-"""Departed sessions that are looked at at a time."""
+"""Departed sessions that are looked at a beat."""
 
 
 @dataclass(eq=False, slots=True)
@@ -33,8 +33,8 @@ class Handshake:
 
     Parameters
     ----------
-    operators, tell_live
-        Told of a session that has ended.
+    operators, on_live_session_end
+        Follow a session that has ended.
     departures
         Logs how many clients left, a line a minute.
     """
@@ -45,14 +45,14 @@ class Handshake:
     event_log: EventLog
     operators: OperatorRequests
     survey: Survey
-    tell_live: Callable[[Session], None] = lambda _session: None
+    on_live_session_end: Callable[[Session], None] = lambda _session: None
     departures: MinuteLog = field(default_factory=MinuteLog)
     _seen: Usage = field(default_factory=Usage)
     _settling: list[Session] = field(default_factory=list)
     _departed_before: list[Session] = field(default_factory=list)
 
     def enter(self, connection: Connection, message: Hello, now_s: float) -> Session:
-        """Return the session of who says hello.
+        """Return the session of a client that says hello.
 
         Raises
         ------
@@ -87,11 +87,11 @@ class Handshake:
         return session
 
     def hung_up(self, connection: Connection) -> None:
-        """A connection has ended; its session ends when the kernel says that it maps nothing."""
+        """Follow a connection that has ended; its session ends when the kernel says that it maps nothing."""
         if (session := self.sessions.by_slot(connection.slot)) is None:
             return
         session.disconnect()
-        self.cells.forget(session)
+        self.cells.on_disconnect(session)
         self.sessions.departed[session.slot] = session
         if session.held:
             self.survey.ask(session, lambda usage: self._settle(session, usage))
@@ -118,13 +118,13 @@ class Handshake:
             self.leave(session)
 
     def leave(self, session: Session) -> None:
-        """A client is gone, or said goodbye: what it held may be free now."""
+        """End the session of a client that is gone or said goodbye: what it held may be free now."""
         pid = session.peer.pid
         if session.held:
             log.debug("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)
             self.departures.count("clients left", session.client, session.held_bytes)
         self.event_log.publish(events.Left, session.slot, pid, session.client, session.held_bytes)
         self.sessions.close(session)
-        self.cells.left(session)
-        self.operators.left(session)
-        self.tell_live(session)
+        self.cells.on_session_end(session)
+        self.operators.on_session_end(session)
+        self.on_live_session_end(session)

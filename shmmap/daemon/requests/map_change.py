@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new state of the map takes over: waiting requests, memory and loads follow it, and it is told."""
+"""A new state of the map takes over: waiting requests, memory and loads follow it, and it is published."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from shmmap.protocol import events
 
 __all__ = ["MapChange"]
 
-CELLS_TOLD: Final = 64
-"""Changed cells named one by one: a map written anew has a million; `metadata` names them all."""
-PROBLEMS_TOLD: Final = 64
+MAX_NAMED: Final = 64
+"""Changed cells with events of their own: a rewritten map has a million; `metadata` names them all."""
+MAX_PROBLEMS: Final = 64
 """Problems of the map in the log."""
 
 
@@ -39,7 +39,7 @@ class MapChange:
     paging: Paging
 
     def collect(self) -> None:
-        """A reload is over: serve what it found, and tell those who asked for it."""
+        """Serve what a reload found, and answer those that asked for it."""
         self.reloader.collect(self._apply, self._keep)
 
     def _apply(self, reread: Reread) -> Reread | None:
@@ -56,20 +56,20 @@ class MapChange:
         statistics.set("last_reload_unix_ns", time.time_ns())
         statistics.set("last_reload_failed", 0)
         statistics.set("map_problems", len(catalogue.problems))
-        self._tell(reread.change)
-        for problem in itertools.islice(catalogue.problems, PROBLEMS_TOLD):
+        self._publish(reread.change)
+        for problem in itertools.islice(catalogue.problems, MAX_PROBLEMS):
             log.warning("problem in the map", what=problem)
         return reread
 
     def _try_again(self) -> None:
-        """More is known of the state of the map that was held back."""
+        """Serve the state of the map that was held back, if enough is known of it now."""
         self.reloader.apply_held(self._apply)
 
-    def _tell(self, change: CatalogueChange) -> None:
-        """Say what is new in the map."""
+    def _publish(self, change: CatalogueChange) -> None:
+        """Log and publish what is new in the map."""
         cache, catalogue = self.cache, self.cache.catalogue
         counts = {how: len(getattr(change, how)) for how in ("changed", "moved", "added", "removed")}
-        named = [(how, cell) for how in counts for cell in change.ids(how, CELLS_TOLD)][:CELLS_TOLD]
+        named = [(how, cell) for how in counts for cell in change.ids(how, MAX_NAMED)][:MAX_NAMED]
         log.info("reload done", cells=len(catalogue), **counts)
         self.event_log.publish(
             events.Reloaded, catalogue.map_version, counts["changed"] + counts["moved"], counts["added"],
@@ -81,8 +81,8 @@ class MapChange:
             self.event_log.publish(events.Changed, cache.wire_id(cell), version, how)
 
     def _keep(self, error: ShmmapError) -> None:
-        """The map could not be read again: the old state of it stays."""
-        cache = self.cache
-        cache.statistics.add("reloads_failed")
-        cache.statistics.set("last_reload_failed", 1)
-        self.event_log.publish(events.Reloaded, cache.catalogue.map_version, 0, 0, 0, 0, error.message)
+        """Keep the old state of the map, which could not be read again."""
+        statistics, catalogue = self.cache.statistics, self.cache.catalogue
+        statistics.add("reloads_failed")
+        statistics.set("last_reload_failed", 1)
+        self.event_log.publish(events.Reloaded, catalogue.map_version, 0, 0, 0, 0, error.message)

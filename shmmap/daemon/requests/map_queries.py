@@ -16,15 +16,15 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.holders import Share, Usage
 from shmmap.daemon.cache.map_switch import MapSwitch
-from shmmap.daemon.cache.survey import Share, Usage
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages
+from shmmap.daemon.pace import Pace
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.requests.pending_request import parts
 from shmmap.daemon.telemetry.sampler import client_row
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
@@ -45,7 +45,7 @@ LOOKED_AT: Final = 20_000
 """Cells that are tested for one page of an area's metadata, retired segments that are looked through."""
 METADATA_WAIT_S: Final = 0.25
 """How long a request for the list waits for a page of the map; it is repeated until that has come."""
-MOST_WAITING: Final = 1024
+MAX_WAITING: Final = 1024
 ROW_BITS: Final = 32
 
 
@@ -94,15 +94,16 @@ class MapQueries:
         return self.cache.catalogue
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
-        """Tell a new client where everything is."""
+        """Answer a new client's hello: where everything is."""
         cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
+        ledger = cache.ledger
         return messages.Welcome(
             message.request, major, minor, daemon=__version__, instance=self.config.instance,
             epoch=self.cache.epoch, session=session.slot, map_version=catalogue.map_version,
             map_path=self.config.map_path, frame_id=catalogue.frame_id, shm_dir=self.config.shm_dir,
             id_prefix=cache.id_prefix, segment_prefix=cache.segment_prefix, cells=len(catalogue),
             bounds=catalogue.bounds, layers=self._kinds,
-            budget_bytes=cache.ledger.budget_bytes, pid=os.getpid(), events=self.events_path,
+            budget_bytes=ledger.budget_bytes, pid=os.getpid(), events=self.events_path,
             origin=catalogue.frame.origin, crs=catalogue.frame.crs, unit_m=catalogue.frame.unit_m,
         )  # fmt: skip
 
@@ -125,7 +126,7 @@ class MapQueries:
             That cannot be had at present.
         """
         page = self.page(message)
-        if page is None and len(self._waiting) < MOST_WAITING:
+        if page is None and len(self._waiting) < MAX_WAITING:
             self._waiting.append(_Waiting(session, message, now_s + METADATA_WAIT_S))
         else:
             session.connection.reply(encode(page or self.page(message, empty=True)))
@@ -288,30 +289,34 @@ class MapQueries:
         return self._changes
 
     def _row(self, index: int) -> messages.MetadataRow:
-        catalogue = self._catalogue
-        heights = self.cache.heights.get(index) or (None, None)
+        catalogue, known = self._catalogue, self.cache.heights
+        heights = known.get(index) or (None, None)
         wire_id, size = self.cache.wire_id(catalogue.id(index)), catalogue.source_bytes(index)
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
     def stats(self, message: messages.Stats, usage: Usage) -> Generator[None, None, messages.StatsReply]:
         """Answer a request for statistics with what a survey found, some sessions a turn."""
-        rows: list[messages.ClientRow] = []
-        for number, sessions in enumerate(parts(tuple(self.sessions))):
-            if number:
-                yield
-            rows += [_with_share(client_row(one), usage.shares.get(one.slot, Share())) for one in sessions]
+        statistics, pace, rows = self.cache.statistics, Pace(), list[messages.ClientRow]()
+        for one in tuple(self.sessions):
+            yield from pace.pause()
+            rows.append(_with_share(client_row(one), usage.shares.get(one.slot, Share())))
         return messages.StatsReply(
-            message.request, self.cache.epoch, self._catalogue.map_version,
-            dict(self.cache.statistics.values), tuple(rows), usage.unknown, usage.unknown_bytes,
-        )  # fmt: skip
+            message.request,
+            self.cache.epoch,
+            self._catalogue.map_version,
+            dict(statistics.values),
+            tuple(rows),
+            usage.unknown,
+            usage.unknown_bytes,
+        )
 
     def _show(self, message: messages.Show) -> messages.ShownCell:
-        cache, catalogue = self.cache, self._catalogue
+        cache, catalogue, ledger, heights = self.cache, self._catalogue, self.cache.ledger, self.cache.heights
         index = cache.index_of(message.id)
-        # a cell that left the map while somebody maps it still shows, with version 0
+        # a cell that left the map while a process maps it still shows, with version 0
         ids = {message.id, cache.id_prefix + message.id} if index is None else {catalogue.id(index)}
-        found = [resident for cell_id in sorted(ids) for resident in cache.ledger.of_cell(cell_id)]
-        retired = itertools.islice(cache.ledger.retired.values(), LOOKED_AT)
+        found = [resident for cell_id in sorted(ids) for resident in ledger.of_cell(cell_id)]
+        retired = itertools.islice(ledger.retired.values(), LOOKED_AT)
         found += [one.resident for one in retired if one.resident.key.cell_id in ids]
         shown = tuple(map(self._segment, found))
         if index is None:
@@ -323,7 +328,7 @@ class MapQueries:
             return messages.ShownCell(message.request, found[0].key.cell_id, 0, *found[0].box, 0, shown)
         (cell_id,) = ids
         failures = [failure for key, failure in self.loads.failures.items() if key.cell_id == cell_id]
-        z_min, z_max = cache.heights.get(index) or (None, None)
+        z_min, z_max = heights.get(index) or (None, None)
         return messages.ShownCell(
             message.request, cell_id, catalogue.version(index), *catalogue.box(index),
             catalogue.source_bytes(index), shown,
@@ -333,12 +338,12 @@ class MapQueries:
         )  # fmt: skip
 
     def _segment(self, resident: Resident) -> messages.CellRow:
+        holders, ledger = self.cache.holders, self.cache.ledger
         state: CellState = "resident" if self.cache.is_current(resident) else "stale"
-        if resident.name in self.cache.ledger.retired:
+        if resident.name in ledger.retired:
             state = "zombie"
-        row = self.cache.rows.row(resident, state)
-        holders = self.cache.holders.of(resident)
-        return replace(row, id=resident.key.cell_id, segment=resident.name, holders=holders)
+        row = self.cache.events.row(resident, state)
+        return replace(row, id=resident.key.cell_id, segment=resident.name, holders=holders.of(resident))
 
 
 def _with_share(row: messages.ClientRow, share: Share) -> messages.ClientRow:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose list of cells comes in pages: what those that have come are for, and which may go again."""
+"""A map whose list of cells comes in pages: what those that have come are for, and which may be dropped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.loading.adoption import Adoption
 from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.map.catalogue_view import CatalogueView, Pages
+from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.transport.sessions import Sessions
@@ -24,7 +24,7 @@ __all__ = ["Paging"]
 
 KEPT_S: Final = 0.02
 """Pause after a page that has to stay: each check takes about a millisecond."""
-MOST_RETIRED: Final = 20_000
+MAX_RETIRED: Final = 20_000
 """Retired segments that are looked through; of more, no page is given up."""
 
 
@@ -49,10 +49,6 @@ class Paging:
     _was_out_of_reach: bool = False
     _rests_until_s: float = -math.inf
 
-    @property
-    def _pages(self) -> Pages | None:
-        return self.cache.catalogue.pages
-
     def follow(self) -> None:
         """Follow the pages of the map that is served from now on."""
         self._stop_following_the_next()
@@ -60,7 +56,7 @@ class Paging:
             self.watched.unwatch(self._fd)
             self.cells.map_changed()
             self.adoption.map_changed(time.monotonic())
-        pages = self._pages
+        pages = self.cache.pages
         self._fd = pages.fd if pages is not None else -1
         if self._fd >= 0:
             self.watched.watch(self._fd, self.collect, "map")
@@ -71,7 +67,7 @@ class Paging:
         Else its pages are fetched, and ``try_again`` is called when some have come.
         """
         self._stop_following_the_next()
-        pages, served = new.pages, self._pages
+        pages, served = new.pages, self.cache.pages
         lacking = pages.lacking(served) if pages is not None and served is not None else ()
         if pages is None or not lacking:
             return True
@@ -91,8 +87,8 @@ class Paging:
         self._coming_fd = -1
 
     def collect(self) -> None:
-        """Pages have settled: begin what waited for them."""
-        pages = self._pages
+        """Begin what waited for pages that have come, or cannot be had."""
+        pages = self.cache.pages
         if pages is None:
             return
         news = pages.collect()
@@ -101,7 +97,8 @@ class Paging:
         self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
             self.adoption.pages_came(news.come, time.monotonic())
-            if self.cache.layers.halo_m(self.cache.ledger.layers()):
+            layers, ledger = self.cache.layers, self.cache.ledger
+            if layers.halo_m(ledger.layers()):
                 self.map_switch.recheck()
         self.cells.pages_settled(news)
         self.scheduler.pages_settled()
@@ -112,7 +109,7 @@ class Paging:
     @property
     def next_s(self) -> float:
         """When a page may have to go, or a request for the list has waited long enough."""
-        pages = self._pages
+        pages = self.cache.pages
         if pages is None:
             return math.inf
         drop_s = self._rests_until_s if pages.spare() is not None else math.inf
@@ -121,7 +118,7 @@ class Paging:
     def run_step(self, now_s: float) -> None:
         """Drop a page, if they are too many and nothing needs it."""
         self.queries.answer_overdue(now_s)
-        pages = self._pages
+        pages = self.cache.pages
         page = pages.spare() if pages is not None and now_s >= self._rests_until_s else None
         if pages is None or page is None:
             return
@@ -134,19 +131,22 @@ class Paging:
 
     def is_needed(self, page: int) -> bool:
         """Whether a page has to stay."""
-        cache, pages = self.cache, self._pages
-        if pages is None or len(cache.ledger.retired) > MOST_RETIRED or self.cells.uses(page):
+        cache, ledger, catalogue, pages = (
+            self.cache,
+            self.cache.ledger,
+            self.cache.catalogue,
+            self.cache.pages,
+        )
+        if pages is None or len(ledger.retired) > MAX_RETIRED or self.cells.uses(page):
             return True
         for session in self.sessions:
-            if (area := session.area) is not None:
-                halo_m = cache.layers.halo_m(session.layers)
-                if page in pages.of_area(area.around(*area.center, halo_m)):
-                    return True
-        ids = set(map(cache.catalogue.id, pages.cells(page)))
-        in_memory = (one.resident.key.cell_id for one in cache.ledger.retired.values())
+            if session.area is not None and page in cache.pages_around(session.area, session.layers):
+                return True
+        ids = set(map(catalogue.id, pages.cells(page)))
+        in_memory = (one.resident.key.cell_id for one in ledger.retired.values())
         return (
             any(key.cell_id in ids for key in self.scheduler.loads.by_key)
-            or any(key.cell_id in ids for key in cache.ledger.needed())
+            or any(key.cell_id in ids for key in ledger.needed())
             or not ids.isdisjoint(in_memory)
-            or any(map(cache.ledger.of_cell, ids))
+            or any(map(ledger.of_cell, ids))
         )

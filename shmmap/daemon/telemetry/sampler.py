@@ -17,6 +17,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.cache.holders import Survey
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.transport.sessions import Session, Sessions
@@ -24,6 +25,7 @@ from shmmap.geometry import Area, Box, Circle
 from shmmap.protocol.rows import ClientRow, Window
 from shmmap.statistics.counters import REFUSALS, SPANS, WINDOWED
 from shmmap.statistics.layout import MAX_CLIENTS
+from shmmap.statistics.writer import StatisticsWriter
 
 if TYPE_CHECKING:
     from shmmap.origin.remote.object_tier import ObjectCounts
@@ -45,10 +47,10 @@ CHANGE_BEAT_S: Final = 0.02
 EVENT_BEAT_S: Final = 1.0
 """How often the last event's number is published, so that a missed event does not stay unnoticed."""
 ROWS_PER_BEAT: Final = 128
-USED_ROWS_PER_BEAT: Final = 64
 ROWS_PER_TURN: Final = 16
-"""Rows of cells that are written, or whose hits are brought up to date, at one beat, and in one of its turns,
-which takes a tenth of a millisecond."""
+"""Rows of cells that are written at one beat, and in one of its turns: a tenth of a millisecond."""
+MAX_TURNS_OF_USED: Final = 4
+"""Turns of a beat in which rows of cells that were handed out are brought up to date."""
 CLIENT_ROWS_PER_BEAT: Final = 64
 """Rows of clients that are brought up to date at one beat: half a millisecond."""
 SAMPLE_S: Final = 1.0
@@ -160,8 +162,6 @@ class Sampler:
 
     Parameters
     ----------
-    sessions
-        The clients.
     waiting
         Whose length is the number of requests that wait for loads.
     on_beat
@@ -169,7 +169,9 @@ class Sampler:
     """
 
     cache: CellCache
+    survey: Survey
     scheduler: Scheduler
+    statistics: StatisticsWriter
     event_log: EventLog
     sessions: Sessions
     waiting: Sized
@@ -188,7 +190,7 @@ class Sampler:
         """Return when the next beat or part of one is due: soon after cells came, went or changed."""
         if self._beating is not None:
             return 0.0
-        if self.cache.statistics.outdated:
+        if self.statistics.outdated:
             # a reader right after a change sees it, yet a stream of changes costs little
             return min(self._next_s, self._last_s + CHANGE_BEAT_S)
         return self._next_s
@@ -208,42 +210,22 @@ class Sampler:
 
     def measure(self) -> None:
         """Bring the gauges of memory, loads and the map up to date."""
-        cache, ledger, set_value = self.cache, self.cache.ledger, self.cache.statistics.set
+        self.cache.measure()
+        set_value = self.statistics.set
         set_value("sessions", len(self.sessions))
         set_value("waiting_requests", len(self.waiting))
         set_value("workers", len(self.scheduler.pool))
         set_value("load_queue", len(self.scheduler.loads))
-        set_value("cells_resident", ledger.resident_count)
-        found = ledger.unchecked_count + len(cache.warm) + cache.unentered
-        set_value("stale_cells", max(0, ledger.resident_count - found))
-        set_value("bytes_resident", ledger.resident_bytes)
-        set_value("zombies", len(ledger.retired))
-        set_value("bytes_zombie", ledger.retired_bytes)
-        set_value("bytes_pinned", cache.survey.usage.nbytes)
-        set_value("segments_pinned", cache.survey.usage.count)
-        set_value("bytes_reserved", ledger.reserved_bytes)
-        set_value("bytes_statistics", cache.statistics.size_bytes)
-        set_value("bytes_prefetched", ledger.prefetched_bytes)
-        set_value("budget_bytes", ledger.budget_bytes)
-        set_value("evictions", cache.evictor.evicted_count)
-        set_value("map_cells", len(cache.catalogue))
-        pages = cache.catalogue.pages
-        set_value("map_cells_known", len(cache.catalogue) if pages is None else pages.known_cells)
-        set_value("map_pages", 0 if pages is None else len(pages))
-        set_value("map_pages_known", 0 if pages is None else pages.known_pages)
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
         """Do what need not be done at each of many beats while cells load."""
-        cache, values = self.cache, self.cache.statistics.values
+        values = self.statistics.values
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
             for name, count in zip(WINDOWED, growth, strict=True):
                 values[f"{name}_{span}"] = count
-        cache.events.pressure.step(now_s)
-        cache.events.minutes.step(now_s)
-        cache.events.prefetch_misses.turn(now_s)
-        cache.lost.report(now_s)
+        self.cache.report(now_s)
         self._measure_prefetching(now_s)
         if now_s - self._event_beat_s >= EVENT_BEAT_S:
             self._event_beat_s = now_s
@@ -254,10 +236,10 @@ class Sampler:
 
         An outage begins when the failed loads were started; its length is shown until the next one.
         """
-        prefetcher, statistics = self.scheduler.prefetcher, self.cache.statistics
+        prefetcher, statistics = self.scheduler.prefetcher, self.statistics
         health = prefetcher.health
         statistics.set("outage_tolerance_ns", int(prefetcher.outage_tolerance_s * 1e9))
-        statistics.set("prefetch_budget_bytes", int(prefetcher.share * self.cache.ledger.budget_bytes))
+        statistics.set("prefetch_budget_bytes", int(prefetcher.budget_bytes))
         statistics.set("prefetch_short", prefetcher.shortage(now_s))
         statistics.set("origin_out", int(health.is_out))
         if health.is_out and self._outage_since_s is None:
@@ -270,48 +252,34 @@ class Sampler:
                 self._outage_since_s = None
                 statistics.set("origin_out_since_unix_ns", 0)
 
-    def _show_used(self, now_s: float) -> None:
-        """Bring hits and last use of some segments that were handed out up to date.
-
-        One that others cut short is retired: its cell has failed at the client's, and is loaded again.
-        """
-        cache = self.cache
-        for _ in range(min(ROWS_PER_TURN, len(cache.used))):
-            resident = cache.used.pop()
-            if cache.ledger.resident_named(resident.name) is resident:
-                if cache.retire_if_lost(resident, now_s):
-                    continue
-                cache.rows.show(resident, "resident" if cache.is_current(resident) else "stale")
-
     def _beat(self, now_s: float, *, whole: bool) -> Iterator[None]:
         """Each part takes some tenths of a millisecond at most."""
-        cache = self.cache
+        statistics = self.statistics
         if whole:
-            if cache.survey.idle:  # else it has turns of its own
-                cache.survey.step()
+            if self.survey.idle:  # else it has turns of its own
+                self.survey.step()
             yield
             self._look_around(now_s)
             yield
-            cache.statistics.show_clients(self._rows.of(self.sessions))
+            statistics.show_clients(self._rows.of(self.sessions))
             yield
-            for _ in range(USED_ROWS_PER_BEAT // ROWS_PER_TURN):
-                self._show_used(now_s)
+            for _ in range(MAX_TURNS_OF_USED):
+                more = self.cache.show_used(now_s)
                 yield
-                if not cache.used:
+                if not more:
                     break
         for _ in range(ROWS_PER_BEAT // ROWS_PER_TURN):
-            cache.statistics.write_rows(ROWS_PER_TURN)
-            if not cache.statistics.outdated:
+            statistics.write_rows(ROWS_PER_TURN)
+            if not statistics.outdated:
                 break
             yield
         yield
         self.measure()
         yield
-        cache.ledger.overhead_bytes = cache.statistics.size_bytes
-        cache.statistics.beat(max_rows=0)
+        statistics.beat(max_rows=0)
         if whole:
             yield
-            cache.statistics.restore(now_s)
+            statistics.restore(now_s)
             self.on_beat()
 
 

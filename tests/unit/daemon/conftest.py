@@ -22,6 +22,13 @@ def small_map(tmp_path: Path) -> DividedMap:
 
 
 @pytest.fixture
+def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """End each turn of work on many things after the first of them."""
+    monkeypatch.setattr("shmmap.daemon.pace.TURN_S", 0.0)
+    monkeypatch.setattr("shmmap.daemon.pace.BATCH", 1)
+
+
+@pytest.fixture
 def inner(tmp_path: Path) -> Iterator[Callable[..., InnerDaemon]]:
     """Make daemons without a socket: ``inner(map_path, budget_bytes=..., ...)``; closed at the end."""
     made: list[InnerDaemon] = []

@@ -18,10 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.evictor import Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.map_switch import MapSwitch
-from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.prepared_parent import PreparedParent
@@ -32,6 +30,7 @@ from shmmap.daemon.records import Key
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
+from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
@@ -94,33 +93,50 @@ class InnerDaemon:
         self.ledger = Ledger(budget_bytes)
         self.ledger.overhead_bytes = self.statistics.size_bytes
         pins = PinWatch(self.directory, events=True)
-        self.reclaimer = Reclaimer(self.ledger, self.directory, self.sessions, pins)
-        self.evictor = Evictor(self.reclaimer)
         self.watched = WatchedDescriptors()
         self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
         self.ended: list[Key] = []
         self.event_log = EventLog(EPOCH)
         self.cache = CellCache(
-            catalogue, self.evictor, self.statistics, self.event_log,
-            instance="inner", mode=0o400, gid=-1,
-        )  # fmt: skip
+            catalogue,
+            self.ledger,
+            self.directory,
+            self.sessions,
+            pins,
+            self.statistics,
+            self.event_log,
+            instance="inner",
+            mode=0o400,
+            gid=-1,
+        )
+        self.reclaimer, self.evictor, self.events = (
+            self.cache.reclaimer,
+            self.cache.evictor,
+            self.cache.events,
+        )
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
         self.map_switch = MapSwitch(self.cache)
         make_pool = partial(WorkerPool, workers, self.directory, self.parent, load_timeout_s, self.watched)
+        self.waiting = WaitingList(self.ledger)
         self.scheduler = Scheduler(
-            self.cache, self.map_switch, make_pool, clock=self.now_s, prefetch_share=prefetch_share,
+            self.cache,
+            self.map_switch,
+            make_pool,
+            self,
+            clock=self.now_s,
+            prefetch_share=prefetch_share,
             outage_tolerance_s=outage_tolerance_s,
-        )  # fmt: skip
+        )
         self.loads, self.pool = self.scheduler.loads, self.scheduler.pool
-        self.watched.watch(self.reclaimer.closer.fd, self.scheduler.room.on_freed)
-        self.watched.watch(pins.fd, lambda: self.scheduler.room.on_closes(self.now_s()))
+        self.scheduler.room.watch(self.watched, self.now_s)
         self.hold_answers = False
         self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []
         self.cells = CellRequests(
             self.cache,
             self.scheduler,
+            self.waiting,
             quota_bytes=quota_bytes,
             due=self._answer,
             clock=self.now_s,
@@ -139,6 +155,11 @@ class InnerDaemon:
         """Begin to serve a request for cells, and do what of it needs no waiting."""
         verb = getattr(self.cells, type(message).__name__.lower())
         finish(verb(session, message))
+
+    def load_finished(self, key: Key) -> None:
+        """Note the end of a load, as the list of waiting requests does."""
+        self.ended.append(key)
+        self.waiting.load_finished(key)
 
     def now_s(self) -> float:
         """Return the time of the daemon's clock."""
@@ -168,7 +189,6 @@ class InnerDaemon:
         self.scheduler.pump(now_s)
         while self.scheduler.unfinished:
             self.scheduler.pump(now_s)
-        self.ended += self.scheduler.ended
         self.cells.answer_overdue(now_s)
         self.map_switch.run_step(now_s)
         if self.scheduler.prefetcher.next_s <= now_s:
@@ -177,7 +197,7 @@ class InnerDaemon:
             self.evictor.run_step(now_s)
         while not self.hold_answers and self.due:
             finish(self.due.pop(0))
-        self.cache.tell_all()
+        self.events.flush()
 
     def run_until(self, done: Callable[[], object]) -> None:
         """Turn until ``done()``."""
@@ -233,7 +253,7 @@ class InnerDaemon:
         new = self.origin.load(fresh=True)
         self.map_switch.switch(new, new.changes_from(self.cache.catalogue))
         self.scheduler.map_changed()
-        self.cache.tell_all()
+        self.events.flush()
         return new
 
     def leave(self) -> None:

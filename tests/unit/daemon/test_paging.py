@@ -238,7 +238,7 @@ def test_an_area_is_refused_by_the_pages_that_lie_wholly_in_it(
     paged: Paged, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before any of them has come."""
-    monkeypatch.setattr(limits, "MOST_CELLS", 12)
+    monkeypatch.setattr(limits, "MAX_CELLS", 12)
     everything = m.BoxMessage(-100.0, -100.0, 100.0, 100.0)
     reply = paged.ask(lambda n: m.Area(n, everything, wait=LONG_S))
     assert isinstance(reply, m.ErrorReply)
@@ -698,13 +698,13 @@ def test_segments_of_what_is_not_known_yet_are_set_aside(
     paged.daemon = whole(paged.directory.root, origin=paged.origin)
     ledger, loaded = paged.daemon.memory.cache.ledger, paged.count("loads_finished")
     assert (paged.count("adopted"), ledger.resident_count) == (8, 8)
-    assert ledger.aside_bytes == sum(before[name].bytes for name in before if Path(name).name in EASTERN)
+    assert ledger.set_aside_bytes == sum(before[name].bytes for name in before if Path(name).name in EASTERN)
     assert EAST in paged.pages.wanted
     reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=0.3))
     assert not reply.covered
     paged.know(WEST, EAST)
     assert paged.count("adopted") == 16 - change
-    assert ledger.aside_bytes == 0
+    assert ledger.set_aside_bytes == 0
     reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
     assert names(reply.cells) == ALL
     others = [Path(cell.id).name for cell in reply.cells if cell.segment != before[cell.id].segment]
@@ -725,7 +725,7 @@ def test_what_is_set_aside_is_judged_by_a_later_version_that_knows_more(
         paged.origin, "load", lambda **_words: PagedView(paged.origin.whole, PAGES, {WEST, EAST})
     )
     paged.read_again()
-    assert (paged.count("adopted"), paged.daemon.memory.cache.ledger.aside_bytes) == (16, 0)
+    assert (paged.count("adopted"), paged.daemon.memory.cache.ledger.set_aside_bytes) == (16, 0)
 
 
 def test_what_is_set_aside_goes_with_the_daemon(paged: Paged, whole: Callable[..., WholeDaemon]) -> None:

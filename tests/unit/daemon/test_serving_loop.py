@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import pytest
 
-from shmmap.daemon.cache.cell_cache import CellCache
+from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.serving_loop import LONG_TURN_NS, TURN_NS
 from shmmap.protocol.events import LongTurn, Recent, decode_event
 from tests.support.divided_map import DividedMap
@@ -54,10 +54,10 @@ def test_a_defect_beside_a_request_does_not_starve_its_process(
 ) -> None:
     """What follows a request fails; the process's next request has its turn all the same."""
 
-    def broken(_: CellCache) -> NoReturn:
+    def broken(_: CellEvents) -> NoReturn:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr(CellCache, "tell_all", broken)
+    monkeypatch.setattr(CellEvents, "flush", broken)
     for request in (2, 3, 4):
         assert one.ask(Recent(request)).request == request
     assert one.memory.statistics.values["defects"] == 3

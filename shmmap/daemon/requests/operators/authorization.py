@@ -27,7 +27,7 @@ class Authorization:
     Parameters
     ----------
     group
-        Group (name or number) whose members may, besides root and the daemon's user; empty: nobody.
+        Group (name or number) whose members may, besides root and the daemon's user; empty: no one else.
     setting
         Where that is set.
 
@@ -61,7 +61,7 @@ class Authorization:
         Raises
         ------
         NotPermitted
-            It belongs to somebody else.
+            It may not.
         """
         if not self.allow(peer, now_s):
             members = f", and members of group {self._name}" if self._name else ""

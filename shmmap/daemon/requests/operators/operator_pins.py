@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cells that an operator wants resident, asked for or not: they are loaded, and never make room.
 
-A pin is on a cell and a layer, not on a version: a cell that changes is loaded anew, one that
+A pin is on a cell and a layer, not on a version: a cell that changes is loaded again, one that
 cannot be loaded is tried again.  Pins end with `unpin` or with the daemon.
 """
 
@@ -16,9 +16,9 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
+from shmmap.daemon.pace import Pace
 from shmmap.daemon.records import Key
 from shmmap.daemon.requests.limits import check_count
-from shmmap.daemon.requests.pending_request import parts
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages
@@ -27,9 +27,9 @@ from shmmap.quantities import format_bytes
 
 __all__ = ["OperatorPins", "cells_named"]
 
-LOOKS_AT_ONCE: Final = 64
+LOOKS_PER_BEAT: Final = 64
 """Pins looked at per beat: about a fifth of a millisecond."""
-MOST_PINS: Final = 20_000
+MAX_PINS: Final = 20_000
 
 
 def cells_named(
@@ -45,15 +45,14 @@ def cells_named(
     check_count(len(ids))
     known: dict[str, None] = {}
     unknown: list[str] = []
-    for number, some in enumerate(parts(ids)):
-        if number:
-            yield
-        for cell in some:
-            index = cache.index_of(cell)
-            if index is None:
-                unknown.append(cell)
-            else:
-                known[cache.catalogue.id(index)] = None
+    pace = Pace()
+    for cell in ids:
+        yield from pace.pause()
+        index, catalogue = cache.index_of(cell), cache.catalogue
+        if index is None:
+            unknown.append(cell)
+        else:
+            known[catalogue.id(index)] = None
     return list(known), tuple(dict.fromkeys(unknown))
 
 
@@ -92,44 +91,41 @@ class OperatorPins:
         cells, unknown = yield from cells_named(self.cache, message.ids)
         wanted = [Key(cell, layer) for cell in cells for layer in canonical_layers(message.layers)]
         check_count(len(wanted))
-        new = {}
-        for number, some in enumerate(parts(wanted)):
-            if number:
-                yield
-            new.update({key: self._size(key) for key in some if key not in self._keys})
-        ledger = self.cache.ledger
+        new, ledger, pace = dict[Key, int](), self.cache.ledger, Pace()
+        for key in wanted:
+            yield from pace.pause()
+            if key not in self._keys:
+                new[key] = self._size(key)
         total = self._total + sum(new.values())
-        if total + ledger.overhead_bytes > ledger.budget_bytes:
+        if not ledger.fits_at_all(total):
             raise OverBudget(
                 f"with these cells {format_bytes(total)} would be pinned; the budget is"
                 f" {format_bytes(ledger.budget_bytes)}",
                 hint="unpin others, or serve with a larger --budget",
             )
-        if len(self._keys) + len(new) > MOST_PINS:
-            raise BadRequest(f"more than {MOST_PINS} cells would be pinned", hint="unpin others")
-        for number, some in enumerate(parts(wanted)):
-            if number:
-                yield
-            for key in some:
-                if key not in self._keys:
-                    ledger.need(key)
-                    self._keys[key] = new[key]
-                    self._total += new[key]
-                self._keep(key, now_s)
+        if len(self._keys) + len(new) > MAX_PINS:
+            raise BadRequest(f"more than {MAX_PINS} cells would be pinned", hint="unpin others")
+        for key in wanted:
+            yield from pace.pause()
+            if key not in self._keys:
+                ledger.need(key)
+                self._keys[key] = new[key]
+                self._total += new[key]
+            self._keep(key, now_s)
         return (yield from self._answer(message.request, wanted, unknown))
 
     def unpin(self, message: messages.Unpin) -> Generator[None, None, messages.Pinned]:
-        """Let cells go, all without ids; answers with what stays pinned."""
+        """Unpin cells, all without ids; answer with what stays pinned."""
         cells, unknown = yield from cells_named(self.cache, message.ids or ())
-        named = set(cells)
+        named, ledger = set(cells), self.cache.ledger
         for key in [key for key in self._keys if message.ids is None or key.cell_id in named]:
             self._total -= self._keys.pop(key)
-            self.cache.ledger.need_no_more(key)
+            ledger.need_no_more(key)
         return (yield from self._answer(message.request, list(self._keys), unknown))
 
     def keep(self, now_s: float) -> None:
         """Look at some pins: what is not in memory at its current version is loaded."""
-        for key in list(islice(self._keys, LOOKS_AT_ONCE)):
+        for key in list(islice(self._keys, LOOKS_PER_BEAT)):
             self._keys.move_to_end(key)
             self._keep(key, now_s)
 
@@ -142,24 +138,24 @@ class OperatorPins:
             self.scheduler.want(index, key.layer, BACKGROUND, now_s)
 
     def _size(self, key: Key) -> int:
-        resident = self.cache.ledger.by_key.get(key)
-        if resident is not None:
-            return resident.nbytes
+        ledger = self.cache.ledger
+        if key in ledger.by_key:
+            return ledger.by_key[key].nbytes
         index = self.cache.index_of(key.cell_id)
         return 0 if index is None else self.cache.estimate(index, key.layer)
 
     def _answer(
         self, request: int, keys: Sequence[Key], unknown: tuple[str, ...]
     ) -> Generator[None, None, messages.Pinned]:
-        rows: list[PinnedCell] = []
-        for number, some in enumerate(parts(keys)):
-            if number:
-                yield
-            rows += map(self._row, some)
+        rows, pace = list[PinnedCell](), Pace()
+        for key in keys:
+            yield from pace.pause()
+            rows.append(self._row(key))
         return messages.Pinned(request, tuple(rows), unknown)
 
     def _row(self, key: Key) -> PinnedCell:
-        resident, failure = self.cache.ledger.by_key.get(key), self.scheduler.loads.failures.get(key)
+        ledger, failure = self.cache.ledger, self.scheduler.loads.failures.get(key)
+        resident = ledger.by_key.get(key)
         if resident is not None:
             state = "resident" if self.cache.is_current(resident) else "stale"
         elif self.scheduler.loads.is_promised(key):

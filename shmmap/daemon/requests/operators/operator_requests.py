@@ -10,6 +10,7 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
+from shmmap.daemon.pace import Pace
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import Offline, ShmmapError
@@ -20,23 +21,21 @@ from shmmap.protocol.codec import encode
 __all__ = ["OPERATOR_REQUESTS", "OperatorRequests"]
 
 OPERATOR_REQUESTS: Final = (messages.Reload, messages.Evict, messages.Pin, messages.Unpin, messages.Shutdown)
-EVICTED_AT_ONCE: Final = 16
-"""Segments retired in one turn: each is renamed, and the kernel asked who uses it."""
 RELOAD_S: Final = 4.0
 """How long a reload of a map that is elsewhere may take before its answer is that it cannot be reached."""
 FAREWELL_S: Final = 1.0
-"""How long a stop waits for the one who asked for it: its libzmq drops a reply that was not read when the
+"""How long a stop waits for the client that asked for it: its libzmq drops a reply that was not read when the
 connection ends (ZMQ_IMMEDIATE)."""
 
 
 @dataclass(eq=False, slots=True)
 class OperatorRequests:
-    """Does what an operator asks; whether one may ask was found out before.
+    """Does what an operator asks; the permission was checked before.
 
     Attributes
     ----------
     stop_by_s
-        When the daemon stops; infinity if nobody asked for that.
+        When the daemon stops; infinity if no operator asked for that.
     """
 
     cache: CellCache
@@ -64,8 +63,8 @@ class OperatorRequests:
             session.connection.reply(encode(messages.Stopping(message.request)))
             self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
-    def left(self, session: Session) -> None:
-        """A session ended: if it is the one that the daemon stops for, it has read its answer."""
+    def on_session_end(self, session: Session) -> None:
+        """Stop now, if this is the session that the daemon stops for: it has read its answer."""
         if session is self._asked_to_stop:
             self.stop_by_s = -math.inf
 
@@ -81,7 +80,7 @@ class OperatorRequests:
         asked = session.slot, message.request
         if asked in self._reloading:
             return  # the client repeats what it has no answer to yet
-        until_s = math.inf if self.cache.catalogue.pages is None else now_s + RELOAD_S
+        until_s = math.inf if self.cache.pages is None else now_s + RELOAD_S
         self._reloading[asked] = session, until_s
 
         def answer(result: Reread | ShmmapError) -> None:
@@ -110,11 +109,11 @@ class OperatorRequests:
                 chosen += ledger.of_cell(cell)
                 yield
         freed = kept = 0
-        for number, resident in enumerate(chosen):
-            if number % EVICTED_AT_ONCE == EVICTED_AT_ONCE - 1:
-                yield
+        pace = Pace()
+        for resident in chosen:
+            yield from pace.pause()
             if ledger.resident_named(resident.name) is not resident:
-                continue  # somebody else had it evicted meanwhile
+                continue  # it was evicted meanwhile
             if resident.key in self.pins:
                 kept += 1
             else:

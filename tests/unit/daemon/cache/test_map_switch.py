@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Another state of the map is served at once; what is in memory is looked at a few segments a turn."""
+"""Another state of the map is served at once; what is in memory is looked at some segments a turn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from shmmap.daemon.cache import map_switch
-from shmmap.daemon.cache.map_switch import SEGMENTS_A_STEP
 from shmmap.daemon.cache.warm_index import Heights
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Area, CircleMessage, Differential, Metadata
@@ -25,13 +24,10 @@ def made(tmp_path: Path) -> DividedMap:
     return make_map(tmp_path / "map", columns=SIDE, rows=SIDE, points=5)
 
 
-def steps(one: InnerDaemon) -> int:
-    """Do the rest of a change; returns how many turns it took."""
-    count = 0
+def finish_change(one: InnerDaemon) -> None:
+    """Do the rest of a change."""
     while one.map_switch.busy:
         one.map_switch.run_step(one.now_s())
-        count += 1
-    return count
 
 
 def remove(made: DividedMap, name: str) -> None:
@@ -39,23 +35,9 @@ def remove(made: DividedMap, name: str) -> None:
     made.write_metadata()
 
 
-def test_a_turn_looks_at_a_few_segments(inner: Inner, made: DividedMap) -> None:
-    one = inner(str(made.root))
-    one.everything()
-    remove(made, "0_0.pcd")
-    one.reload()
-    assert len(one.cache.warm) == 0
-    before, entered = 0, []
-    while one.map_switch.busy:
-        one.map_switch.run_step(one.now_s())
-        entered.append(len(one.cache.warm) - before)
-        before = len(one.cache.warm)
-    assert max(entered) == SEGMENTS_A_STEP
-    assert (len(one.cache.warm), one.ledger.resident_count, one.cache.unentered) == (CELLS - 1, CELLS - 1, 0)
-
-
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_whoever_asks_meanwhile_is_answered_as_if_it_were_over(
+@pytest.mark.parametrize("turns", [0, 1, CELLS // 2, CELLS + 3])
+@pytest.mark.usefixtures("short_turns")
+def test_requests_meanwhile_are_answered_as_if_it_were_over(
     inner: Inner, made: DividedMap, turns: int
 ) -> None:
     """Nothing is loaded again, nothing that left is handed out, and what is held is not sent again."""
@@ -73,12 +55,14 @@ def test_whoever_asks_meanwhile_is_answered_as_if_it_were_over(
     assert len(reply.removed_packed) == 8  # of the cell that left; the changed one is replaced
     assert len(one.everything(3).cells) == CELLS - 1
     assert one.statistics.values["loads_started"] == loads + 1
-    steps(one)
+    finish_change(one)
+    assert one.cache.unentered == 0
     one.ask(one.session(), Area(4, CircleMessage(1, 1, 2)))
     assert "0_0.pcd" not in names(one.cells_of(4))
     assert one.ledger.resident_count == CELLS - 1
 
 
+@pytest.mark.usefixtures("short_turns")
 def test_a_change_during_a_change(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     one.everything()
@@ -86,31 +70,15 @@ def test_a_change_during_a_change(inner: Inner, made: DividedMap) -> None:
         remove(made, name)
         one.reload()
         one.map_switch.run_step(one.now_s())
-    steps(one)
+    finish_change(one)
     assert len(one.cache.warm) == one.ledger.resident_count == CELLS - 5
     assert len(one.everything(2).cells) == CELLS - 5
-
-
-def test_tables_are_freed_little_by_little(
-    inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(map_switch, "ENTRIES_A_STEP", 7)
-    one = inner(str(made.root))
-    one.everything()
-    made.change("20_20.pcd", 3)
-    one.reload()
-    (table,) = one.map_switch._leftovers
-    assert len(table) == CELLS
-    one.map_switch.run_step(one.now_s())
-    assert len(table) == CELLS - 7
-    steps(one)
-    assert len(table) == 0
 
 
 def test_very_many_changes_are_not_remembered(
     inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who asks what changed since then gets the whole list; fewer are told, also of several states."""
+    """Then the whole list is answered; fewer changes are named, also of several states."""
     monkeypatch.setattr(map_switch, "CELLS_REMEMBERED", 5)
     one = inner(str(made.root))
     first = one.cache.catalogue.map_version
@@ -121,8 +89,8 @@ def test_very_many_changes_are_not_remembered(
     second = one.cache.catalogue.map_version
     made.change(some[3], 3)
     one.reload()
-    told = one.queries.page(Metadata(1, since=first))
-    assert [row.id for row in told.rows] == some[:4]  # type: ignore[union-attr]
+    page = one.queries.page(Metadata(1, since=first))
+    assert [row.id for row in page.rows] == some[:4]  # type: ignore[union-attr]
     for name in some[4:]:
         made.change(name, 4)
     one.reload()

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from shmmap.daemon.cache.evictor import WORK_AT_ONCE, Evictor
+from shmmap.daemon.cache.evictor import WORK_PER_TURN, Evictor
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_AT_ONCE, TICK_S, Reclaimer
+from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_PER_TURN, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Sessions
@@ -34,9 +34,8 @@ class Memory:
         self.directory = directory
         self.ledger = Ledger(1 << 40)
         self.pins = PinWatch(directory, events=True)
-        self.reclaimer = Reclaimer(self.ledger, directory, Sessions(), self.pins)
-        self.reclaimer.on_retired = lambda *_: None
-        self.reclaimer.on_gone = lambda *_: None
+        nothing: Any = SimpleNamespace(segment_retired=lambda *_: None, segment_gone=lambda *_: None)
+        self.reclaimer = Reclaimer(self.ledger, directory, Sessions(), self.pins, nothing)
         self.evictor = Evictor(self.reclaimer)
         self.looks = 0
         look = PinWatch.is_used_elsewhere
@@ -127,10 +126,12 @@ def test_a_large_segment_s_memory_counts_until_it_is_free(
     assert held == [(0, LARGE)], "it had no name, but all its memory"
 
 
-def test_so_many_wait_to_be_closed(memory: Memory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_that_wait_to_be_closed_is_bounded(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The others keep their names, and count, until there is room for them."""
     monkeypatch.setattr(closer, "MAX_WAITING", 3)
-    monkeypatch.setattr(closer.Closer, "_run", lambda _: None)  # nobody closes anything
+    monkeypatch.setattr(closer.Closer, "_run", lambda _: None)  # nothing is closed
     large = memory.publish(5, LARGE)
     for resident in large:
         memory.reclaimer.retire(resident, NOW_S)
@@ -145,56 +146,45 @@ def test_so_many_wait_to_be_closed(memory: Memory, monkeypatch: pytest.MonkeyPat
         os.close(item[0])
 
 
-def test_retired_segments_are_looked_at_a_few_at_a_time(memory: Memory) -> None:
-    """All that are due come to their turn."""
-    for resident in memory.publish(5 * LOOKS_AT_ONCE):
-        memory.reclaimer.retire(resident, NOW_S)
-    memory.looked()
-    for left in range(4, -1, -1):
-        assert memory.reclaimer.next_sweep_s() == NOW_S + TICK_S
-        memory.reclaimer.sweep(NOW_S + TICK_S)
-        assert memory.looked() == LOOKS_AT_ONCE
-        assert len(memory.ledger.retired) == left * LOOKS_AT_ONCE
-    assert memory.reclaimer.next_sweep_s() == float("inf")
-
-
-def test_what_a_client_lets_go_of_is_looked_at_a_few_at_a_time(memory: Memory) -> None:
-    """However much that is: by its word, by the kernel's, and when there were too many to tell which."""
-    some = memory.publish(3 * LOOKS_AT_ONCE)
+def test_what_a_client_releases_is_looked_at_a_few_at_a_time(memory: Memory) -> None:
+    """However much that is: as it says, as the kernel reports, and when the kernel lost reports."""
+    some = memory.publish(3 * LOOKS_PER_TURN)
     mapped = [memory.map(resident) for resident in some]
     for resident in some:
         assert not memory.reclaimer.retire(resident, NOW_S)
     while memory.reclaimer.next_sweep_s() <= NOW_S + TICK_S:
+        memory.looked()
         memory.reclaimer.sweep(NOW_S + TICK_S)
+        assert memory.looked() == LOOKS_PER_TURN
     later_s = NOW_S + TICK_S + 1e-4
     assert memory.reclaimer.next_sweep_s() > later_s
     memory.looked()
-    for one in mapped[:LOOKS_AT_ONCE]:
+    for one in mapped[:LOOKS_PER_TURN]:
         one.close()
-    memory.reclaimer.let_go(some[: 2 * LOOKS_AT_ONCE], later_s)
+    memory.reclaimer.release(some[: 2 * LOOKS_PER_TURN], later_s)
     assert memory.looked() == 0
     memory.reclaimer.sweep(later_s)
-    assert memory.looked() == LOOKS_AT_ONCE
-    assert len(memory.ledger.retired) == 2 * LOOKS_AT_ONCE
+    assert memory.looked() == LOOKS_PER_TURN
+    assert len(memory.ledger.retired) == 2 * LOOKS_PER_TURN
     for one in mapped:
         one.close()
     memory.pins.closed = lambda: None  # type: ignore[method-assign]
-    assert memory.reclaimer.hear(later_s)
+    assert memory.reclaimer.on_closes(later_s)
     assert memory.looked() == 0
     for _ in range(8):
         memory.reclaimer.sweep(later_s)
-        assert memory.looked() <= LOOKS_AT_ONCE
+        assert memory.looked() <= LOOKS_PER_TURN
     assert not memory.ledger.retired
 
 
 def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
-    """Somebody may be just opening it, whoever lets go of it meanwhile."""
+    """A process may be just opening it, whichever releases it meanwhile."""
     (one,) = memory.publish(1)
     mapped = memory.map(one)
     assert not memory.reclaimer.retire(one, NOW_S)
     mapped.close()
-    memory.reclaimer.let_go([one], NOW_S)
-    memory.reclaimer.hear(NOW_S)
+    memory.reclaimer.release([one], NOW_S)
+    memory.reclaimer.on_closes(NOW_S)
     assert memory.reclaimer.sweep(NOW_S + TICK_S / 2) == 0
     assert memory.reclaimer.sweep(NOW_S + TICK_S) == SMALL
 
@@ -202,7 +192,7 @@ def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
 def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
     """Past whatever is mapped, needed or was just handed out, which is not looked at again and again."""
     memory.ledger.budget_bytes = 0
-    used = memory.publish(2 * WORK_AT_ONCE)
+    used = memory.publish(2 * WORK_PER_TURN)
     mapped = [memory.map(resident) for resident in used]
     needed, free = memory.publish(3), memory.publish(3)
     for number, resident in enumerate((*used, *needed, *free)):
@@ -212,13 +202,13 @@ def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
     missing = len(free) * SMALL
     looks = memory.until_it_waits(missing)
     assert sum(looks) == len(used) + 2 * len(free)  # once more when it has another name
-    assert max(looks) == WORK_AT_ONCE
+    assert max(looks) == WORK_PER_TURN
     assert list(memory.ledger.retired) == [one.name for one in free]
     assert not memory.evictor.free(missing + SMALL, NOW_S)
     assert memory.looked() == 0, "nothing has changed"
     memory.ledger.need_no_more(needed[0].key)
     mapped[0].close()
-    memory.reclaimer.let_go(used[:1], NOW_S)
+    memory.reclaimer.release(used[:1], NOW_S)
     memory.until_it_waits(memory.ledger.coming_bytes + 2 * SMALL)
     assert {needed[0].name, used[0].name} <= set(memory.ledger.retired)
     needed[1].last_use_s = NOW_S
@@ -237,7 +227,7 @@ def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
         one.close()
 
 
-def test_the_walk_over_all_takes_changes_in_its_stride(memory: Memory) -> None:
+def test_a_walk_over_all_while_segments_go(memory: Memory) -> None:
     """What is there all the time is found, whatever goes meanwhile; larger ones first."""
     some: list[Any] = [*memory.publish(20), *memory.publish(20, LARGE)]
     segments, seen = memory.ledger.segments, list[Resident]()
@@ -254,8 +244,8 @@ def test_the_walk_over_all_takes_changes_in_its_stride(memory: Memory) -> None:
         segments.add(resident)  # as it was
 
 
-def test_what_the_kernel_will_tell_of_is_looked_at_less_and_less(memory: Memory) -> None:
-    """Where it tells nothing, always after the same time."""
+def test_what_the_kernel_reports_is_looked_at_less_and_less(memory: Memory) -> None:
+    """Where it reports nothing, always after the same time."""
     (one,) = memory.publish(1)
     mapped, now_s = memory.map(one), NOW_S
 
@@ -276,9 +266,9 @@ def test_what_the_kernel_will_tell_of_is_looked_at_less_and_less(memory: Memory)
     assert waits() == longer
     other = memory.map(one)
     other.close()
-    assert memory.reclaimer.hear(now_s)
-    assert waits() == longer, "the kernel said that somebody let go"
-    memory.pins.tell_once = lambda name: False  # type: ignore[method-assign]  # noqa: ARG005
+    assert memory.reclaimer.on_closes(now_s)
+    assert waits() == longer, "the kernel reported a close"
+    memory.pins.watch_next_close = lambda name: False  # type: ignore[method-assign]  # noqa: ARG005
     assert waits() == [0.2] * 8
     mapped.close()
     memory.until_it_waits(SMALL, now_s)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""In /dev/shm everybody may make files, also under the names that the daemon is about to need.
+"""In /dev/shm any user may make and remove files, also under the names that the daemon needs.
 
-A directory stands for a stranger's file here: it cannot be replaced by renaming either, not even by root.
+A directory stands for a foreign file here: it cannot be replaced by renaming either, not even by root.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def taken(one: InnerDaemon, name: str) -> Iterator[None]:
 
 
 def shown(one: InnerDaemon) -> dict[str, str]:
-    """Segments and their states as the statistics tell."""
-    one.cache.tell_all()
+    """Segments and their states in the statistics."""
+    one.events.flush()
     one.statistics.beat()
     return {cell.segment: cell.state for cell in read_statistics("inner", one.shm_dir).cells}
 
 
 def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> None:
-    """It retires under another one, is told of under that, comes back, and is freed in the end."""
+    """It retires under another one, is shown under that, comes back, and is freed in the end."""
     one = inner(small_map.root)
     first = load(one, 1)
     old = first.name
@@ -61,7 +61,7 @@ def test_the_name_of_a_retired_segment(inner: Inner, small_map: DividedMap) -> N
 
 
 def test_the_name_it_had_before(inner: Inner, small_map: DividedMap) -> None:
-    """It cannot come back, so that the cell is loaded anew; the retired one goes when its reader does."""
+    """It cannot come back, so that the cell is loaded again; the retired one goes when its reader does."""
     one = inner(small_map.root)
     first = load(one, 1)
     with open(f"{one.shm_dir}{first.name}", "rb"):
@@ -80,6 +80,18 @@ def test_what_others_cut_short_never_comes_back(inner: Inner, small_map: Divided
     with open(path, "rb"):
         os.chmod(path, 0o600)  # an ordinary user may not write what it made read-only
         os.truncate(path, 0)
-        assert one.cache.retire_if_lost(first, one.now_s())
+        assert one.cache.lost.retire_if_lost(first, one.now_s())
         assert load(one, 2) is not first
     one.run_until(lambda: not one.ledger.retired)
+
+
+def test_names_that_vanish(inner: Inner, small_map: DividedMap) -> None:
+    """The cell is loaded again; names of others do not matter, and retired ones are expected to go."""
+    one = inner(small_map.root)
+    first, lost = load(one, 1), one.cache.lost
+    assert lost.vanished() == set()
+    Path(one.shm_dir, "shmmap.other.1").write_bytes(b"")
+    Path(one.shm_dir, "shmmap.other.1").unlink()
+    Path(one.path_of(first.name.rpartition(".")[2])).unlink()
+    one.run_until(lambda: not one.cache.is_in_service(first))
+    assert load(one, 2) is not first

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The log of events: numbers, what is remembered, and pressure told at most once a second."""
+"""The log of events: numbers, what is remembered and sent, and log lines of what happens often."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ import logging
 
 import pytest
 
-from shmmap.daemon.events.log import REMEMBERED, EventLog, MinuteLog, PressureEvents
+from shmmap.daemon.events.cell_events import PressureEvents
+from shmmap.daemon.events.log import REMEMBERED, EventLog, MinuteLog
 from shmmap.protocol import events as e
+from tests.support.connections import Subscriber
 
 MEMORY = (100, 90, 80, 70)
 
 
-def log_of(sent: list[e.Event], *, epoch: int = 7) -> EventLog:
-    """Return a log whose clock ticks once per event."""
-    ticks = iter(range(1, 1 << 20))
-    log = EventLog(epoch, clock_ns=lambda: next(ticks))
-    log.send = lambda data: sent.append(e.decode_event(data))  # type: ignore[arg-type]
-    return log
+def subscribed(*, epoch: int = 7) -> tuple[EventLog, Subscriber]:
+    """Return a log whose clock ticks once per event, and what it sends."""
+    ticks = iter(range(1 << 20))
+    log, subscriber = EventLog(epoch, clock_ns=lambda: next(ticks)), Subscriber()
+    log.subscribe(subscriber)
+    (first,) = subscriber.take()
+    assert first == e.Beat(0, epoch, 0)
+    return log, subscriber
 
 
 def numbers(page: e.EventPage) -> list[int]:
@@ -26,14 +30,17 @@ def numbers(page: e.EventPage) -> list[int]:
 
 
 def test_events_are_numbered_sent_and_remembered() -> None:
-    sent: list[e.Event] = []
-    log = log_of(sent)
+    log, subscriber = subscribed()
     assert numbers(log.page(e.Recent(1))) == []
     for number in range(3):
         log.publish(e.Changed, f"{number}.pcd", number, "changed")
     log.beat()
+    sent = subscriber.take()
     assert [event.seq for event in sent] == [1, 2, 3, 3]
     assert isinstance(sent[-1], e.Beat)
+    log.unsubscribe(subscriber)
+    log.beat()
+    assert subscriber.take() == []
     page = log.page(e.Recent(5))
     assert (page.request, page.epoch, page.first, page.next, numbers(page)) == (5, 7, 1, 4, [1, 2, 3])
     assert numbers(log.page(e.Recent(5, after=1))) == [2, 3]
@@ -46,7 +53,7 @@ def test_events_are_numbered_sent_and_remembered() -> None:
 
 
 def test_the_oldest_are_forgotten() -> None:
-    log = log_of([])
+    log, _ = subscribed()
     for _ in range(REMEMBERED + 10):
         log.publish(e.Changed, "a.pcd", 1, "changed")
     page = log.page(e.Recent(1, limit=1 << 30))
@@ -54,16 +61,16 @@ def test_the_oldest_are_forgotten() -> None:
     assert numbers(page) == list(range(11, 511))  # a page is never longer, whatever is asked for
 
 
-def test_pressure_is_told_once_a_second() -> None:
-    sent: list[e.Event] = []
-    pressure = PressureEvents(log_of(sent), lambda: MEMORY)
+def test_pressure_is_published_once_a_second() -> None:
+    log, subscriber = subscribed()
+    pressure = PressureEvents(log, lambda: MEMORY)
     for tenth in range(25):
         pressure.refused(f"{tenth}.pcd", "points", "over_budget", tenth / 10)
     pressure.step(2.5)
     pressure.step(3.0)
     pressure.step(9.0)
-    told = [(event.id, event.refused) for event in sent if isinstance(event, e.Pressure)]
-    assert told == [("0.pcd", 1), ("10.pcd", 10), ("20.pcd", 10), ("24.pcd", 4)]
+    published = [(event.id, event.refused) for event in subscriber.take() if isinstance(event, e.Pressure)]
+    assert published == [("0.pcd", 1), ("10.pcd", 10), ("20.pcd", 10), ("24.pcd", 4)]
 
 
 def test_what_happens_often_is_a_line_a_minute(caplog: pytest.LogCaptureFixture) -> None:
@@ -97,7 +104,7 @@ def test_what_happens_often_is_a_line_a_minute(caplog: pytest.LogCaptureFixture)
 def test_refusals_are_a_line_a_minute_with_holder_and_setting(
     caplog: pytest.LogCaptureFixture, code: str, setting: str
 ) -> None:
-    pressure = PressureEvents(log_of([]), lambda: MEMORY, lambda: "planner (pid 7): 3.0 MiB")
+    pressure = PressureEvents(subscribed()[0], lambda: MEMORY, lambda: "planner (pid 7): 3.0 MiB")
     with caplog.at_level(logging.WARNING, "shmmap"):
         for step in range(700):
             pressure.refused(f"{step}.pcd", "points", code, step / 10)

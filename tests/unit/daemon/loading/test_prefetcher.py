@@ -422,8 +422,8 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     assert shown_ahead(one) == loaded
     one.ask(one.session(), Selected(2, ("0_0.pcd",), wait=30.0))
     assert len(one.cells_of(2).cells) == 1
-    for resident in one.cache.used:
-        one.cache.rows.show(resident, "resident")
+    while one.cache.show_used(one.now_s()):
+        pass
     assert shown_ahead(one) == loaded | {"0_0.pcd": False}
     assert [count(one, name) for name in ("prefetch_started", "prefetch_used", "prefetch_misses")] == [
         6,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who uses a segment, by each way there is to know; and hearing when somebody let go."""
+"""Who uses a segment, by each source; and which closes are reported."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def reported(fd: int, timeout_s: float = 10.0) -> bool:
     return bool(select.select([fd], [], [], timeout_s)[0])
 
 
-def test_this_machine_tells_everything(directory: ShmDirectory) -> None:
+def test_this_machine_knows_everything(directory: ShmDirectory) -> None:
     support = probe_pins(directory)
     assert support == PinSupport(True, True, True)
     assert support.source is PinSource.LEASES
@@ -41,7 +41,7 @@ def test_this_machine_tells_everything(directory: ShmDirectory) -> None:
 
 
 @pytest.mark.parametrize(("less", "source"), [("locks", PinSource.LOCKS), ("sessions", PinSource.SESSIONS)])
-def test_the_next_best_way_is_taken(
+def test_the_next_best_source_is_taken(
     directory: ShmDirectory, monkeypatch: pytest.MonkeyPatch, less: str, source: PinSource
 ) -> None:
     monkeypatch.setenv("SHMMAP_TEST_PINS", less)
@@ -68,7 +68,7 @@ def test_use(directory: ShmDirectory, source: PinSource, lock: int | None, used:
     assert pins.is_used(NAME) is None
 
 
-def test_a_kept_segment_tells_when_it_is_let_go(directory: ShmDirectory) -> None:
+def test_closes_of_a_kept_segment_are_reported(directory: ShmDirectory) -> None:
     pins = PinWatch(directory, events=True)
     zombie = NAME + ".zombie"
     descriptors = len(os.listdir("/proc/self/fd"))
@@ -92,10 +92,10 @@ def test_a_kept_segment_tells_when_it_is_let_go(directory: ShmDirectory) -> None
     pins.close()
 
 
-def test_a_segment_in_service_tells_once(directory: ShmDirectory) -> None:
+def test_one_close_of_a_segment_in_service_is_reported(directory: ShmDirectory) -> None:
     pins = PinWatch(directory, events=True)
     first, second = (map_segment(directory.path + NAME) for _ in range(2))
-    pins.tell_once(NAME)
+    pins.watch_next_close(NAME)
     first.close()
     assert reported(pins.fd)
     assert pins.closed() == {NAME}
@@ -104,17 +104,17 @@ def test_a_segment_in_service_tells_once(directory: ShmDirectory) -> None:
     pins.close()
 
 
-def test_our_own_look_is_nobody_s_close(directory: ShmDirectory) -> None:
-    """Else who waits for room is told of some again and again, as long as it looks for some."""
+def test_our_own_look_is_no_close(directory: ShmDirectory) -> None:
+    """Else a load that waits for room would find some again and again, as long as it looks for it."""
     pins = PinWatch(directory, events=True)
     first = map_segment(directory.path + NAME)
     for _ in range(3):
-        pins.tell_once(NAME)
+        pins.watch_next_close(NAME)
         assert pins.is_used(NAME) is True
         assert pins.closed() == set()
     first.close()
     assert reported(pins.fd)
-    assert pins.closed() == {NAME}, "it is told of although somebody has looked meanwhile"
+    assert pins.closed() == {NAME}, "although it was looked at meanwhile"
     assert pins.is_used(NAME) is False
     assert pins.closed() == set()
     pins.close()
@@ -123,7 +123,7 @@ def test_our_own_look_is_nobody_s_close(directory: ShmDirectory) -> None:
 def test_a_close_before_our_own_look_counts(directory: ShmDirectory) -> None:
     pins = PinWatch(directory, events=True)
     first = map_segment(directory.path + NAME)
-    pins.tell_once(NAME)
+    pins.watch_next_close(NAME)
     first.close()
     assert pins.is_used(NAME) is False
     assert pins.closed() == {NAME}
@@ -133,7 +133,7 @@ def test_a_close_before_our_own_look_counts(directory: ShmDirectory) -> None:
 def test_without_events_nothing_is_kept(directory: ShmDirectory) -> None:
     pins = PinWatch(directory)
     assert (pins.fd, pins.keep(NAME), pins.keeps(NAME), pins.closed()) == (-1, False, False, set())
-    pins.tell_once(NAME)
+    pins.watch_next_close(NAME)
     pins.close()
 
 

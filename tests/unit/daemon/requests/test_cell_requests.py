@@ -21,20 +21,21 @@ from tests.support.divided_map import DividedMap
 from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish
 
 
-@pytest.mark.parametrize("wait", [-1.0, -0.0001, math.nan, math.inf, -math.inf, 3600.5, 1e300])
 @pytest.mark.parametrize("warm", [False, True])
-def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, wait: float, warm: bool) -> None:
+def test_waits_that_are_refused(inner: Inner, small_map: DividedMap, warm: bool) -> None:
     """Whether the cells are in memory or not."""
     one = inner(small_map.root)
     session = one.session()
     if warm:
         one.everything()
-    with pytest.raises(BadRequest, match="wait"):
-        one.ask(session, Area(2, EVERYWHERE, wait=wait))
-    with pytest.raises(BadRequest, match="wait"):
-        one.ask(session, Differential(2, EVERYWHERE, wait=wait))
-    with pytest.raises(BadRequest, match="wait"):
-        one.ask(session, Selected(2, (), wait=wait))
+    for wait in (-1.0, -0.0001, math.nan, math.inf, -math.inf, 3600.5, 1e300):
+        for message in (
+            Area(2, EVERYWHERE, wait=wait),
+            Differential(2, EVERYWHERE, wait=wait),
+            Selected(2, (), wait=wait),
+        ):
+            with pytest.raises(BadRequest, match="wait"):
+                one.ask(session, message)
     assert not len(one.cells)
     assert not len(one.loads)
 
@@ -63,7 +64,7 @@ def test_waits_that_are_answered_at_once(inner: Inner, small_map: DividedMap) ->
 def test_areas_at_the_end_of_the_world(
     inner: Inner, small_map: DividedMap, area: CircleMessage | BoxMessage, count: int
 ) -> None:
-    """Some touch everything and some nothing; memory can still be made and others served afterwards."""
+    """Some touch everything and some nothing; room can still be made and others served afterwards."""
     one = inner(small_map.root)
     session = one.session()
     one.ask(session, Area(1, area, wait=30.0))
@@ -111,7 +112,7 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
             one.ask(session, Area(request, EVERYWHERE, wait=0.01 * request))
         one.ask(session, Area(9, EVERYWHERE, wait=30.0))
         one.run_until(lambda: len(one.cells) == 1)
-        one.cells.forget(session)
+        one.cells.on_disconnect(session)
         assert len(one.cells) == 0
     one.run_until(lambda: one.ledger.resident_count == 16)
     assert not one.ledger._needed
@@ -120,8 +121,8 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
     assert sorted(one.ended) == sorted(one.ledger.by_key), "each load has ended once"
 
 
-def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
-    """A load that many waited for answers nobody by itself: each answer has its own turn, if still wanted."""
+def test_waiting_requests_are_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
+    """A load that many waited for answers none by itself: each answer has its own turn, if still wanted."""
     one = inner(small_map.root)
     sessions = [one.session(str(number)) for number in range(3)]
     one.hold_answers = True
@@ -132,7 +133,7 @@ def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> 
     assert (len(one.due), one.replies) == (12, [])
     one.cells.answer_overdue(one.now_s() + 60.0)
     assert len(one.due) == 12, "each is due once"
-    one.cells.forget(sessions[1])
+    one.cells.on_disconnect(sessions[1])
     for count, answer in enumerate(one.due):
         before = len(one.replies)
         finish(answer)
@@ -140,7 +141,7 @@ def test_who_waited_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> 
     assert len(one.cells) == 0
 
 
-def test_whose_patience_ends_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
+def test_a_request_whose_time_is_up_is_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     one.hold_answers = True
     one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=5.0))

@@ -10,7 +10,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from shmmap.daemon.requests.pending_request import CELLS_A_STEP
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import (
     Area,
@@ -188,20 +187,22 @@ def test_moved_cells_are_loaded_again_with_their_box(inner: Inner, small_map: Di
         assert parse(map_segment(one.path_of(cell.segment))).fields["box"][:2] == (cell.min_x, cell.min_y)
 
 
-def test_indices_change_between_the_parts_of_a_request(inner: Inner, small_map: DividedMap) -> None:
-    """What the first part has found is found again in the map that is served then."""
+@pytest.mark.usefixtures("short_turns")
+def test_indices_change_between_the_turns_of_a_request(inner: Inner, small_map: DividedMap) -> None:
+    """What was found is found again in the map that is served then."""
     one = inner(small_map.root)
-    first, second = ["20_20.pcd", "0_0.pcd"] * (CELLS_A_STEP // 2), ["20_0.pcd", "20_20.pcd"]
+    first, second = ["20_20.pcd", "0_0.pcd"] * 8, ["20_0.pcd", "20_20.pcd"]
     work = one.cells.selected(one.session(), Selected(1, (*first, *second), wait=30.0))
-    next(work)
+    for _ in first:
+        next(work)
     small_map.remove_cell("-40_-40.pcd")
     small_map.remove_cell("0_0.pcd")
     small_map.write_metadata()
     one.reload()
     finish(work)
     reply = one.cells_of(1)
-    assert names(reply) == ["20_20.pcd"] * (CELLS_A_STEP // 2) + second
-    assert [failed.code for failed in reply.failed] == ["unknown_cell"] * (CELLS_A_STEP // 2)
+    assert names(reply) == ["20_20.pcd"] * 8 + second
+    assert [failed.code for failed in reply.failed] == ["unknown_cell"] * 8
 
 
 def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:

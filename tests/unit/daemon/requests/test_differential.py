@@ -21,10 +21,13 @@ from hypothesis import strategies as st
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Key
-from shmmap.daemon.requests.differential import Difference, difference, warm_difference
+from shmmap.daemon.requests.differential import difference, warm_difference
+from shmmap.daemon.requests.pending_request import Found, PendingRequest
+from shmmap.daemon.transport.sessions import Sessions
 from shmmap.errors import BadRequest
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Area, BoxMessage, Differential, HeldCell
+from tests.support import connections
 from tests.support.divided_map import DividedMap, make_map, random_points
 from tests.unit.daemon.inner_daemon import InnerDaemon, finish
 
@@ -76,15 +79,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     inner.close()
 
 
-def find(cache: CellCache, message: Differential, indices: list[int], layers: tuple[str, ...]) -> Difference:
-    """Do all steps of finding the difference; return it."""
-    found: list[Difference] = []
-
-    def steps() -> Iterator[None]:
-        found.append((yield from difference(cache, message, indices, layers, True, lambda: iter((None,)))))
-
-    finish(steps())
-    return found[0]
+def find(cache: CellCache, message: Differential, indices: list[int], layers: tuple[str, ...]) -> Found:
+    """Find the difference."""
+    session = Sessions().open(connections.of(), "", 0.0)
+    wanted = PendingRequest(cache, session, 1, layers, lambda _wanted: iter(()), found=Found(cache.catalogue))
+    finish(difference(wanted, message, indices, layers))
+    return wanted.found
 
 
 def oracle(
@@ -168,15 +168,17 @@ def test_any_request(
     new, removed, gone, other = oracle(served, inside, held, packed, layers)
     assert [(served.names[index], layer) for index, layer in found.cells] == new
     assert list(found.removed) == removed
-    told = unpack_versions(found.removed_packed)
-    assert set(told) == gone
-    assert len(told) == len(gone), "duplicates are told once"
-    assert {(Path(key.cell_id).name, key.layer) for key in found.old} == {(name, "points") for name in other}
+    removed_versions = unpack_versions(found.removed_packed)
+    assert set(removed_versions) == gone
+    assert len(removed_versions) == len(gone), "each once"
+    assert {(Path(key.cell_id).name, key.layer) for key in found.held_old} == {
+        (name, "points") for name in other
+    }
 
     warm = warm_difference(cache, message, np.array(indices, dtype=np.intp), "points")
     all_warm = not {COLD, BROKEN} & set(inside)
     if all_warm and all(cell.version is not None and cell.layers is None for cell in held):
-        assert warm is not None, "the short way must take what nearly every request is"
+        assert warm is not None, "nearly every request is answered like this"
     if warm is not None:
         assert all_warm
         assert [resident.version for resident in warm.residents] == [served.current[name] for name, _ in new]
@@ -220,7 +222,7 @@ def test_a_version_stands_for_its_layer(served: Served) -> None:
         message = Differential(1, EVERYWHERE, layers, tuple(held), pack_versions(packed))
         found = find(cache, message, [index], layers)
         assert found.cells == [(index, layer) for layer in lacks]
-        assert found.old == {key[layer] for layer in old}
+        assert found.held_old == {key[layer] for layer in old}
         assert (found.removed, found.removed_packed) == ((), b"")
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A request for very many cells is served in parts, and others have their turns in between."""
+"""A request for very many cells takes several turns, and others have theirs in between."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -11,10 +12,9 @@ from typing import Any, cast
 
 import pytest
 
-from shmmap.daemon.requests import cell_replies, limits
-from shmmap.daemon.requests.differential import UNKNOWN_A_STEP
+from shmmap.daemon import pace
+from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.dispatch import Dispatch
-from shmmap.daemon.requests.pending_request import CELLS_A_STEP, LOADS_A_STEP
 from shmmap.errors import BadRequest, NoSession, ShmmapError
 from shmmap.protocol.codec import pack_versions
 from shmmap.protocol.messages import Area, CircleMessage, Differential, HeldCell, Release, Selected
@@ -23,7 +23,7 @@ from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon, finis
 
 SIDE = 14
 CELLS = SIDE * SIDE
-PARTS = -(-CELLS // CELLS_A_STEP)
+short_turns = pytest.mark.usefixtures("short_turns")
 
 
 @pytest.fixture(scope="module")
@@ -31,37 +31,33 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> DividedMap:
     return make_map(tmp_path_factory.mktemp("large") / "map", columns=SIDE, rows=SIDE, points=5)
 
 
-def steps(work: Iterator[None] | None) -> int:
-    return len(list(work or ()))
-
-
-def test_no_step_is_for_more_cells_than_one_may(
+def test_a_turn_ends_when_its_time_is_used(
     inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Cold: found, loads asked for, kept from making room.  Warm: found, answered, noted."""
-    monkeypatch.setattr(cell_replies, "HELD_A_STEP", CELLS_A_STEP)
+    """However many cells it is for.  Here time goes on with each look at it, a quarter of a turn's."""
+    looks = itertools.count()
+    monkeypatch.setattr(pace, "time", SimpleNamespace(monotonic=lambda: next(looks) * pace.TURN_S / 4))
     one = inner(str(made.root))
     session = one.session()
-    wanted: list[int] = []
-    want = one.scheduler.want
-    one.scheduler.want = lambda *arguments: wanted.append(arguments[0]) or want(*arguments)  # type: ignore[method-assign,func-returns-value]
-    work = one.cells.area(session, Area(1, EVERYWHERE, wait=30.0))
-    before, most = 0, 0
-    for _ in work:
-        most, before = max(most, len(wanted) - before), len(wanted)
-    assert most == LOADS_A_STEP
-    assert len(one.cells_of(1).cells) == CELLS
-    assert steps(one.cells.area(session, Area(2, EVERYWHERE, wait=30.0))) == 3 * (PARTS - 1)
+
+    def longest(work: Iterator[None]) -> int:
+        """Looks at the time in the longest turn; each batch of cells costs one."""
+        times = [next(looks)]
+        times += [next(looks) for _ in work]
+        return max(b - a for a, b in itertools.pairwise((*times, next(looks))))
+
+    for count in (1, 2):  # cold, warm
+        assert longest(one.cells.area(session, Area(count, EVERYWHERE, wait=30.0))) <= 8
+        assert len(one.cells_of(count).cells) == CELLS
     ids = tuple(cell.id for cell in one.cells_of(2).cells)
-    assert steps(one.cells.selected(session, Selected(3, ids))) == 4 * (PARTS - 1)
-    assert len(one.cells_of(3).cells) == CELLS
-    held = pack_versions([cell.version for cell in one.cells_of(2).cells])
-    assert steps(one.cells.differential(session, Differential(4, EVERYWHERE, packed=held))) == 0
-    assert steps(one.cells.differential(session, Differential(5, EVERYWHERE))) == PARTS - 1
-    assert len(one.cells_of(5).cells) == CELLS
+    assert longest(one.cells.selected(session, Selected(3, ids))) <= 8
+    held = tuple(HeldCell(cell) for cell in ids)
+    assert longest(one.cells.differential(session, Differential(4, EVERYWHERE, held=held))) <= 8
+    assert [len(one.cells_of(count).cells) for count in (3, 4)] == [CELLS, 0]
 
 
-def test_others_are_answered_between_its_parts(inner: Inner, made: DividedMap) -> None:
+@short_turns
+def test_others_are_answered_between_its_turns(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     one.everything()
     work = one.cells.area(one.session("large"), Area(2, EVERYWHERE))
@@ -73,23 +69,26 @@ def test_others_are_answered_between_its_parts(inner: Inner, made: DividedMap) -
     assert len(one.cells_of(2).cells) == CELLS
 
 
+@short_turns
 def test_nothing_stays_of_one_whose_client_leaves_meanwhile(inner: Inner, made: DividedMap) -> None:
-    """Wherever it is then: the loads that were asked for end, and nothing is kept for it."""
+    """Wherever it is then: nothing is kept for it."""
     one = inner(str(made.root))
-    for count in range(1, 3 * PARTS - 3):
+    one.pool.limit = 0
+    for count in range(1, 3 * CELLS, CELLS // 5):
         session = one.session()
         work = one.cells.area(session, Area(count, EVERYWHERE, wait=30.0))
         for _ in range(count):
             next(work)
-        one.cells.forget(session)
+        one.cells.on_disconnect(session)
         one.sessions.close(session)
         del work  # as the loop does once the connection has ended
         one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-        assert (one.ledger._needed, one.cells._patient._waiting, len(one.cells)) == ({}, {}, 0)
+        assert (one.ledger._needed, one.waiting._of_load, len(one.cells)) == ({}, {}, 0)
     assert one.replies == []
 
 
-def test_a_session_that_ends_meanwhile_is_told(inner: Inner, made: DividedMap) -> None:
+@short_turns
+def test_the_request_of_a_session_that_ends_meanwhile_is_refused(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
     work = one.cells.area(session, Area(1, EVERYWHERE, wait=30.0))
@@ -98,9 +97,10 @@ def test_a_session_that_ends_meanwhile_is_told(inner: Inner, made: DividedMap) -
     with pytest.raises(NoSession):
         finish(work)
     one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-    assert (one.ledger._needed, one.cells._patient._waiting) == ({}, {})
+    assert (one.ledger._needed, one.waiting._of_load) == ({}, {})
 
 
+@short_turns
 @pytest.mark.parametrize("warm", [False, True])
 def test_the_map_changes_meanwhile(inner: Inner, tmp_path: Path, warm: bool) -> None:
     """At any of its steps: it is answered for the map as it is then, once."""
@@ -109,7 +109,7 @@ def test_the_map_changes_meanwhile(inner: Inner, tmp_path: Path, warm: bool) -> 
     if warm:
         one.everything(999)
     gone = sorted(made.corners)
-    for count in range(1, 3 * PARTS - 3):
+    for count in range(1, 3 * CELLS, CELLS // 5):
         work = one.cells.area(one.session(), Area(count, EVERYWHERE, wait=30.0))
         for _ in range(count):
             next(work, None)
@@ -121,15 +121,16 @@ def test_the_map_changes_meanwhile(inner: Inner, tmp_path: Path, warm: bool) -> 
         assert names(one.cells_of(count)) == (cells if answered else cells[1:])
         assert len([reply for _, reply in one.replies if reply.request == count]) == 1
     one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-    assert (one.ledger._needed, one.cells._patient._waiting) == ({}, {})
+    assert (one.ledger._needed, one.waiting._of_load) == ({}, {})
 
 
+@short_turns
 def test_many_loads_end_while_it_is_gone_through(inner: Inner, made: DividedMap) -> None:
     """All of what it would wait for is there before it waits: it is answered all the same."""
     one = inner(str(made.root))
     session = one.session()
     work = one.cells.area(session, Area(1, EVERYWHERE, wait=3000.0))
-    for _ in range(PARTS - (-CELLS // LOADS_A_STEP)):  # found, and loads asked for
+    for _ in range(2 * CELLS + 1):  # found, and loads asked for
         next(work)
     one.run_until(lambda: one.ledger.resident_count == CELLS)
     finish(work)
@@ -143,7 +144,7 @@ def test_what_is_refused_costs_no_version(
     inner: Inner, made: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Finding the neighbours of a cell takes long."""
-    monkeypatch.setattr(limits, "MOST_CELLS", 2 * CELLS - 1)
+    monkeypatch.setattr(limits, "MAX_CELLS", 2 * CELLS - 1)
     one = inner(str(made.root))
     for message in (Area(1, EVERYWHERE, FAR), Differential(2, EVERYWHERE, FAR, packed=bytes(80))):
         with pytest.raises(BadRequest, match=f"more than {2 * CELLS - 1} cells"):
@@ -152,41 +153,40 @@ def test_what_is_refused_costs_no_version(
     assert not one.loads.by_key
 
 
-def test_few_versions_of_layers_that_look_around_are_found_a_turn(inner: Inner, made: DividedMap) -> None:
-    """Each once, however often they are asked for; a change makes those anew that look into it, no others."""
+@short_turns
+def test_one_version_of_layers_that_look_around_is_found_a_turn(inner: Inner, made: DividedMap) -> None:
+    """Each once, however often they are asked for; after a change those that look into that cell."""
     one = inner(str(made.root))
     session, versions = one.session(), one.cache.layers
     one.pool.limit = 0
 
-    def found_a_step(message: Differential) -> list[int]:
-        counts, before = [], len(list(versions.unknown(range(CELLS), FAR)))
-        for _ in one.cells.differential(session, message):
-            now = len(list(versions.unknown(range(CELLS), FAR)))
-            counts.append(before - now)
-            before = now
-        return [count for count in counts if count]
+    def unknown() -> int:
+        return len(list(versions.unknown(range(CELLS), FAR)))
+
+    def found_a_turn(message: Differential) -> set[int]:
+        left = [unknown(), *(unknown() for _ in one.cells.differential(session, message))]
+        return {a - b for a, b in itertools.pairwise(left)}
 
     held = pack_versions(range(1, 100))
-    found = found_a_step(Differential(1, EVERYWHERE, FAR, packed=held))
-    assert max(found) == UNKNOWN_A_STEP
-    assert sum(found) >= 2 * CELLS - UNKNOWN_A_STEP  # the rest with what follows
-    assert found_a_step(Differential(2, EVERYWHERE, FAR, packed=held)) == []
+    assert found_a_turn(Differential(1, EVERYWHERE, FAR, packed=held)) == {0, 1}
+    assert unknown() == 0
+    assert found_a_turn(Differential(2, EVERYWHERE, FAR, packed=held)) == {0}
     assert len(one.cells_of(2).pending) == 2 * CELLS
-    middle = names_of(one).index("0_0.pcd")
-    one.map_switch.learn(middle, bytes(24))
-    assert len(list(versions.unknown(range(CELLS), FAR))) == 2 * 5 * 5
+    one.map_switch.learn(names_of(one).index("0_0.pcd"), bytes(24))
+    assert unknown() == 2 * 5 * 5
 
 
 def names_of(one: InnerDaemon) -> list[str]:
     return [one.cache.catalogue.id(index).rsplit("/", 1)[1] for index in range(CELLS)]
 
 
+@short_turns
 def test_the_map_changes_while_differences_are_found(inner: Inner, tmp_path: Path) -> None:
     made = make_map(tmp_path / "map", columns=SIDE, rows=SIDE, points=5)
     one = inner(str(made.root))
     held = tuple(HeldCell(cell.id) for cell in one.everything(999).cells)
     gone, left = sorted(made.corners), []
-    for count in range(1, PARTS + 1):
+    for count in range(1, CELLS, CELLS // 12):
         work = one.cells.differential(one.session(), Differential(count, EVERYWHERE, held=held[1:]))
         for _ in range(count):
             next(work)
@@ -199,7 +199,8 @@ def test_the_map_changes_while_differences_are_found(inner: Inner, tmp_path: Pat
         assert ([Path(cell).name for cell in reply.removed], names(reply)) == (left, gone[:1])
 
 
-def test_very_much_is_let_go_in_parts(inner: Inner, made: DividedMap) -> None:
+@short_turns
+def test_very_much_is_released_in_several_turns(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
     one.ask(session, Area(1, EVERYWHERE, wait=30.0))
@@ -209,16 +210,17 @@ def test_very_much_is_let_go_in_parts(inner: Inner, made: DividedMap) -> None:
     dispatch.cells = one.cells
     dispatch.handshake = cast("Any", SimpleNamespace(sessions=one.sessions))
     work = dispatch._route(session.connection, Release(2, pack_versions(versions[1:])), b"") or ()
-    assert [len(session.held) for _ in work] == [CELLS - CELLS_A_STEP * part for part in range(1, PARTS)]
+    assert [len(session.held) for _ in work] == list(range(CELLS, 1, -1))
     assert list(session.held) == versions[:1]
     assert one.replies[-1][1].request == 2
 
 
-def test_what_came_for_somebody_else_meanwhile_is_not_loaded_again(inner: Inner, made: DividedMap) -> None:
+@short_turns
+def test_what_came_for_another_client_meanwhile_is_not_loaded_again(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
     work = one.cells.area(session, Area(1, EVERYWHERE, wait=3000.0))
-    for _ in range(PARTS):  # found, and the first loads asked for
+    for _ in range(CELLS + 5):  # found, and the first loads asked for
         next(work)
     one.ask(one.session(), Area(2, EVERYWHERE, wait=30.0))
     assert len(one.cells_of(2).cells) == CELLS
@@ -227,10 +229,9 @@ def test_what_came_for_somebody_else_meanwhile_is_not_loaded_again(inner: Inner,
     assert one.statistics.values["loads_started"] == CELLS
 
 
-def test_a_session_that_ends_while_one_that_waited_is_answered_is_told(
-    inner: Inner, made: DividedMap
-) -> None:
-    """It is no defect of the daemon's, and nothing stays of it."""
+@short_turns
+def test_a_session_that_ends_while_a_request_that_waited_is_answered(inner: Inner, made: DividedMap) -> None:
+    """It is no defect of the daemon, and nothing stays of the request."""
     one = inner(str(made.root))
     refused: list[str] = []
     session = one.session()
@@ -247,4 +248,4 @@ def test_a_session_that_ends_while_one_that_waited_is_answered_is_told(
     finish(one.due[0])
     assert (refused, one.replies) == (["no_session"], [])
     one.run_until(lambda: one.cells.next_deadline_s() == float("inf"))
-    assert (one.ledger._needed, one.cells._patient._waiting, len(one.cells)) == ({}, {}, 0)
+    assert (one.ledger._needed, one.waiting._of_load, len(one.cells)) == ({}, {}, 0)

@@ -1,23 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No request asks for so much that others wait long for it; what it says is bounded before it is kept."""
+"""No request asks for so much that others wait long for it, and no session keeps more than its quota."""
 
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 
 import pytest
 
+from shmmap.daemon.cache.holders import Holders
+from shmmap.daemon.records import Resident
 from shmmap.daemon.requests import limits
+from shmmap.daemon.transport.sessions import Session
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers import versions as layer_versions
 from shmmap.protocol.messages import Area, Differential, HeldCell, Intent, Selected
-from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
+from shmmap.segment.pins import lock_slot
+from tests.support.divided_map import DividedMap, make_map
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon
 
 
 def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     one = inner(small_map.root)
-    monkeypatch.setattr(limits, "MOST_CELLS", 15)
+    monkeypatch.setattr(limits, "MAX_CELLS", 15)
     with pytest.raises(BadRequest, match="more than 15 cells in one request"):
         one.ask(one.session(), Area(1, EVERYWHERE))
     with pytest.raises(BadRequest, match="more than 15 cells"):  # known or not
@@ -29,7 +35,7 @@ def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: 
 
 def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
-    many = limits.MOST_HELD
+    many = limits.MAX_HELD
     for message in (
         Differential(1, EVERYWHERE, held=(HeldCell("a"),) * (many + 1)),
         Differential(1, EVERYWHERE, packed=bytes(8 * (many + 1))),
@@ -47,8 +53,8 @@ def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> Non
 def test_loads_that_one_process_waits_for(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Asking again for the same ones is no more of them; others wait for nobody else's."""
-    monkeypatch.setattr(limits, "MOST_QUEUED", 5)
+    """Asking again for the same ones is no more of them; others' loads do not count."""
+    monkeypatch.setattr(limits, "MAX_QUEUED", 5)
     one = inner(small_map.root)
     with one.loaders_standing_still():
         greedy, other = one.session(), one.session()
@@ -96,3 +102,62 @@ def test_intents() -> None:
     ):
         with pytest.raises(BadRequest, match="finite"):
             limits.check_intent(wrong)
+
+
+@pytest.fixture
+def many(inner: Inner, tmp_path: Path) -> InnerDaemon:
+    """Return a daemon of 60 cells."""
+    return inner(make_map(tmp_path / "map", columns=10, rows=6, points=10).root)
+
+
+def ids(many: InnerDaemon, first: int, last: int) -> tuple[str, ...]:
+    return tuple(many.cache.catalogue.id(index) for index in range(first, last))
+
+
+def full(many: InnerDaemon, *, map_them: bool = False) -> tuple[Session, list[int]]:
+    """Return a session that was handed 50 cells, which is all that it may keep; descriptors of them."""
+    session = many.session()
+    many.ask(session, Selected(1, ids(many, 0, 50), wait=30.0))
+    cells = many.cells_of(1).cells
+    opened = [os.open(many.path_of(cell.segment), os.O_RDONLY) for cell in cells] if map_them else []
+    for fd in opened:
+        lock_slot(fd, session.slot)
+    many.cells._quota.nbytes = session.held_bytes
+    many.offset_s += 2.0
+    return session, opened
+
+
+@pytest.mark.usefixtures("short_turns")
+def test_a_few_looks_a_turn(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds 50 and maps none: enough of them are dropped for what it asks for now, the oldest first."""
+    looks, look = 0, Holders.has
+
+    def counted(holders: Holders, resident: Resident, slot: int) -> bool:
+        nonlocal looks
+        looks += 1
+        return look(holders, resident, slot)
+
+    monkeypatch.setattr(Holders, "has", counted)
+    session, _ = full(many)
+    before = 0
+    for _ in many.cells.selected(session, Selected(2, ids(many, 50, 60) + ids(many, 0, 8), wait=30.0)):
+        assert looks - before <= 1
+        before = looks
+    assert len(many.cells_of(2).cells) == 18
+    assert many.statistics.values["refused_quota"] == 0
+    assert 10 <= looks < 50
+    assert {r.key.cell_id for r in session.residents()} >= set(ids(many, 30, 60))
+
+
+def test_what_it_still_maps_counts(many: InnerDaemon) -> None:
+    """It is refused what is too much."""
+    session, opened = full(many, map_them=True)
+    many.ask(session, Selected(2, ids(many, 45, 60), wait=30.0))
+    reply = many.cells_of(2)
+    assert len(reply.cells) + len(reply.failed) == 15
+    assert {failure.code for failure in reply.failed} == {"over_budget"}
+    assert many.statistics.values["refused_quota"] == len(reply.failed) > 0
+    for fd in opened:
+        os.close(fd)
+    many.ask(session, Selected(4, ids(many, 50, 60), wait=30.0))
+    assert len(many.cells_of(4).cells) == 10

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nearly every request of a moving vehicle is answered the short way, with handles encoded before."""
+"""Nearly every request of a moving vehicle is answered from versions, with handles encoded before."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from shmmap.daemon.requests import cell_requests
 from shmmap.protocol.codec import encode_handle, pack_versions
-from shmmap.protocol.messages import BoxMessage, Cells, Differential, HeldCell
+from shmmap.protocol.messages import BoxMessage, Cells, Differential
 from tests.support.divided_map import make_map
 from tests.unit.daemon.inner_daemon import EVERYWHERE, InnerDaemon
 
@@ -20,7 +20,7 @@ HALF = BoxMessage(-1e3, -1e3, -1.0, 1e3)
 
 
 class LongWay(Exception):
-    """The request took the way that covers everything."""
+    """The request was answered with what covers everything."""
 
 
 def long_way(*_: object) -> NoReturn:
@@ -44,32 +44,6 @@ def differential(
     return inner.cells_of(request)
 
 
-def test_versions_of_a_warm_area_take_the_short_way(
-    warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    inner, everything = warm
-    monkeypatch.setattr(cell_requests, "lacking", long_way)
-    held = [cell.version for cell in everything.cells]
-    assert not differential(inner, 2, EVERYWHERE, held).cells
-    assert len(differential(inner, 3, EVERYWHERE, held[2:]).cells) == 2
-    left = differential(inner, 4, HALF, held)
-    assert 0 < len(left.removed_packed) < 8 * len(held)
-    by_name = (HeldCell(everything.cells[0].id, held[0]),)
-    assert len(differential(inner, 5, EVERYWHERE, held[1:], held=by_name).cells) == 0
-
-
-def test_what_the_short_way_cannot_answer_takes_the_long_one(
-    warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So that the test above is not true of everything."""
-    inner, everything = warm
-    monkeypatch.setattr(cell_requests, "lacking", long_way)
-    with pytest.raises(LongWay):  # no version is given
-        differential(inner, 2, EVERYWHERE, [], held=(HeldCell(everything.cells[0].id),))
-    with pytest.raises(LongWay):  # two layers
-        differential(inner, 3, EVERYWHERE, [], layers=("points", "voxel(leaf=1.0)"))
-
-
 def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
     """Replies carry the bytes that each segment was given when it came into memory."""
     inner, everything = warm
@@ -85,12 +59,12 @@ def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
         assert {cell.points for cell in reply.cells} == {4711}, request
 
 
-def test_a_full_cache_takes_the_short_way_too(
+def test_what_others_hold_does_not_count(
     warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is in memory may come to more than one session may have; what it has and gets does not."""
+    """What is in memory may come to more than one session may have: it is answered from versions, too."""
     inner, everything = warm
-    monkeypatch.setattr(cell_requests, "lacking", long_way)
+    monkeypatch.setattr(cell_requests, "difference", long_way)
     sizes = [cell.bytes for cell in everything.cells]
     inner.cells._quota.nbytes = sum(sizes[:2])
     assert inner.ledger.resident_bytes > inner.cells._quota.nbytes

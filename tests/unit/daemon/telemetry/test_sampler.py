@@ -38,7 +38,9 @@ def beat(sampler: Sampler, now_s: float) -> int:
 
 
 def sampler_of(one: InnerDaemon, on_beat: Callable[[], None] = lambda: None) -> Sampler:
-    return Sampler(one.cache, one.scheduler, one.event_log, one.sessions, (), on_beat)
+    return Sampler(
+        one.cache, one.cache.survey, one.scheduler, one.statistics, one.event_log, one.sessions, (), on_beat
+    )
 
 
 def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_beat(
@@ -60,8 +62,8 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
     beat(sampler, now_s)
     assert whole == [1000.0]
     residents: list[Any] = list(one.ledger.residents())
-    one.cache.used.update(residents)
-    one.cache.rows.show(residents[0], "resident")
+    one.cache.hand_out(residents, now_s)
+    one.events.show(residents[0], "resident")
     written.clear()
     beat(sampler, now_s := 1000.0 + CHANGE_BEAT_S / 2)
     assert written == []
