@@ -68,9 +68,7 @@ from shmmap.errors import ShmmapError as ShmmapError
 from shmmap.errors import ShmmapWarning as ShmmapWarning
 from shmmap.errors import StaleHandle as StaleHandle
 from shmmap.errors import UnknownCell as UnknownCell
-from shmmap.lazy_names import lazy_names, public_names
-from shmmap.optional_packages import needed_packages as _needed_packages
-from shmmap.segment.process_limits import no_files_left as _no_files_left
+from shmmap.lazy_names import lazy_public_names, public_names
 from shmmap.version import __version__ as __version__
 
 if TYPE_CHECKING:  # the list of public names
@@ -101,7 +99,7 @@ _PACKAGES: Final = ("errors", "events", "layers", "live")
 """Where the other public names are."""
 
 # No `__all__`: of its classes `help(shmmap)` would print all that they have, seven thousand lines.
-_load = lazy_names(__name__)
+_load = lazy_public_names(__name__)
 
 
 if not TYPE_CHECKING:  # for a type checker a name that is not in the list is no name
@@ -110,8 +108,7 @@ if not TYPE_CHECKING:  # for a type checker a name that is not in the list is no
         if name in _PACKAGES:
             return importlib.import_module(f"shmmap.{name}")
         try:
-            with _needed_packages(f"shmmap.{name}"):
-                return _load(name)
+            return _load(name)
         except AttributeError:
             for package in _PACKAGES:
                 if name in importlib.import_module(f"shmmap.{package}").__all__:
@@ -120,11 +117,6 @@ if not TYPE_CHECKING:  # for a type checker a name that is not in the list is no
                     )
                     raise error from None
             raise
-        except (OSError, ImportError) as error:
-            limit = _no_files_left(error, f"shmmap.{name} cannot be loaded: ")
-            if limit is None:
-                raise
-            raise limit from None
 
 
 def __dir__() -> list[str]:

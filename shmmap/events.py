@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_public_names
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, MissedEvents
@@ -68,4 +68,4 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazy_names(__name__)
+    __getattr__ = lazy_public_names(__name__)

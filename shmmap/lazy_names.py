@@ -14,7 +14,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["lazy_names", "public_names"]
+from shmmap.optional_packages import needed_packages
+from shmmap.segment.process_limits import no_files_left
+
+__all__ = ["lazy_names", "lazy_public_names", "public_names"]
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:
@@ -37,6 +40,26 @@ def lazy_names(package: str) -> Callable[[str], Any]:
         return value
 
     return load
+
+
+def lazy_public_names(package: str) -> Callable[[str], Any]:
+    """Return what `lazy_names` does; what keeps a name from being loaded is said in one clear line.
+
+    What it needs for that is imported beforehand: there may be no descriptor left for it.
+    """
+    load = lazy_names(package)
+
+    def load_or_say(name: str) -> Any:
+        try:
+            with needed_packages(f"{package}.{name}"):
+                return load(name)
+        except (OSError, ImportError) as error:
+            limit = no_files_left(error, f"{package}.{name} cannot be loaded: ")
+            if limit is None:
+                raise
+            raise limit from None
+
+    return load_or_say
 
 
 def public_names(package: str) -> dict[str, str]:

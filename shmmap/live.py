@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_names import lazy_public_names
 
 if TYPE_CHECKING:
     from shmmap.chunks.occupancy import Occupancy, ScanCounts, ScanFilter
@@ -42,4 +42,4 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__ = lazy_names(__name__)
+    __getattr__ = lazy_public_names(__name__)

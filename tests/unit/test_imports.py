@@ -57,7 +57,7 @@ PARTS = {
     "version": set[str](),
     "large_tables": set[str](),
     "disk_budget": {"failpoints"},
-    "lazy_names": set[str](),
+    "lazy_names": {"optional_packages", "segment.process_limits"},
     "live": {"chunks", "client", "lazy_names", "protocol"},
     "events": {"client", "lazy_names", "protocol"},
     "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
