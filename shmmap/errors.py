@@ -10,7 +10,7 @@
     ├── MapDataError           a file is not what it claims to be                 exit 65
     ├── MapMissing             there is no map there                              exit 66
     ├── CannotWrite            an output cannot be made: disk full, no permission exit 73
-    ├── DaemonUnreachable      nobody answers                                     exit 69
+    ├── DaemonUnreachable      no daemon answers                                  exit 69
     │   ├── NoSocket           nothing listens: the daemon was never started
     │   ├── SocketPermission   the socket is there, but not for this user
     │   ├── StaleSocket        the socket's daemon is gone
@@ -23,7 +23,7 @@
     ├── NotPermitted           the daemon refuses this to this user               exit 1
     ├── LimitReached           this process may have no more files, threads, memory   exit 71
     ├── Busy                   too many requests of this process wait already     exit 75
-    ├── LiveInterrupted        who keeps live maps is started anew: ask again      exit 75
+    ├── LiveInterrupted        the live worker starts again: ask again            exit 75
     ├── SegmentError           a segment cannot be used
     │   ├── StaleHandle        it is gone: ask again                              exit 1
     │   └── SegmentCorrupt     its bytes are wrong (magic, version, checksum)     exit 65
@@ -341,7 +341,7 @@ class Offline(CellError):
 
     code = "offline"
     exit_code = 75
-    advice = "ask again later: it is tried again when somebody asks"
+    advice = "ask again later: each request tries again"
 
 
 class PackageMissing(ShmmapError, ImportError):

@@ -68,7 +68,7 @@ class _Log:
         self._logger = logging.getLogger("shmmap")
 
     def debug(self, event: str, **details: object) -> None:
-        """Log what only somebody looking for a defect wants to know."""
+        """Log what only a search for a defect needs."""
         if self._logger.isEnabledFor(logging.DEBUG):
             self._logger.debug(logfmt(event, **details))
 

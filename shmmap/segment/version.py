@@ -42,7 +42,7 @@ class Source(msgspec.Struct, frozen=True, array_like=True):
 
 Stamp: TypeAlias = bytes
 """Names one state of a cell's source.  Only the origin that made it knows what it says: of a file, what
-``stat`` tells (`shmmap.segment.layout.SourceStamp`); elsewhere a hash of the content, say."""
+``stat`` says (`shmmap.segment.layout.SourceStamp`); elsewhere a hash of the content, say."""
 
 _LENGTH: Final = struct.Struct("<I")
 _BOX: Final = struct.Struct("<4d")

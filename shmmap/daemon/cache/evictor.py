@@ -85,11 +85,8 @@ class Evictor:
     reclaimer: Reclaimer
     evicted_count: int = 0
     wake_s: float = math.inf
-    _waits: tuple[int, float, float] = (
-        -1,
-        -math.inf,
-        -math.inf,
-    )  # at so many changes; all is as it was then, until when
+    # the count of changes after which nothing could be freed, until when that holds, and when to try again
+    _waits: tuple[int, float, float] = (-1, -math.inf, -math.inf)
     _score: Score = _UNTIL_CLIENTS_MOVE
     _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
     _round_version: int = 0

@@ -127,7 +127,7 @@ class Ledger:
         return fits
 
     def fits_at_all(self, nbytes: int) -> bool:
-        """Whether so many bytes fit beside the daemon's own overhead, once all else is evicted."""
+        """Whether ``nbytes`` fit beside the daemon's own overhead, once all else is evicted."""
         return nbytes + self.overhead_bytes <= self.budget_bytes
 
     def add_overhead(self, nbytes: int) -> bool:

@@ -54,7 +54,7 @@ class LiveEvents:
         """Write the statistics while the daemon waits for live maps, and its loop does not run yet."""
         self.statistics.beat()
 
-    def told(self, rows: Sequence[LiveMapRow]) -> None:
+    def update(self, rows: Sequence[LiveMapRow]) -> None:
         """Report how the maps are now."""
         self._rows = {row.name: row for row in rows}
         self.statistics.show_live_maps(rows)

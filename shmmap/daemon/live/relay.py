@@ -117,7 +117,7 @@ class Tickets:
 
     def refuse_some(self) -> None:
         """Refuse some of the requests whose worker has ended."""
-        error = LiveInterrupted("the process that keeps live maps ended, and is started anew")
+        error = LiveInterrupted("the process that keeps live maps ended, and starts again")
         for _ in range(min(REFUSED_PER_TURN, len(self._lost))):
             session, request = self._lost.popleft()
             session.connection.refuse(request, error)
@@ -256,7 +256,7 @@ class LiveRelay:
         """Show each map as not served just now."""
         budget_bytes = self._begin.budget_bytes // max(1, len(self._begin.maps))
         self._rows = tuple(messages.not_served(one, budget_bytes, problem) for one in self._begin.maps)
-        self._events.told(self._rows)
+        self._events.update(self._rows)
 
     def begin_events(self) -> None:
         """Emit events from now on: clients are served."""
@@ -302,7 +302,7 @@ class LiveRelay:
                 session.connection.reply(message.body)
         elif isinstance(message, messages.Status):
             self._rows = message.maps
-            self._events.told(message.maps)
+            self._events.update(message.maps)
         elif isinstance(message, messages.Begun):
             self._serving, self._served_s = True, time.monotonic()
             self._refused = (
@@ -378,7 +378,7 @@ class LiveRelay:
                 hint="ask again: it takes long the first time",
             )
         if len(self._unsent) >= MAX_UNSENT:
-            raise Busy("the process that keeps live maps hears nothing just now", hint="ask again")
+            raise Busy("the process that keeps live maps does not answer at present", hint="ask again")
         maps = self._may_map(session.peer, now_s)
         self._known_sessions.add(session.slot)
         ticket = self._tickets.give(session, message.request)

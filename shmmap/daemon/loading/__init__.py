@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Absent cells: what is wanted, what is being loaded, by whom, and what an earlier life left."""
+"""Absent cells: what is wanted, what is being loaded and by which loader, and what a previous run left."""

@@ -190,9 +190,7 @@ class Mappers:
                 hint="it has not mapped for long: open the map again",
             )
         if not active.session:
-            raise LiveInterrupted(
-                f"nobody maps as {active.mapper.name!r} just now", hint="open the map again"
-            )
+            raise LiveInterrupted(f"no mapper {active.mapper.name!r} is active", hint="open the map again")
         if active.session != session:
             raise BadRequest(
                 f"another program maps as {active.mapper.name!r} now", hint="give each program its own name"

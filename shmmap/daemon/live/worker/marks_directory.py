@@ -46,7 +46,7 @@ class MarksDirectory:
         self._fd = os.open(path, os.O_DIRECTORY | os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
         try:
             if os.fstat(self._fd).st_uid != os.geteuid():
-                raise PermissionError(1, "it belongs to somebody else", path)
+                raise PermissionError(1, "it belongs to another user", path)
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
             os.fchmod(self._fd, 0o1770 if gid >= 0 else 0o700)

@@ -57,32 +57,32 @@ def test_each_change_is_published_once() -> None:
     one = Published()
     one.events.begin(1)
     assert one.take() == [(e.LiveStarted, 1, 0)]
-    one.events.told((ROW,))
-    one.events.told((changed(scans=12),))
+    one.events.update((ROW,))
+    one.events.update((changed(scans=12),))
     assert one.take() == []  # how it was at first, and what is in no event
     last = one.log.last
-    one.events.told((changed(change=41),))
-    one.events.told((changed(change=41),))
+    one.events.update((changed(change=41),))
+    one.events.update((changed(change=41),))
     assert one.take() == [(e.LiveChanged, "lidar", 41)]
     assert one.log.last == last, "it takes no number: it would push out what happened to cells"
     full = changed(change=41, problem="chunk 0_0_0 cannot be saved: disk full")
-    one.events.told((full,))
-    one.events.told((changed(change=41, problem="chunk 1_0_0 cannot be saved: disk full"),))
-    one.events.told((changed(change=41),))
+    one.events.update((full,))
+    one.events.update((changed(change=41, problem="chunk 1_0_0 cannot be saved: disk full"),))
+    one.events.update((changed(change=41),))
     assert one.take() == [(e.LiveProblem, "lidar", full.problem), (e.LiveProblem, "lidar", "")]
-    one.events.told((changed(change=41, damaged=("a",)),))
-    one.events.told((changed(change=41, damaged=("a", "b")),))
+    one.events.update((changed(change=41, damaged=("a",)),))
+    one.events.update((changed(change=41, damaged=("a", "b")),))
     assert one.take() == [(e.LiveDamaged, "lidar", "a"), (e.LiveDamaged, "lidar", "b")]
 
 
 def test_a_worker_that_ends_and_the_next_one() -> None:
     one = Published()
     one.events.begin(1)
-    one.events.told((changed(damaged=("a",)),))
+    one.events.update((changed(damaged=("a",)),))
     one.take()
     one.events.ended(1)
     one.events.started(1, 5)
-    one.events.told((changed(damaged=("a",), change=99),))
+    one.events.update((changed(damaged=("a",), change=99),))
     assert one.take() == [(e.LiveEnded, 1), (e.LiveStarted, 1, 5), (e.LiveChanged, "lidar", 99)]
     assert one.shown.values == {"live_restarts": 1}
 
@@ -91,7 +91,7 @@ def test_nothing_is_published_before_the_start() -> None:
     """What was found by then is published after it."""
     one = Published()
     one.events.started(1, 3)
-    one.events.told((changed(problem="chunk 0_0_0 cannot be loaded: torn", damaged=("a",)),))
+    one.events.update((changed(problem="chunk 0_0_0 cannot be loaded: torn", damaged=("a",)),))
     assert one.take() == []
     one.events.begin(1)
     assert one.take() == [
@@ -102,7 +102,7 @@ def test_nothing_is_published_before_the_start() -> None:
 
 def test_the_statistics_show_them() -> None:
     one = Published()
-    one.events.told(
+    one.events.update(
         (ROW, changed(name="radar", damaged=("a", "b"), problem="chunk 0_0_0 cannot be loaded: torn"))
     )
     lidar, radar = one.shown.rows

@@ -51,7 +51,7 @@ def test_only_who_opened_it_last_maps_under_a_name(mappers: Mappers) -> None:
     mappers.on_disconnect(1)
     assert mappers.expect(number, 2, 2).session == 2, "the first one's end is not the second one's"
     mappers.on_disconnect(2)
-    with pytest.raises(LiveInterrupted, match="nobody maps as 'front'"):
+    with pytest.raises(LiveInterrupted, match="no mapper 'front' is active"):
         mappers.expect(number, 2, 2)
 
 
