@@ -437,7 +437,7 @@ def test_of_several_sockets_the_telling_one_is_named(
 @BOTH
 def test_waits_that_make_no_sense(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
     with connect(daemon(divided_map.root).endpoint) as client:
-        for wait in (-1.0, -6.0, np.inf, np.nan):
+        for wait in (-1.0, -6.0, np.nan):
             with pytest.raises(BadRequest, match="wait"):
                 client.around(0, 0, 5, wait=wait)
             assert client.around(0, 0, 5).complete

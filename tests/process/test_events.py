@@ -86,7 +86,7 @@ def test_what_happens_is_told_in_order(
     assert (started.what, started.cells, started.adopted) == ("started", 36, 0)
     assert (joined.pid, joined.client, left.client) == (os.getpid(), "driver", "driver")
     assert (first.id, first.version, first.points) == ("0_0.pcd", loaded.version, 500)
-    assert (reloaded.changed, reloaded.removed, reloaded.told, reloaded.error) == (1, 1, 2, "")
+    assert (reloaded.changed, reloaded.removed, reloaded.listed, reloaded.error) == (1, 1, 2, "")
     assert (changed.id, changed.version, changed.how) == ("0_0.pcd", newer.version, "changed")
     assert (removed.id, removed.version, removed.how) == ("20_20.pcd", 0, "removed")
     assert (failed.id, failed.code) == ("0_-20.pcd", "load_failed")

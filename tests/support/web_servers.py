@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import http.server
 import os
+import random
 import re
 import shutil
 import signal
@@ -227,11 +228,15 @@ def needed_nginx() -> str:
 
 
 def free_port() -> int:
-    """A port that was free a moment ago."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
+    """Return a port that no program listens at, below those that the kernel gives to connections.
+
+    So it is still free when a server that was stopped starts again.
+    """
+    while True:
+        port = random.randrange(20_000, 32_000)
+        with socket.socket() as one, suppress(OSError):
+            one.bind(("127.0.0.1", port))
+            return port
 
 
 def web_server(root: Path, folder: Path, port: int, more: str = "") -> str:
