@@ -177,7 +177,7 @@ def test_a_worker_that_reads_nothing_costs_little(world: World) -> None:
                 world.ask(asker, number)
             world.relay.on_disconnect(asker)  # type: ignore[arg-type]
 
-    with pytest.raises(Busy, match="hears nothing"):
+    with pytest.raises(Busy, match="does not answer"):
         come_ask_and_go()
     assert len(world.relay._unsent) <= MAX_UNSENT + 1
     asked = 0
