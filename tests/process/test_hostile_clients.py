@@ -501,7 +501,7 @@ def test_locks_hold_nobody_up(daemon: DaemonFactory, connect: Connect, divided_m
         assert found["refused"] == ["lease", "open lock", "read lock of statistics", "write lock"]
         stats = client.ask("stats")
         assert stats[6] == 36  # mapped by unknown processes
-        assert client.ask("show", "0_0.pcd")[9][0][6][0][:2] == [0, 0]
+        assert client.ask("show", "0_0.pcd")[9][0][12][0][:2] == [0, 0]
         evicted = client.ask("evict")
         assert (evicted[2], evicted[3]) == (0, 36)
         assert len(client.area(circle(0, 0, 500)).cells) == 36  # revived: it is all there still

@@ -169,7 +169,7 @@ def test_another_user_s_directory_is_not_used(path: Path) -> None:
     path.mkdir()
     os.chown(path, MEMBER, -1)
     before = len(os.listdir("/proc/self/fd"))
-    with pytest.raises(PermissionError, match="somebody else"):
+    with pytest.raises(PermissionError, match="another user"):
         MarksDirectory(str(path))
     assert len(os.listdir("/proc/self/fd")) == before
 
