@@ -105,9 +105,11 @@ def difference(
     cache, found = wanted.cache, wanted.found
     versions, of_version = cache.layers, cache.warm.of_version
     version_of = versions.version
-    for unknown in versions.unknown(indices, layers):
+    for cells in batched(indices):
         yield from wanted.pause()
-        version_of(*unknown)
+        for unknown in versions.unknown(cells, layers):
+            yield from wanted.pause()
+            version_of(*unknown)
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
     has: dict[int, set[str]] = {}

@@ -192,7 +192,11 @@ class SessionQuota:
         counted: set[Key] = set()
         too_much: list[Key] = []
         added = 0
-        nearest: list[int] = np.argsort(wanted.distances_m(cells), kind="stable").tolist()
+        distances: list[float] = []
+        for some in batched(cells):
+            yield from wanted.pause()
+            distances += wanted.distances_m(some)
+        nearest: list[int] = np.argsort(distances, kind="stable").tolist()
         for positions in batched(nearest):
             yield from wanted.pause()
             for position in positions:
