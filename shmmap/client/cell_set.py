@@ -54,7 +54,7 @@ class CellSet(Sequence[Cell]):
         comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may
         exist: ask again.
     reason : str
-        Why what is missing is not on its way: ``"offline"``, where the list of cells cannot be reached at
+        Why what is missing is not being loaded: ``"offline"``, where the list of cells cannot be reached at
         present; empty where it is being fetched, where all is covered, and from a daemon older than protocol
         1.6.
     """

@@ -85,7 +85,7 @@ class EventStream:
     ----------
     epoch : int
         The daemon's present run.
-    heard_s : float
+    last_message_s : float
         When a message last came from the daemon, `time.monotonic`; it sends one every second.
 
     Raises
@@ -121,7 +121,7 @@ class EventStream:
         self._closed = False
         self._ready: deque[Happening] = deque()
         self.epoch = self._connection.welcome.epoch
-        self.heard_s = time.monotonic()
+        self.last_message_s = time.monotonic()
         try:
             self._begin(since)
         except BaseException:
@@ -189,7 +189,7 @@ class EventStream:
                 self.epoch = self._ask(Recent(0, limit=0)).epoch
 
     def _take(self, data: bytes) -> None:
-        self.heard_s = time.monotonic()
+        self.last_message_s = time.monotonic()
         event = decode_event(data)
         if event is None:  # a kind that this version does not know: its number counts
             head = msgspec.msgpack.decode(data)

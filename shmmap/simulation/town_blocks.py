@@ -8,8 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from shmmap.simulation.town_ground import BLOCK_METRES, ROAD_HALF_METRES
-from shmmap.simulation.town_surfaces import Surfaces
+from shmmap.simulation.town_surfaces import BLOCK_METRES, ROAD_HALF_METRES, Surfaces
 
 __all__ = ["build_block"]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every layer kind has to keep, checked on clouds of every sort.
+"""Checks of what every layer kind must guarantee, on clouds of every sort.
 
 ::
 
@@ -7,8 +7,7 @@
     def test_my_kind(cloud: str) -> None:
         check_layer("roughness(leaf=1.0)", cloud)
 
-It does not know what a layer should hold; a test of one's own, against an independent and slow
-computation, has to say that.
+It does not know what a layer should hold: test that against an independent, slow computation.
 """
 
 from __future__ import annotations
@@ -31,9 +30,18 @@ from shmmap.segment.writer import SegmentOrigin, write_table
 __all__ = ["CORNERS", "check_layer", "corner", "surface"]
 
 CORNERS: Final = (
-    "origin", "negative", "large_f4", "large_f8", "borders", "empty", "one_point", "duplicates", "not_finite",
-    "flat", "far_apart",
-)  # fmt: skip
+    "origin",
+    "negative",
+    "large_f4",
+    "large_f8",
+    "borders",
+    "empty",
+    "one_point",
+    "duplicates",
+    "not_finite",
+    "flat",
+    "far_apart",
+)
 
 MOVED: Final[NDArray[Any]] = np.array([89570.0, 42300.0, 3.0])
 
@@ -50,7 +58,7 @@ def check_layer(layer: str, cloud: str) -> LayerTable | None:
     Raises
     ------
     InternalError
-        Naming what the kind does not keep.
+        Naming the guarantee that the kind breaks.
     """
     spec = parse_layer(layer)
     _must(parse_layer(str(spec)) == spec, f"{layer} is not the same spec as its canonical form {spec}")
@@ -142,10 +150,17 @@ def _check_segment(spec: LayerSpec, table: LayerTable) -> None:
     fd = os.memfd_create("layer")
     try:
         header = write_table(
-            fd, table.columns, layer=str(spec), rows=table.rows, origin=origin,
-            builder_version=spec.builder_version, units=table.units, lattice=table.lattice,
-            z_min=0.0, z_max=0.0,
-        )  # fmt: skip
+            fd,
+            table.columns,
+            layer=str(spec),
+            rows=table.rows,
+            origin=origin,
+            builder_version=spec.builder_version,
+            units=table.units,
+            lattice=table.lattice,
+            z_min=0.0,
+            z_max=0.0,
+        )
         data = os.pread(fd, os.fstat(fd).st_size, 0)
     finally:
         os.close(fd)

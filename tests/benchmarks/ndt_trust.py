@@ -30,7 +30,7 @@ from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matr
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.scans.scan_file import read_scan, thinned
 
-from shmmap.simulation.lidar_drive import LidarDrive
+from shmmap.simulation.lidar import LidarDrive
 from shmmap.simulation.town import Town
 from tests.benchmarks.street_data import SENSOR_HEIGHT_M, street
 

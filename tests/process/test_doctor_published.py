@@ -244,9 +244,11 @@ def test_another_account_is_told_what_it_cannot_see(
     words = ["--instance", bucket.instance, "--runtime-dir", bucket.runtime_dir, "--shm-dir", bucket.shm_dir]
     done = subprocess.run(
         [sys.executable, "-c", program, "doctor", "--json", *words],
-        cwd="/", env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": "/nonexistent"},
-        capture_output=True, text=True,
-    )  # fmt: skip
+        cwd="/",
+        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": "/nonexistent"},
+        capture_output=True,
+        text=True,
+    )
     assert done.stdout, done.stderr
     found = {one["name"]: one for one in json.loads(done.stdout)["findings"]}
     said = found["credentials"]["fact"] + found["link"]["fact"]

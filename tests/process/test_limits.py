@@ -23,7 +23,7 @@ from shmmap.daemon.prerequisites import access_of_segments
 from shmmap.errors import ConfigError, LimitReached
 from shmmap.segment.process_limits import check_files, check_threads
 from shmmap.statistics.reader import read_statistics
-from shmmap.testing.environment import without_settings
+from shmmap.testing.daemon_process import without_settings
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, make_map, random_points

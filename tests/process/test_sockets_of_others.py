@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shmmap import connect
-from shmmap.testing.process_watch import wait_ended
+from shmmap.testing.daemon_process import wait_ended
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import counters, until

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.doctor.signed_map import signature_lines, trust_problems
+from shmmap.doctor.verdicts import signature_lines, trust_problems
 from shmmap.quantities import counted, format_bytes, format_duration, format_utc
 
 if TYPE_CHECKING:

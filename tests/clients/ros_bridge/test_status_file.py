@@ -14,9 +14,9 @@ from shmmap_clients.ros_bridge.status_file import StatusFile, status_name
 
 import shmmap
 from shmmap.daemon.config import load_config
-from shmmap.doctor.finding import Finding
-from shmmap.doctor.patient import examine
-from shmmap.doctor.ros_bridge import check_ros_bridge
+from shmmap.doctor.access import check_ros_bridge
+from shmmap.doctor.checks import examine
+from shmmap.doctor.verdicts import Finding
 
 HOLDER = """\
 import json, sys

@@ -14,9 +14,22 @@ _PACKAGES = "import numpy, zmq, posix_ipc, msgspec"
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 
 EXPENSIVE = {
-    "array", "asyncio", "ctypes.util", "dataclasses", "enum", "inspect", "json", "logging", "numpy.typing",
-    "selectors", "signal", "socket", "subprocess", "typing_extensions", "zmq.utils.monitor",
-}  # fmt: skip
+    "array",
+    "asyncio",
+    "ctypes.util",
+    "dataclasses",
+    "enum",
+    "inspect",
+    "json",
+    "logging",
+    "numpy.typing",
+    "selectors",
+    "signal",
+    "socket",
+    "subprocess",
+    "typing_extensions",
+    "zmq.utils.monitor",
+}
 """A millisecond or more each where nothing else has loaded them."""
 
 ALLOWED = {"_heapq", "_queue", "fcntl", "heapq", "queue", "select", "zlib"}

@@ -33,12 +33,12 @@ def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) ->
     """State and text of each row."""
     counts = {"published_version": 7, "published_refused": 0, "published_expires_unix_ns": 0}
     counts |= {"published_taken_unix_ns": time.time_ns(), **counters}
-    patient = ward.patient(snapshot(**counts), map_path=url)  # type: ignore[arg-type]
-    assert patient.seen is not None
-    patient.seen.identity = None  # the map is that of the settings
-    patient.__dict__["store"] = answer
+    diagnosis = ward.diagnosis(snapshot(**counts), map_path=url)  # type: ignore[arg-type]
+    assert diagnosis.seen is not None
+    diagnosis.seen.identity = None  # the map is that of the settings
+    diagnosis.__dict__["store"] = answer
     checks = (check_link, check_credentials, check_clock, check_versions)
-    found = [check(patient) for check in checks]
+    found = [check(diagnosis) for check in checks]
     return {one.name: ("skip" if one.skipped else one.state, f"{one.fact} -> {one.advice}") for one in found}
 
 

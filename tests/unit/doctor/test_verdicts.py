@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the cache is too small: one verdict, the same for every verb that tells it."""
+"""Whether the cache is too small: one verdict, the same for every verb that shows it."""
 
 from __future__ import annotations
 

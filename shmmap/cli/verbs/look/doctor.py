@@ -8,7 +8,7 @@ import contextlib
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import print_hanging, print_json
-from shmmap.doctor.finding import Finding
+from shmmap.doctor.verdicts import Finding
 from shmmap.errors import NoSocket
 
 __all__ = ["add_parser", "run"]
@@ -43,9 +43,8 @@ def run(args: argparse.Namespace) -> int:
     """Print every finding."""
     from shmmap.cli import daemon_address
     from shmmap.daemon.config import installed_config_file, load_config
-    from shmmap.doctor.checks import diagnose
-    from shmmap.doctor.finding import worst
-    from shmmap.doctor.patient import examine
+    from shmmap.doctor.checks import diagnose, examine
+    from shmmap.doctor.verdicts import worst
 
     file = args.config or installed_config_file()
     flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}

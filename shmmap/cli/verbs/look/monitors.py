@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_json, print_line
-from shmmap.doctor.signed_map import trust_problems
+from shmmap.doctor.verdicts import trust_problems
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:

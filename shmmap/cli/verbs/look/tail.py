@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
             if happening is not None:
                 show(happening)
                 sys.stdout.flush()
-            elif time.monotonic() - stream.heard_s > SILENT_S:
+            elif time.monotonic() - stream.last_message_s > SILENT_S:
                 _wait_for_heartbeat(stream, show)
     return 0
 
