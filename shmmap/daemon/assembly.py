@@ -38,9 +38,8 @@ from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.map_change import MapChange
 from shmmap.daemon.requests.map_queries import MapQueries
-from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
+from shmmap.daemon.requests.operators.operator_requests import Authorization, OperatorRequests
 from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager import ActivatedSocket, ServiceManager, status_line
 from shmmap.daemon.serving_loop import BackgroundTask, ServingLoop

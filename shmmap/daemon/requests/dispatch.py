@@ -15,8 +15,11 @@ from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import check_intent
 from shmmap.daemon.requests.map_queries import MapQueries
-from shmmap.daemon.requests.operators.authorization import Authorization
-from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
+from shmmap.daemon.requests.operators.operator_requests import (
+    OPERATOR_REQUESTS,
+    Authorization,
+    OperatorRequests,
+)
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import WorkItem

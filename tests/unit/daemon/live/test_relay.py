@@ -12,7 +12,6 @@ import msgspec
 import pytest
 
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.live import messages, relay
 from shmmap.daemon.live.relay import (
@@ -23,6 +22,7 @@ from shmmap.daemon.live.relay import (
     REFUSED_PER_TURN,
     STABLE_S,
     START_END_S,
+    LiveEvents,
     LiveRelay,
 )
 from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
