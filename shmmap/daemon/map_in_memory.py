@@ -32,7 +32,7 @@ from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import DEFAULT_SHM_DIR, ShmDirectory, is_full
 from shmmap.segment.names import segment_prefix

@@ -26,7 +26,7 @@ from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.telemetry.sampler import BEAT_S
 from shmmap.daemon.transport.inbox import Inbox
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.protocol.events import LongTurn
 from shmmap.statistics.writer import StatisticsWriter
 

@@ -98,7 +98,7 @@ ROOMS = [
     {"__main__"}, {"main"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
     {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel", "prerequisites"},
     {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"},
-    {"config_table", "records", "pace"},
+    {"config_table", "records", "turns"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 

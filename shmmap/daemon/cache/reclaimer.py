@@ -24,11 +24,11 @@ from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.pace import Walk
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident, Retired
 from shmmap.daemon.transport.sessions import Sessions
+from shmmap.daemon.turns import Walk
 from shmmap.logfmt import log
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.names import another_name, retired_name
@@ -44,8 +44,8 @@ THREAD_NAME: Final = "shmmap-freeing"
 class Closer:
     """Closes the last descriptors of removed segments, in a thread that is begun when it is first needed.
 
-    Taking memory back takes the kernel 0.2 ms a megabyte, in the thread that closes the last descriptor.  This
-    one does nothing else, and holds the interpreter only for the moment between two closes.
+    Taking memory back takes the kernel 0.2 ms a megabyte, in the thread that closes the last descriptor.
+    This one does nothing else, and holds the interpreter only for the moment between two closes.
 
     Attributes
     ----------

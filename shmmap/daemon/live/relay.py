@@ -25,7 +25,7 @@ from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.live import messages
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, LiveInterrupted, ShmmapError, error_from_wire
 from shmmap.logfmt import log
 from shmmap.processes.start_child import packet_buffer, receive_packet, start_child

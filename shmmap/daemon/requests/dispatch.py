@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from shmmap.daemon.cache.holders import Survey, Usage
 from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
-from shmmap.daemon.pace import Pace, batched
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import check_intent
@@ -24,6 +23,7 @@ from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import WorkItem
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import Pace, batched
 from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions

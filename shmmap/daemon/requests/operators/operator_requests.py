@@ -16,11 +16,11 @@ from typing import Final
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_reload import Reloader, Reread
-from shmmap.daemon.pace import Pace
 from shmmap.daemon.prerequisites import group_id
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins, cells_named
 from shmmap.daemon.transport.connection import Peer
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import Pace
 from shmmap.errors import NotPermitted, Offline, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import messages

@@ -25,7 +25,7 @@ from shmmap.daemon.live.relay import (
     LiveEvents,
     LiveRelay,
 )
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_reply
