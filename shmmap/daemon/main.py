@@ -38,7 +38,6 @@ from shmmap.daemon.config import DaemonConfig, option_of
 from shmmap.daemon.config_live import state_directory
 from shmmap.daemon.events.log import events_path
 from shmmap.daemon.host.instance import InstanceLock, lock_path, make_runtime_dir, stopped_early
-from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
 from shmmap.daemon.live.relay import LiveEvents, LiveRelay, NoLiveMaps
 from shmmap.daemon.loading.prepared_parent import fork_early
@@ -65,7 +64,7 @@ from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
-from shmmap.logfmt import log
+from shmmap.logfmt import log, set_up_logging
 from shmmap.optional_packages import needed_packages
 from shmmap.origin.catalogue import NoMap
 from shmmap.origin.catalogue_bytes import default_cache_directory
