@@ -64,8 +64,8 @@ from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
+from shmmap.lazy_imports import needed_packages
 from shmmap.logfmt import log, set_up_logging
-from shmmap.optional_packages import needed_packages
 from shmmap.origin.catalogue import NoMap
 from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.map_layout import absolute_path

@@ -21,7 +21,7 @@ from shmmap.client.connection import until_served
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, SegmentCorrupt, SegmentError, StaleHandle
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 from shmmap.protocol import live as messages
 from shmmap.protocol.areas import FURTHEST_M, BoxMessage, LiveArea, SphereMessage, area_to_message
 
