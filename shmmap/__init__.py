@@ -68,7 +68,7 @@ from shmmap.errors import ShmmapError as ShmmapError
 from shmmap.errors import ShmmapWarning as ShmmapWarning
 from shmmap.errors import StaleHandle as StaleHandle
 from shmmap.errors import UnknownCell as UnknownCell
-from shmmap.lazy_names import lazy_public_names, public_names
+from shmmap.lazy_imports import lazy_public_names, public_names
 from shmmap.version import __version__ as __version__
 
 if TYPE_CHECKING:  # the list of public names

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a table of points is made of: named columns, each with its dtype, width and unit."""
+"""What a table of points is made of: named columns, each with its dtype, width and unit; and its bounds."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["ColumnSpec", "column_names"]
+__all__ = ["Bounds", "ColumnSpec", "column_names", "row_extremes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,3 +48,78 @@ def column_names(names: Iterable[str]) -> tuple[str, ...]:
         taken.add(new)
         found.append(new)
     return tuple(found)
+
+
+_GROUP: Final = 512  # rows folded into one long row, so that numpy reduces with vector instructions
+
+
+def row_extremes(rows: NDArray[Any]) -> tuple[list[float], list[float]]:
+    """Return minimum and maximum of each column of a C-contiguous (N, k) array, N > 0; NaN wins."""
+    with np.errstate(invalid="ignore"):  # signalling NaNs
+        return _reduce(np.minimum, rows), _reduce(np.maximum, rows)
+
+
+def _axis_extremes(axes: tuple[NDArray[Any], ...]) -> tuple[list[float], list[float]]:
+    """Return minimum and maximum of each contiguous (N,) array, N > 0; NaN wins."""
+    with np.errstate(invalid="ignore"):
+        return [float(axis.min()) for axis in axes], [float(axis.max()) for axis in axes]
+
+
+def _reduce(extreme: np.ufunc, rows: NDArray[Any]) -> list[float]:
+    count, width = rows.shape
+    whole = count - count % _GROUP
+    if whole:
+        folded = extreme.reduce(rows[:whole].reshape(-1, _GROUP * width), axis=0).reshape(_GROUP, width)
+        rest = count - whole
+        if rest:
+            extreme(folded[:rest], rows[whole:], out=folded[:rest])
+        rows = folded
+    # transposed first: numpy would reduce along the short rows one by one
+    values: list[float] = extreme.reduce(np.ascontiguousarray(rows.T), axis=1).tolist()
+    return values
+
+
+class Bounds:
+    """Bounds of all finite points seen so far, float64, metres.
+
+    The minimum and maximum of a block are needed anyway, and they show whether every coordinate is
+    finite: both propagate NaN, and an infinity is one of them.  Only a block in which they are not
+    finite pays for a mask.
+
+    Attributes
+    ----------
+    low, high
+        Least and greatest x, y, z; infinite, the wrong way round, before any point.
+    """
+
+    def __init__(self) -> None:
+        self.low = [math.inf] * 3
+        self.high = [-math.inf] * 3
+
+    def add(self, xyz: NDArray[Any], axes: tuple[NDArray[Any], ...] = ()) -> NDArray[np.bool_] | None:
+        """Take a block of (N, 3) points in; ``axes`` are the same as contiguous x, y and z, if at hand.
+
+        Returns
+        -------
+        None if all are finite; else the mask of those that are, the only ones taken in.
+        """
+        if not len(xyz):
+            return None
+        low, high = _axis_extremes(axes) if axes else row_extremes(xyz)
+        if all(map(math.isfinite, low + high)):
+            self._take(low, high)
+            return None
+        mask: NDArray[np.bool_] = np.isfinite(xyz).all(axis=1)
+        if mask.any():
+            self._take(*row_extremes(np.ascontiguousarray(xyz[mask])))
+        return mask
+
+    def _take(self, low: list[float], high: list[float]) -> None:
+        self.low = list(map(min, self.low, low))
+        self.high = list(map(max, self.high, high))
+
+    def result(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (min_xyz, max_xyz); NaN when no finite point was seen."""
+        if self.low[0] > self.high[0]:
+            return np.full(3, np.nan), np.full(3, np.nan)
+        return np.array(self.low), np.array(self.high)

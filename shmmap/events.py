@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_public_names
+from shmmap.lazy_imports import lazy_public_names
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, MissedEvents

@@ -28,7 +28,7 @@ from shmmap.chunks.layout import (
 )
 from shmmap.chunks.voxels import BRICKS, ChunkKey
 from shmmap.errors import ConfigError, MapDataError, SegmentCorrupt
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from shmmap.cli.parser import NUMBER_OPTIONS, build_parser, verb_first
 from shmmap.cli.program import exit_code_of, join_negative_values
 from shmmap.errors import BadRequest
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 
 __all__ = ["main", "serve_main"]
 

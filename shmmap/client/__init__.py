@@ -22,7 +22,7 @@ import zmq  # noqa: F401
 from shmmap.client.cell import Cell
 from shmmap.client.cell_set import CellSet, PendingLayer
 from shmmap.client.client import Client, connect
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from shmmap.client.event_stream import EventStream, MissedEvents

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmmap.errors import NoColumn
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 from shmmap.protocol.messages import Handle
 from shmmap.segment.attach import AttachedSegment, attach_writable
 from shmmap.segment.layout import Lattice, SegmentHeader, SourceStamp

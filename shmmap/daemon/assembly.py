@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Final, Protocol
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventPublisher, events_path
 from shmmap.daemon.host.instance import InstanceLock, make_runtime_dir, take_away
-from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.host.scheduling import SERVING_SLICE_NS, take_slices
 from shmmap.daemon.host.signals import (
     KEEP_SIGNAL,
@@ -34,13 +33,12 @@ from shmmap.daemon.map.catalogue_reload import Reloader, Reread
 from shmmap.daemon.map.file_watch import FileWatch, directories_of
 from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.requests.cell_requests import CellRequests
-from shmmap.daemon.requests.dispatch import Dispatch
+from shmmap.daemon.requests.dispatch import Defects, Dispatch
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.map_change import MapChange
 from shmmap.daemon.requests.map_queries import MapQueries
-from shmmap.daemon.requests.operators.authorization import Authorization
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
+from shmmap.daemon.requests.operators.operator_requests import Authorization, OperatorRequests
 from shmmap.daemon.requests.paging import Paging
 from shmmap.daemon.service_manager import ActivatedSocket, ServiceManager, status_line
 from shmmap.daemon.serving_loop import BackgroundTask, ServingLoop

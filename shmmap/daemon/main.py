@@ -36,17 +36,14 @@ from typing import TYPE_CHECKING, Final
 from shmmap.daemon.assembly import Service
 from shmmap.daemon.config import DaemonConfig, option_of
 from shmmap.daemon.config_live import state_directory
-from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.log import events_path
 from shmmap.daemon.host.instance import InstanceLock, lock_path, make_runtime_dir, stopped_early
-from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.host.signals import StartSignals, ignore_signals
-from shmmap.daemon.live.place import place_live_maps
-from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
+from shmmap.daemon.live.relay import LiveEvents, LiveRelay, NoLiveMaps
 from shmmap.daemon.loading.prepared_parent import fork_early
 from shmmap.daemon.map.catalogue_reload import Reloader
 from shmmap.daemon.map.catalogue_view import ViewOrigin
-from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory
+from shmmap.daemon.map_in_memory import FetchedFrom, MapInMemory, place_live_maps
 from shmmap.daemon.prerequisites import (
     access_of_segments,
     check_file_size_limit,
@@ -55,7 +52,7 @@ from shmmap.daemon.prerequisites import (
     import_ahead,
     raise_descriptor_limit,
 )
-from shmmap.daemon.requests.operators.authorization import Authorization
+from shmmap.daemon.requests.operators.operator_requests import Authorization
 from shmmap.daemon.service_manager import (
     ActivatedSocket,
     MoreTime,
@@ -67,8 +64,8 @@ from shmmap.daemon.transport.socket_file import refuse_taken
 from shmmap.dividing.served_cloud import find_origin
 from shmmap.errors import CannotWrite, ConfigError, ShmmapError
 from shmmap.failpoints import step
-from shmmap.logfmt import log
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
+from shmmap.logfmt import log, set_up_logging
 from shmmap.origin.catalogue import NoMap
 from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.origin.map_layout import absolute_path

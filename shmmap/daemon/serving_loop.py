@@ -19,14 +19,13 @@ from typing import Final, Protocol
 from shmmap.daemon.cache.holders import Survey
 from shmmap.daemon.events.cell_events import CellEvents
 from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.requests.cell_requests import CellRequests
-from shmmap.daemon.requests.dispatch import Dispatch
+from shmmap.daemon.requests.dispatch import Defects, Dispatch
 from shmmap.daemon.requests.operators.operator_requests import OperatorRequests
 from shmmap.daemon.telemetry.sampler import BEAT_S
 from shmmap.daemon.transport.inbox import Inbox
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.protocol.events import LongTurn
 from shmmap.statistics.writer import StatisticsWriter
 

@@ -17,11 +17,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from shmmap.columns import Bounds
 from shmmap.dividing.lattice import CellLattice
 from shmmap.dividing.sources import NO_MOVE, NO_SCALE, Bound3, RowLayout, Source
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.coordinate_system import FEET, METRE, UNITS, CoordinateSystem, LengthUnit, units_text
-from shmmap.formats.finite import Bounds
 from shmmap.formats.source_file import refusal
 
 __all__ = [

@@ -10,9 +10,8 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.columns import ColumnSpec
+from shmmap.columns import Bounds, ColumnSpec
 from shmmap.formats.coordinate_system import GEOGRAPHIC_SYSTEM, CoordinateSystem, degrees_warning
-from shmmap.formats.finite import Bounds
 from shmmap.formats.las_reader import LAS_SUFFIXES, LasReader
 from shmmap.formats.pcd.header import IDENTITY_VIEWPOINT
 from shmmap.formats.pcd.reader import PcdReader

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_public_names
+from shmmap.lazy_imports import lazy_public_names
 
 if TYPE_CHECKING:
     from shmmap.layers.build import build_layer
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from shmmap.layers.ground import ground_height
     from shmmap.layers.spec import canonical_layer
     from shmmap.layers.voxels import voxel_covariances
-    from shmmap.optional_packages import needed_packages
+    from shmmap.lazy_imports import needed_packages
 
 __all__ = [
     "LayerKind",

@@ -30,8 +30,8 @@ from shmmap.layers.contract import BUILT_ANYWHERE, Box, Columns, LayerTable, Poi
 from shmmap.layers.disk_cache import CacheKey, LayerCache
 from shmmap.layers.sources import SMALLER, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, parse_layer
+from shmmap.lazy_imports import needed_packages
 from shmmap.logfmt import log
-from shmmap.optional_packages import needed_packages
 from shmmap.segment.layout import NO_SOURCE, SegmentHeader, SourceStamp
 from shmmap.segment.version import Source
 from shmmap.segment.writer import SegmentOrigin, write_table

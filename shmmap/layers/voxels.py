@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import BadRequest, MapDataError
 from shmmap.layers.contract import LayerColumn, LayerKind, LayerTable, Parameter, Parameters, PointTable
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 from shmmap.segment.layout import Lattice
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
     "group_points",
     "voxel_covariances",
 ]
-
 
 MAX_TABLE_VOXELS: Final = 1 << 24
 """Voxels of a dense table that is written out: 64 MiB of int32, a 512 m cube at 2 m."""

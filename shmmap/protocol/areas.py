@@ -11,16 +11,21 @@ import shmmap.geometry as geometry
 from shmmap.errors import BadRequest
 
 __all__ = [
+    "FURTHEST_M",
     "AreaMessage",
     "BoxMessage",
     "CircleMessage",
     "HeldCell",
     "Intent",
+    "LiveArea",
+    "SphereMessage",
     "SquareMessage",
     "area_from_message",
     "area_to_message",
 ]
 
+FURTHEST_M: Final = 1e150
+"""Place and radius of a sphere are less, metres: so that their squares are numbers."""
 MAX_VERTICES: Final = 4096
 """Of a route, as it may be sent; the daemon goes by its beginning."""
 
@@ -56,7 +61,18 @@ class BoxMessage(msgspec.Struct, array_like=True, tag="box", frozen=True):
     z_max: float | None = None
 
 
+class SphereMessage(msgspec.Struct, array_like=True, tag="sphere", frozen=True):
+    """Voxels whose middles are within ``radius`` of a place; metres."""
+
+    x: float
+    y: float
+    z: float
+    radius: float
+
+
 AreaMessage: TypeAlias = CircleMessage | SquareMessage | BoxMessage
+LiveArea: TypeAlias = BoxMessage | SphereMessage
+"""An area of a live map."""
 
 
 def area_from_message(message: AreaMessage) -> geometry.Area:

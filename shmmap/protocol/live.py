@@ -10,16 +10,14 @@ from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
-from shmmap.protocol.areas import BoxMessage
+from shmmap.protocol.areas import LiveArea
 from shmmap.protocol.rows import LiveMapRow
 
 __all__ = [
-    "FURTHEST_M",
     "LIVE_REQUESTS",
     "MAX_CHUNK_ROWS",
     "MAX_NAME_BYTES",
     "LiveApplied",
-    "LiveArea",
     "LiveChunkPage",
     "LiveChunkRow",
     "LiveChunks",
@@ -39,30 +37,15 @@ __all__ = [
     "LiveScan",
     "LiveVoxels",
     "LiveVoxelsReply",
-    "SphereMessage",
 ]
 
 MAX_NAME_BYTES: Final = 64
 MAX_CHUNK_ROWS: Final = 1000
 """Rows of one page of chunks."""
-FURTHEST_M: Final = 1e150
-"""Place and radius of a sphere are less, metres: so that their squares are numbers."""
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(max_length=MAX_NAME_BYTES)]
 Point: TypeAlias = tuple[float, float, float]
 Key: TypeAlias = tuple[int, int, int]
-
-
-class SphereMessage(msgspec.Struct, array_like=True, tag="sphere", frozen=True):
-    """Voxels whose middles are within ``radius`` of a place; metres."""
-
-    x: float
-    y: float
-    z: float
-    radius: float
-
-
-LiveArea: TypeAlias = BoxMessage | SphereMessage
 
 
 class LiveList(msgspec.Struct, array_like=True, tag="live_list"):

@@ -27,7 +27,7 @@ import posix_ipc
 
 from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 from shmmap.failpoints import step
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 from shmmap.segment.directory import DEFAULT_SHM_DIR
 from shmmap.segment.header import (
     OUTSIDE,

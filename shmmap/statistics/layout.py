@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.statistics.counters import Counter
-from shmmap.statistics.histogram import BUCKETS
+from shmmap.statistics.counters import BUCKETS, Counter
 
 __all__ = [
     "CELL_ROW_BYTES",

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from shmmap.statistics.counters import PUBLISHED, SPANS, WINDOWED
-from shmmap.statistics.histogram import STEPS, Histogram, lower_bound_ns
+from shmmap.statistics.counters import PUBLISHED, SPANS, STEPS, WINDOWED, Histogram, lower_bound_ns
 from shmmap.statistics.snapshot import Snapshot
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Literal, TypeVar
 
 from shmmap.errors import SegmentCorrupt
-from shmmap.statistics.counters import Counter
-from shmmap.statistics.histogram import Histogram
+from shmmap.statistics.counters import Counter, Histogram
 from shmmap.statistics.identity import DaemonIdentity, DaemonState
 from shmmap.statistics.layout import Header, State
 

@@ -25,9 +25,16 @@ from shmmap.logfmt import log
 from shmmap.protocol.rows import CellRow, ClientRow, LiveMapRow
 from shmmap.segment.directory import ShmDirectory, measured_bytes
 from shmmap.segment.names import statistics_name
-from shmmap.statistics.counters import COUNTER_NAMES, COUNTERS, HISTOGRAMS, OBJECTS_READ, TURN_KINDS
+from shmmap.statistics.counters import (
+    BUCKETS,
+    COUNTER_NAMES,
+    COUNTERS,
+    HISTOGRAMS,
+    OBJECTS_READ,
+    TURN_KINDS,
+    bucket_of,
+)
 from shmmap.statistics.exclusive_name import hold, take_name
-from shmmap.statistics.histogram import BUCKETS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import (
     CELL_ROW_BYTES,

@@ -23,7 +23,7 @@ from shmmap.errors import (
     ShmmapWarning,
     error_from_wire,
 )
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 
 
 def kinds(root: type[ShmmapError] = ShmmapError) -> Iterator[type[ShmmapError]]:

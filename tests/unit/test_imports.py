@@ -30,12 +30,11 @@ BASE = {
     "geometry",
     "quantities",
     "lacking",
-    "optional_packages",
     "kernel_cache",
     "compiling",
     "large_tables",
     "disk_budget",
-    "lazy_names",
+    "lazy_imports",
     "version",
 }
 PARTS = {
@@ -48,25 +47,24 @@ PARTS = {
     "lacking": {"errors", "geometry", "quantities"},
     "processes": set[str](),
     "geometry": {"errors"},
-    "optional_packages": {"errors"},
     "formats": {"errors", "columns", "geometry", "logfmt", "processes"},
-    "segment": {"errors", "columns", "geometry", "failpoints", "optional_packages"},
+    "segment": {"errors", "columns", "geometry", "failpoints", "lazy_imports"},
     "protocol": {"errors", "columns", "geometry"},
     "kernel_cache": {"logfmt", "version"},
     "compiling": {"kernel_cache", "version"},
     "version": set[str](),
     "large_tables": set[str](),
     "disk_budget": {"failpoints"},
-    "lazy_names": {"optional_packages", "segment.process_limits"},
-    "live": {"chunks", "client", "lazy_names", "protocol"},
-    "events": {"client", "lazy_names", "protocol"},
-    "chunks": {"errors", "failpoints", "compiling", "optional_packages"},
+    "lazy_imports": {"errors", "segment.process_limits"},
+    "live": {"chunks", "client", "lazy_imports", "protocol"},
+    "events": {"client", "lazy_imports", "protocol"},
+    "chunks": {"errors", "failpoints", "compiling", "lazy_imports"},
     "statistics": {"errors", "columns", "geometry", "logfmt", "protocol", "large_tables", "segment"},
     "layers": BASE | {"formats", "segment", "protocol", "statistics"},
     "origin": BASE | {"formats", "segment", "protocol", "statistics"},
     "dividing": BASE | {"formats", "layers", "origin"},
     "client": {
-        "errors", "columns", "failpoints", "geometry", "lacking", "lazy_names", "optional_packages", "chunks",
+        "errors", "columns", "failpoints", "geometry", "lacking", "lazy_imports", "chunks",
         "segment", "protocol", "statistics.layout",
     },
     "daemon": BASE | {
@@ -98,7 +96,7 @@ ROOMS = [
     {"__main__"}, {"main"}, {"assembly"}, {"map_in_memory", "serving_loop"}, {"requests"},
     {"telemetry"}, {"loading", "live"}, {"cache"}, {"events"}, {"transport"}, {"travel", "prerequisites"},
     {"map", "pins"}, {"host", "service_manager"}, {"config"}, {"config_live"},
-    {"config_table", "records", "pace"},
+    {"config_table", "records", "turns"},
 ]  # fmt: skip
 """The daemon's floors, uppermost first; a room imports from the floors below its own."""
 
@@ -213,7 +211,7 @@ def test_programs_use_public_names_alone(module: str) -> None:
                 "shmmap.formats.png",
                 "shmmap.formats.svg",
                 "shmmap.layers",
-                "shmmap.lazy_names",
+                "shmmap.lazy_imports",
                 "shmmap.live",
             ):
                 continue

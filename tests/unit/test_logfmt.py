@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Log lines: one event, one line, whatever a file or a client is called."""
+"""Log lines: one event, one line, whatever a file or a client is called; and where they go."""
 
 from __future__ import annotations
 
+import logging
 import os
+import re
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.logfmt import escaped, logfmt
+from shmmap.logfmt import escaped, logfmt, set_up_logging
 
 
 def test_an_ordinary_line() -> None:
@@ -45,3 +48,47 @@ def test_nothing_moves_the_cursor_or_begins_a_line(text: str) -> None:
     line = logfmt("x", name=text)
     assert line.isprintable()
     assert line.encode()  # lone surrogates are escaped, too
+
+
+@pytest.fixture
+def root_logger() -> Iterator[logging.Logger]:
+    """Give the root logger its handlers back after the test."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield root
+    root.handlers[:], root.level = handlers, level
+
+
+def test_on_a_terminal(
+    root_logger: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("JOURNAL_STREAM", raising=False)
+    set_up_logging()
+    logging.getLogger("shmmap.x").info("cell %s", "a\x1b[2J.pcd")
+    logging.getLogger("shmmap.x").debug("not shown")
+    logging.getLogger("shmmap.x").error("bad")
+    out, err = capsys.readouterr()
+    first, second = err.splitlines()
+    assert out == ""
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    cell a\\x1b\[2J\.pcd", first)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ERROR   bad", second)
+
+
+def test_under_systemd(
+    root_logger: logging.Logger, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every line has its priority, those of a traceback too."""
+    monkeypatch.setenv("JOURNAL_STREAM", "8:12345")
+    set_up_logging(logging.DEBUG)
+    log = logging.getLogger("shmmap.y")
+    for level in (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL):
+        log.log(level, "text")
+    try:
+        raise ValueError("no\x1b[2J")
+    except ValueError:
+        log.exception("two\nlines")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:6] == [*(f"<{n}>text" for n in (7, 6, 4, 3, 2)), r"<3>two\nlines"]
+    assert len(lines) > 7
+    assert all(line.startswith("<3>") for line in lines[5:])
+    assert lines[-1] == r"<3>ValueError: no\x1b[2J"

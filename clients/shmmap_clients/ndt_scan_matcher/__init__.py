@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.ndt_scan_matcher.backends.backend import Backend, DeviceError, DeviceOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from shmmap_clients.ros_bridge.node import BridgeSettings, RosBridge

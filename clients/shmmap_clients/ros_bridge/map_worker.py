@@ -11,9 +11,8 @@ from typing import Any, Final
 from cyclonedds.pub import DataWriter
 
 from shmmap import BadRequest, CellInfo, Client, LoadFailed
-from shmmap_clients.ros_bridge.catalogue import Catalogue, Requesters
 from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
-from shmmap_clients.ros_bridge.map_answers import MapAnswers
+from shmmap_clients.ros_bridge.map_answers import Catalogue, MapAnswers, Requesters
 from shmmap_clients.ros_bridge.messages import MapMetaData, PointCloud2, ready_made
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, fill_rows, write_cloud_head
 from shmmap_clients.ros_bridge.service_server import Listening, Request

@@ -14,7 +14,7 @@ from shmmap.statistics.counters import TURN_KINDS
 
 if TYPE_CHECKING:
     from shmmap.protocol.rows import ClientRow, LiveMapRow
-    from shmmap.statistics.histogram import Histogram
+    from shmmap.statistics.counters import Histogram
     from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.snapshot import Snapshot
 

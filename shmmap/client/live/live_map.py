@@ -21,9 +21,9 @@ from shmmap.client.connection import until_served
 from shmmap.client.live.chunk_reader import ChunkInfo, ChunkReader, Place
 from shmmap.client.session import Session
 from shmmap.errors import BadRequest, SegmentCorrupt, SegmentError, StaleHandle
-from shmmap.optional_packages import needed_packages
+from shmmap.lazy_imports import needed_packages
 from shmmap.protocol import live as messages
-from shmmap.protocol.areas import BoxMessage, area_to_message
+from shmmap.protocol.areas import FURTHEST_M, BoxMessage, LiveArea, SphereMessage, area_to_message
 
 if TYPE_CHECKING:
     from shmmap.chunks.occupancy import ScanFilter
@@ -368,14 +368,14 @@ def _points(what: str, values: ArrayLike) -> NDArray[np.float64]:
         raise BadRequest(f"{what}: need numbers of the shape (N, 3): {error}") from None
 
 
-def _area(area: geometry.Box | Sphere | None) -> messages.LiveArea | None:
+def _area(area: geometry.Box | Sphere | None) -> LiveArea | None:
     if area is None:
         return None
     if isinstance(area, Sphere):
         x, y, z, radius = _metres(area.x, area.y, area.z, area.radius)
-        if not all(abs(value) < messages.FURTHEST_M for value in (x, y, z, radius)) or radius < 0.0:
+        if not all(abs(value) < FURTHEST_M for value in (x, y, z, radius)) or radius < 0.0:
             raise BadRequest(f"{area}: it is not finite, or nothing can lie in it")
-        return messages.SphereMessage(x, y, z, radius)
+        return SphereMessage(x, y, z, radius)
     message = area_to_message(area)
     if not isinstance(message, BoxMessage):
         raise BadRequest("an area of a live map is a Box or a Sphere")

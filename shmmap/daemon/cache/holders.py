@@ -16,10 +16,10 @@ from itertools import islice
 from typing import Final
 
 from shmmap.daemon.cache.reclaimer import Reclaimer
-from shmmap.daemon.pace import Walk
 from shmmap.daemon.pins.probe import PinSource
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import Walk
 from shmmap.errors import Busy
 from shmmap.protocol.messages import Holder
 from shmmap.segment.pins import LOADER_SLOT, has_slot, holders

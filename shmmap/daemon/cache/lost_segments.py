@@ -12,8 +12,8 @@ from typing import Final
 
 from shmmap.daemon.cache.reclaimer import Reclaimer
 from shmmap.daemon.host.inotify import NAME_GONE, OVERFLOW, Inotify
-from shmmap.daemon.pace import Walk
 from shmmap.daemon.records import Resident
+from shmmap.daemon.turns import Walk
 from shmmap.logfmt import log
 from shmmap.quantities import format_bytes
 

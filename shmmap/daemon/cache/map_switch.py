@@ -12,8 +12,8 @@ import numpy as np
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.pace import Walk
 from shmmap.daemon.records import Resident
+from shmmap.daemon.turns import Walk
 from shmmap.large_tables import ShardedDict
 from shmmap.origin.catalogue_change import CatalogueChange
 from shmmap.segment.version import Stamp

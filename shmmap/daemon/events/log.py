@@ -17,7 +17,7 @@ from typing import Final, Protocol
 import msgspec
 
 from shmmap.daemon.transport.connection import Connection, Connections, Listener
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.logfmt import log
 from shmmap.protocol import events
 from shmmap.protocol.events import EventPage, Recent, encode_event

@@ -10,7 +10,7 @@ import subprocess
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.logfmt import log
 from shmmap.processes.start_child import ForkedProcess, fork_child, how_ended, receive_packet, start_child
 from shmmap.version import __version__

@@ -16,7 +16,7 @@ from shmmap.daemon.loading.prefetcher import Prefetcher
 from shmmap.daemon.loading.worker_messages import Decision, Need
 from shmmap.daemon.loading.worker_pool import Worker, WorkerPool
 from shmmap.daemon.records import Load, Resident
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.quantities import format_bytes
 
 __all__ = ["Room"]

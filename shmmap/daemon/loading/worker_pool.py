@@ -21,7 +21,7 @@ import msgspec
 
 from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.prepared_parent import PreparedParent
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.layers.points import LAYER
 from shmmap.logfmt import log
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet

@@ -20,13 +20,13 @@ import msgspec
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.scheduler import Scheduler
 from shmmap.daemon.map.catalogue_view import PageNews
-from shmmap.daemon.pace import Pace, batched
 from shmmap.daemon.records import SPACE_CODES, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import difference, warm_difference
 from shmmap.daemon.requests.pending_request import LARGE, Found, MapChanged, PendingRequest, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import Pace, batched
 from shmmap.errors import BadRequest, ShmmapError
 from shmmap.geometry import Area
 from shmmap.protocol import messages

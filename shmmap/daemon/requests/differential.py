@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.pace import batched
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.pending_request import PendingRequest
+from shmmap.daemon.turns import batched
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
 from shmmap.protocol.messages import Differential, HeldCell

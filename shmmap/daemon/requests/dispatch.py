@@ -3,30 +3,77 @@
 
 from __future__ import annotations
 
+import math
+import sys
 import time
+import traceback
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Final
 
 from shmmap.daemon.cache.holders import Survey, Usage
-from shmmap.daemon.host.logs import Defects
 from shmmap.daemon.live.relay import LiveRelay, NoLiveMaps
-from shmmap.daemon.pace import Pace, batched
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.handshake import Handshake
 from shmmap.daemon.requests.limits import check_intent
 from shmmap.daemon.requests.map_queries import MapQueries
-from shmmap.daemon.requests.operators.authorization import Authorization
-from shmmap.daemon.requests.operators.operator_requests import OPERATOR_REQUESTS, OperatorRequests
+from shmmap.daemon.requests.operators.operator_requests import (
+    OPERATOR_REQUESTS,
+    Authorization,
+    OperatorRequests,
+)
 from shmmap.daemon.telemetry.sampler import Sampler
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.inbox import WorkItem
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import Pace, batched
 from shmmap.errors import BadRequest, InternalError, NoSession, ShmmapError
+from shmmap.logfmt import log
 from shmmap.protocol import messages
 from shmmap.protocol.codec import decode_request, encode, request_number, unpack_versions
 from shmmap.protocol.live import LIVE_REQUESTS
+from shmmap.statistics.writer import StatisticsWriter
 
-__all__ = ["Dispatch"]
+__all__ = ["Defects", "Dispatch"]
+
+MAX_DEFECTS: Final = 100
+WITHIN_S: Final = 10.0
+"""That many exceptions of one place in this time are fatal; one of them is logged."""
+
+
+class Defects:
+    """Unexpected exceptions met while serving: counted and survived, unless one place keeps raising.
+
+    Parameters
+    ----------
+    clock
+        Seconds.
+    """
+
+    def __init__(self, statistics: StatisticsWriter, clock: Callable[[], float] = time.monotonic) -> None:
+        self._statistics = statistics
+        self._now_s = clock
+        self._met: defaultdict[tuple[str, int], deque[float]] = defaultdict(
+            partial(deque, maxlen=MAX_DEFECTS)
+        )
+        self._logged_s: dict[tuple[str, int], float] = {}
+
+    def record(self) -> bool:
+        """Record the exception that is being handled; True when its place raised too often to go on.
+
+        Its traceback is logged, unless that of the same place was just now.
+        """
+        self._statistics.add("defects")
+        *_, (frame, line) = traceback.walk_tb(sys.exc_info()[2])
+        place, now_s = (frame.f_code.co_filename, line), self._now_s()
+        if now_s >= self._logged_s.get(place, -math.inf) + WITHIN_S:
+            self._logged_s[place] = now_s
+            log.exception("defect", place=f"{place[0]}:{place[1]}", hint="please report it")
+        met = self._met[place]
+        met.append(now_s)
+        return len(met) == MAX_DEFECTS and now_s - met[0] <= WITHIN_S
 
 
 @dataclass(eq=False, slots=True)

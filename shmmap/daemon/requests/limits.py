@@ -15,10 +15,10 @@ import numpy as np
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S
 from shmmap.daemon.loading.loads import Loads
-from shmmap.daemon.pace import batched
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.requests.pending_request import PendingRequest
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import batched
 from shmmap.errors import BadRequest, Busy
 from shmmap.layers.spec import canonical_layer, canonical_layers
 from shmmap.protocol import messages

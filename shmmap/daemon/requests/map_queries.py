@@ -22,11 +22,11 @@ from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.loading.loads import Loads
 from shmmap.daemon.map.catalogue_view import CatalogueView, PageNews, Pages
-from shmmap.daemon.pace import Pace
 from shmmap.daemon.records import Resident
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.telemetry.sampler import client_row
 from shmmap.daemon.transport.sessions import Session, Sessions
+from shmmap.daemon.turns import Pace
 from shmmap.errors import BadRequest, Offline, ShmmapError, UnknownCell
 from shmmap.geometry import Area
 from shmmap.layers.spec import kinds

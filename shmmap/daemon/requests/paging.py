@@ -18,7 +18,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 
 __all__ = ["Paging"]
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.map.catalogue_view import CatalogueView
-from shmmap.daemon.pace import Pace, Walk
 from shmmap.daemon.records import Key
 from shmmap.daemon.transport.sessions import Session
+from shmmap.daemon.turns import Pace, Walk
 from shmmap.errors import NoSession
 from shmmap.geometry import Area, distance_to_boxes
 

@@ -23,8 +23,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.daemon.transport.zmtp import GREETING, Incoming, framed
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import BadRequest, ProtocolMismatch, ShmmapError
 from shmmap.failpoints import step
 from shmmap.logfmt import log

@@ -17,8 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from shmmap.columns import ColumnSpec
-from shmmap.formats.finite import Bounds
+from shmmap.columns import Bounds, ColumnSpec
 from shmmap.formats.pcd import lzf
 from shmmap.formats.pcd.body import ascii_blocks, binary_blocks, check_sizes, compressed_blocks, field_arrays
 from shmmap.formats.pcd.fields import AXES

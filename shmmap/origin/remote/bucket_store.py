@@ -14,7 +14,7 @@ from datetime import timedelta
 from typing import Any, Final, TypeVar, cast
 
 from shmmap.errors import BadRequest, ConfigError, MapDataError, MapMissing, Offline
-from shmmap.optional_packages import FOR_REMOTE, needed_packages
+from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 from shmmap.origin.remote.credentials import azure_settings, google_settings, s3_settings
 from shmmap.origin.remote.store import (
     WEB_SCHEMES,

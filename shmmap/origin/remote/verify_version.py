@@ -20,7 +20,7 @@ import msgspec
 
 from shmmap.errors import MapDataError, MapMissing, ShmmapError
 from shmmap.formats.durable_file import locked_file, writing_errors
-from shmmap.optional_packages import TO_SIGN, needed_packages
+from shmmap.lazy_imports import TO_SIGN, needed_packages
 from shmmap.origin.reading_apart import Outcome
 from shmmap.origin.remote.map_versions import MAX_METADATA_BYTES, TIMESTAMP
 from shmmap.origin.remote.opened_store import open_store

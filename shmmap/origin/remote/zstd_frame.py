@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Final
 
 from shmmap.errors import MapDataError
-from shmmap.optional_packages import FOR_REMOTE, needed_packages
+from shmmap.lazy_imports import FOR_REMOTE, needed_packages
 
 with needed_packages("a published map", together=FOR_REMOTE):
     import zstandard

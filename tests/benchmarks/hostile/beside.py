@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from shmmap.statistics.histogram import Histogram, lower_bound_ns
+from shmmap.statistics.counters import Histogram, lower_bound_ns
 from shmmap.statistics.reader import read_statistics
 from tests.benchmarks.hostile.actors import Actor, asks_the_daemon, asks_the_echo, echoes, newcomers
 from tests.benchmarks.hostile.stage import Report

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
 
 from shmmap_clients.ros_bridge import participant
-from shmmap_clients.ros_bridge.catalogue import Requesters
-from shmmap_clients.ros_bridge.map_answers import RecentCells, sensible, touches
+from shmmap_clients.ros_bridge.map_answers import RecentCells, Requesters, sensible, touches
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
 from shmmap_clients.ros_bridge.service_server import Request, Requester

@@ -24,8 +24,8 @@ def small_map(tmp_path: Path) -> DividedMap:
 @pytest.fixture
 def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     """End each turn of work on many things after the first of them."""
-    monkeypatch.setattr("shmmap.daemon.pace.TURN_S", 0.0)
-    monkeypatch.setattr("shmmap.daemon.pace.BATCH", 1)
+    monkeypatch.setattr("shmmap.daemon.turns.TURN_S", 0.0)
+    monkeypatch.setattr("shmmap.daemon.turns.BATCH", 1)
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ from shmmap.daemon.requests.operators.operator_pins import OperatorPins
 from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply

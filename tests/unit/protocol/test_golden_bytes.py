@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 from shmmap.errors import ProtocolMismatch
+from shmmap.protocol import areas, live
 from shmmap.protocol import events as e
-from shmmap.protocol import live
 from shmmap.protocol import messages as m
 from shmmap.protocol.codec import (
     decode_reply,
@@ -402,7 +402,7 @@ LIVE_REQUESTS: list[tuple[Any, list[Any], str]] = [
         "93a96c6976655f7361766505a56c69646172",
     ),
     (
-        live.LiveChunks(6, "lidar", live.SphereMessage(1.0, 2.0, 3.0, 4.0), 7, True, (-1, 0, 2)),
+        live.LiveChunks(6, "lidar", areas.SphereMessage(1.0, 2.0, 3.0, 4.0), 7, True, (-1, 0, 2)),
         ["live_chunks", 6, "lidar", ["sphere", 1.0, 2.0, 3.0, 4.0], 7, True, [-1, 0, 2]],
         (
             "97ab6c6976655f6368756e6b7306a56c6964617295a6737068657265cb3ff0000000000000cb4000"

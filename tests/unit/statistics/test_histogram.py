@@ -8,7 +8,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.statistics.histogram import BUCKETS, Histogram, bucket_of, lower_bound_ns
+from shmmap.statistics.counters import BUCKETS, Histogram, bucket_of, lower_bound_ns
 
 
 def counted(durations: list[int]) -> Histogram:

@@ -15,8 +15,7 @@ import msgspec
 
 from shmmap.segment.directory import ShmDirectory
 from shmmap.statistics import identity as identity_module
-from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
-from shmmap.statistics.histogram import bucket_of
+from shmmap.statistics.counters import COUNTERS, HISTOGRAMS, bucket_of
 from shmmap.statistics.identity import DaemonIdentity, WriterProcess, judge, start_time_ticks
 from shmmap.statistics.reader import StatisticsReader, read_statistics
 from shmmap.statistics.writer import StatisticsWriter

@@ -34,7 +34,6 @@ __all__ = [
     "worker_count",
 ]
 
-
 _SHOWN_FAILURES: Final = 20
 
 
@@ -119,7 +118,7 @@ def add_store_options(parser: argparse.ArgumentParser) -> None:
 
 def store_at(url: str, args: argparse.Namespace) -> Store:
     """Return the store at a URL, opened as the options say."""
-    from shmmap.optional_packages import needed_packages
+    from shmmap.lazy_imports import needed_packages
 
     with needed_packages("a published map"):
         from shmmap.origin.remote.opened_store import open_store
@@ -136,7 +135,7 @@ def add_sign_option(parser: argparse.ArgumentParser) -> None:
 
 def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False) -> MapSigner | None:
     """Return what signs a map, as the options say; None: it is not signed."""
-    from shmmap.optional_packages import TO_SIGN, needed_packages
+    from shmmap.lazy_imports import TO_SIGN, needed_packages
 
     if args.sign is None:
         return None

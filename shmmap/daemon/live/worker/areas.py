@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from shmmap.chunks.voxels import CHUNK_SIDE, FURTHEST_INDEX, ChunkKey
 from shmmap.daemon.live.paging.key_index import EVERYWHERE, KeyRange
 from shmmap.errors import BadRequest
-from shmmap.protocol.live import FURTHEST_M, LiveArea, SphereMessage
+from shmmap.protocol.areas import FURTHEST_M, LiveArea, SphereMessage
 
 __all__ = ["check_area", "inside", "key_range", "touches"]
 

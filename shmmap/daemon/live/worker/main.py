@@ -20,7 +20,6 @@ from typing import Any, Final
 
 from shmmap.chunks.chunk_file import usual_codec
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.host.logs import set_up_logging
 from shmmap.daemon.live import messages
 from shmmap.daemon.live.chunk_memory import ChunkMemory, live_prefix
 from shmmap.daemon.live.disk.folder import Folder
@@ -30,7 +29,7 @@ from shmmap.daemon.live.worker.marks_directory import MarksDirectory
 from shmmap.daemon.live.worker.opening import OpeningMap
 from shmmap.daemon.live.worker.served_map import ServedMap
 from shmmap.errors import BadRequest, ConfigError, InstanceBusy, InternalError, LiveInterrupted, ShmmapError
-from shmmap.logfmt import log
+from shmmap.logfmt import log, set_up_logging
 from shmmap.processes.end_with_parent import die_with
 from shmmap.processes.start_child import packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_request, encode, request_number

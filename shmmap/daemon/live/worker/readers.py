@@ -28,6 +28,7 @@ from shmmap.daemon.live.worker.voxel_lists import Later, Steps, VoxelLists
 from shmmap.errors import BadRequest, CannotWrite, InternalError, ShmmapError
 from shmmap.logfmt import log
 from shmmap.protocol import live as messages
+from shmmap.protocol.areas import LiveArea
 from shmmap.protocol.messages import ErrorReply
 
 __all__ = ["Readers"]
@@ -285,7 +286,7 @@ class Readers:
     # --- requests -------------------------------------------------------------------------------
 
     def _keys(
-        self, area: messages.LiveArea | None, indexes: list[KeyIndex], since: int, after: ChunkKey | None
+        self, area: LiveArea | None, indexes: list[KeyIndex], since: int, after: ChunkKey | None
     ) -> Iterator[list[ChunkKey]]:
         """Yield chunks that touch an area, in order, a step's at a time; of those in memory what changed."""
         resolution = self.live.resolution

@@ -16,9 +16,9 @@ from typing import Final
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.loading.loads import BACKGROUND
 from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.pace import Pace
 from shmmap.daemon.records import Key
 from shmmap.daemon.requests.limits import check_count
+from shmmap.daemon.turns import Pace
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol import messages

@@ -17,8 +17,7 @@ from shmmap.cli.screens.top_screen import budget_parts, screen
 from shmmap.cli.verbs.look.outputs import Prefetching
 from shmmap.client.live.chunk_reader import ChunkInfo
 from shmmap.protocol.rows import CellRow, CellState, ClientRow, LiveMapRow, Window
-from shmmap.statistics.counters import COUNTERS, HISTOGRAMS
-from shmmap.statistics.histogram import BUCKETS
+from shmmap.statistics.counters import BUCKETS, COUNTERS, HISTOGRAMS
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.layout import State, plan
 from shmmap.statistics.snapshot import Snapshot

@@ -10,7 +10,7 @@ import pytest
 import shmmap
 from shmmap.client.live.live_map import LiveMap, _area
 from shmmap.errors import BadRequest
-from shmmap.protocol.live import SphereMessage
+from shmmap.protocol.areas import SphereMessage
 
 
 @pytest.mark.parametrize(

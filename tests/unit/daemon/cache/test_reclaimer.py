@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
+from shmmap.daemon.cache import reclaimer
 from shmmap.daemon.cache.evictor import WORK_PER_TURN, Evictor
 from shmmap.daemon.cache.ledger import Ledger
 from shmmap.daemon.cache.reclaimer import HAND_OUT_GRACE_S, LOOKS_PER_TURN, TICK_S, Reclaimer
 from shmmap.daemon.pins.watch import PinWatch
 from shmmap.daemon.records import Key, Resident
 from shmmap.daemon.transport.sessions import Sessions
-from shmmap.segment import closer
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 
@@ -107,7 +107,7 @@ def test_a_large_segment_s_memory_counts_until_it_is_free(
         may_close.wait(10.0)
         close(fd)
 
-    monkeypatch.setattr(closer, "os", SimpleNamespace(**{**vars(os), "close": held_up}))
+    monkeypatch.setattr(reclaimer, "os", SimpleNamespace(**{**vars(os), "close": held_up}))
     (small,), (large,) = memory.publish(1), memory.publish(1, LARGE)
     for resident in (small, large):
         assert memory.reclaimer.retire(resident, NOW_S)
@@ -130,8 +130,8 @@ def test_the_number_that_wait_to_be_closed_is_bounded(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The others keep their names, and count, until there is room for them."""
-    monkeypatch.setattr(closer, "MAX_WAITING", 3)
-    monkeypatch.setattr(closer.Closer, "_run", lambda _: None)  # nothing is closed
+    monkeypatch.setattr(reclaimer, "MAX_WAITING", 3)
+    monkeypatch.setattr(reclaimer.Closer, "_run", lambda _: None)  # nothing is closed
     large = memory.publish(5, LARGE)
     for resident in large:
         memory.reclaimer.retire(resident, NOW_S)

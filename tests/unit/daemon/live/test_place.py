@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from shmmap.daemon import map_in_memory
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.host.memory import Mount, choose_budget
-from shmmap.daemon.live import place
 from shmmap.daemon.live.messages import Begin
-from shmmap.daemon.live.place import CEILING_BYTES, bytes_beside_cells, place_live_maps
+from shmmap.daemon.map_in_memory import CEILING_BYTES, bytes_beside_cells, place_live_maps
 from shmmap.errors import CannotStart, ConfigError
 from shmmap.segment.directory import ShmDirectory
 
@@ -45,7 +45,7 @@ def placed(
 def mounted(monkeypatch: pytest.MonkeyPatch, *rows: tuple[str, str]) -> None:
     """Have the machine's mounts be these: where, and the options of the file system."""
     found = [Mount("tmpfs", "/", point, options.split(",")) for point, options in rows]
-    monkeypatch.setattr(place, "mounts", lambda: iter(found))
+    monkeypatch.setattr(map_in_memory, "mounts", lambda: iter(found))
 
 
 def test_beside_the_cells(cells: ShmDirectory) -> None:
@@ -57,7 +57,7 @@ def test_beside_the_cells(cells: ShmDirectory) -> None:
 
 
 def test_a_map_without_a_directory_gets_one(cells: ShmDirectory, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(place, "live_directory", lambda instance, name: f"/state/{instance}/{name}")
+    monkeypatch.setattr(map_in_memory, "live_directory", lambda instance, name: f"/state/{instance}/{name}")
     begin = place_live_maps(
         [LiveSettings("lidar")], instance="city", cells=cells, cells_budget_bytes=0, shm_dir="",
         budget_bytes=0, gid=-1, marks_gid=-1,

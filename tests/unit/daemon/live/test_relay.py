@@ -12,7 +12,6 @@ import msgspec
 import pytest
 
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.log import EventLog
 from shmmap.daemon.live import messages, relay
 from shmmap.daemon.live.relay import (
@@ -23,9 +22,10 @@ from shmmap.daemon.live.relay import (
     REFUSED_PER_TURN,
     STABLE_S,
     START_END_S,
+    LiveEvents,
     LiveRelay,
 )
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import BadRequest, Busy, ConfigError, LiveInterrupted
 from shmmap.processes.start_child import channel, packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_reply

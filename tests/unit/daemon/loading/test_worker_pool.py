@@ -16,7 +16,7 @@ import pytest
 from shmmap.daemon.loading.prepared_parent import PreparedParent
 from shmmap.daemon.loading.worker_messages import Check, Job
 from shmmap.daemon.loading.worker_pool import JOBS_AHEAD, LAYERS_AHEAD, Work, Worker, WorkerPool
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.protocol.messages import Selected
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.version import Source

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import pytest
 
-from shmmap.daemon import pace
+from shmmap.daemon import turns
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.dispatch import Dispatch
 from shmmap.errors import BadRequest, NoSession, ShmmapError
@@ -36,7 +36,7 @@ def test_a_turn_ends_when_its_time_is_used(
 ) -> None:
     """However many cells it is for.  Here time goes on with each look at it, a quarter of a turn's."""
     looks = itertools.count()
-    monkeypatch.setattr(pace, "time", SimpleNamespace(monotonic=lambda: next(looks) * pace.TURN_S / 4))
+    monkeypatch.setattr(turns, "time", SimpleNamespace(monotonic=lambda: next(looks) * turns.TURN_S / 4))
     one = inner(str(made.root))
     session = one.session()
 

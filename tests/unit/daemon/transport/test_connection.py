@@ -31,8 +31,8 @@ from shmmap.daemon.transport.connection import (
 )
 from shmmap.daemon.transport.inbox import Inbox
 from shmmap.daemon.transport.socket_file import SocketFile
-from shmmap.daemon.transport.watched_descriptors import WatchedDescriptors
 from shmmap.daemon.transport.zmtp import GREETING, framed
+from shmmap.daemon.turns import WatchedDescriptors
 from shmmap.errors import Busy
 from shmmap.protocol.codec import decode_reply
 from shmmap.statistics.writer import StatisticsWriter

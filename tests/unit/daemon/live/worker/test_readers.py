@@ -23,16 +23,14 @@ from shmmap.daemon.live.worker.areas import check_area, inside, key_range, touch
 from shmmap.daemon.live.worker.voxel_lists import KEPT_S, VOXEL_BYTES, Later, VoxelLists
 from shmmap.errors import BadRequest, OverBudget
 from shmmap.protocol import live as messages
-from shmmap.protocol.areas import BoxMessage
+from shmmap.protocol.areas import BoxMessage, LiveArea, SphereMessage
 from shmmap.protocol.codec import decode_reply, encode
 from shmmap.protocol.live import (
     MAX_CHUNK_ROWS,
-    LiveArea,
     LiveChunkPage,
     LiveChunks,
     LiveVoxels,
     LiveVoxelsReply,
-    SphereMessage,
 )
 from shmmap.protocol.messages import ErrorReply
 from tests.support.live_drive import RESOLUTION
@@ -214,7 +212,7 @@ def test_a_session_that_asks_for_much_waits_for_one_that_asks_for_little(
 @pytest.mark.parametrize("area", [None, BoxMessage(10.0, 0.0, 20.0, 5.0), SphereMessage(15.0, 0.0, 0.0, 5.0)])
 @pytest.mark.parametrize("saved", [True, False])
 def test_a_step_looks_at_few_chunks_however_many_there_are(
-    served: Served, monkeypatch: pytest.MonkeyPatch, area: messages.LiveArea | None, *, saved: bool
+    served: Served, monkeypatch: pytest.MonkeyPatch, area: LiveArea | None, *, saved: bool
 ) -> None:
     monkeypatch.setattr(readers, "TURN_S", 0.0)
     for x in range(20):
@@ -223,7 +221,7 @@ def test_a_step_looks_at_few_chunks_however_many_there_are(
     bring(served, ChunkKey(1, 0, 0))
     looked = 0
 
-    def counted(area: messages.LiveArea | None, key: ChunkKey, resolution: float) -> bool:
+    def counted(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
         nonlocal looked
         looked += 1
         return areas.touches(area, key, resolution)

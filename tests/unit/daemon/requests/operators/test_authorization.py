@@ -8,7 +8,7 @@ import pwd
 
 import pytest
 
-from shmmap.daemon.requests.operators.authorization import Authorization
+from shmmap.daemon.requests.operators.operator_requests import Authorization
 from shmmap.daemon.transport.connection import Peer
 from shmmap.errors import ConfigError, NotPermitted
 

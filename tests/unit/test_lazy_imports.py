@@ -13,7 +13,7 @@ import pytest
 PACKAGE = """\
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from lazy_one.inner import first, second

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shmmap.formats.finite import Bounds, row_extremes
+from shmmap.columns import Bounds, row_extremes
 
 SIZES = [1, 2, 511, 512, 513, 1023, 1024, 1025, 5000]
 

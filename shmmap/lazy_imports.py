@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Public names of a package that are loaded when they are first used (PEP 562).
+"""Imports on first use: a package's public names (PEP 562), and one clear line where a package is missing.
 
 So importing a package costs next to nothing, and a command line starts, and can say which package is missing,
 where not all are installed.  The package imports its public names under ``if TYPE_CHECKING:``, for type
@@ -11,13 +11,75 @@ from __future__ import annotations
 import _ast  # `ast` itself takes a millisecond to load
 import importlib
 import sys
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
 
-from shmmap.optional_packages import needed_packages
+from shmmap.errors import PackageMissing
 from shmmap.segment.process_limits import no_files_left
 
-__all__ = ["lazy_names", "lazy_public_names", "public_names"]
+__all__ = ["FOR_REMOTE", "TO_SIGN", "lazy_names", "lazy_public_names", "needed_packages", "public_names"]
+
+FOR_REMOTE: Final = "obstore zstandard"
+"""What a published map needs, together: the extra ``remote``."""
+TO_SIGN: Final = "tuf 'securesystemslib[crypto]'"
+"""What a signed map needs: the extra ``sign``."""
+
+_PACKAGES: Final = {
+    "securesystemslib": "securesystemslib[crypto]",
+    "cryptography": "securesystemslib[crypto]",
+    "lzf": "python-neo-lzf",
+    "yaml": "PyYAML",
+    "zmq": "pyzmq",
+    "open3d": "open3d-cpu",
+}
+"""Packages that are not called as the module they bring."""
+
+_OPTIONAL: Final = frozenset(
+    {"cyclonedds", "laspy", "obstore", "pyopencl", "securesystemslib[crypto]", "tifffile", "tuf", "zstandard"}
+)
+"""Packages that no ordinary install brings: `project.optional-dependencies`."""
+
+_OURS: Final = ("shmmap", "shmmap_clients")
+
+
+@contextmanager
+def needed_packages(what: str, *, together: str = "") -> Iterator[None]:
+    """Say which package is missing where something is imported, instead of a traceback.
+
+    Parameters
+    ----------
+    what
+        Who needs it: a function, a program.
+    together
+        What to install where one is of little use without others.
+
+    Raises
+    ------
+    PackageMissing
+        For the `ModuleNotFoundError` of anybody else's module.
+
+    Examples
+    --------
+    >>> with needed_packages("shmmap-ndt"):
+    ...     import numba
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if not module or module in _OURS:
+            raise
+        package = _PACKAGES.get(module, module)
+        all_others = (
+            ""
+            if package in _OPTIONAL
+            else ("; after a client-only install, `pip install .` in the checkout brings all packages")
+        )
+        raise PackageMissing(
+            f"{what} needs the package {package}, which is not installed",
+            hint=f"pip install {together or package}{all_others}",
+        ) from None
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import msgspec
 
-from shmmap.daemon.events.live_events import LiveEvents
 from shmmap.daemon.events.log import EventLog
+from shmmap.daemon.live.relay import LiveEvents
 from shmmap.protocol import events as e
 from shmmap.protocol.rows import LiveMapRow
 from shmmap.statistics.writer import StatisticsWriter
