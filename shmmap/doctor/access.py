@@ -60,7 +60,7 @@ def groups_of(uid: int) -> set[int]:
 
 
 def check_group(patient: Patient) -> Finding:
-    """Is who asks a member of the group that may connect?"""
+    """Check that the user is in the group that may connect."""
     name = "group"
     gid = -1
     if patient.config.group.isdigit():
@@ -101,7 +101,7 @@ def check_group(patient: Patient) -> Finding:
 
 
 def check_socket(patient: Patient) -> Finding:
-    """Does the daemon answer, and who could ask it?"""
+    """Check that the daemon answers, and who may connect."""
     from shmmap.client.discovery import check_socket as connect
 
     name, path = "socket", patient.socket
@@ -148,7 +148,7 @@ def _access(path: str) -> str:
 
 
 def check_map_access(patient: Patient) -> Finding:
-    """Can the daemon read the map, wherever it lies?"""
+    """Check that the daemon can read the map, wherever it lies."""
     name, path = "map", patient.map_path
     if not path and (patient.config.live or (patient.seen is not None and patient.seen.live)):
         return ok(name, "none is served: the daemon keeps live maps alone")

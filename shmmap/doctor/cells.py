@@ -25,7 +25,7 @@ MAX_MISS_SHARE: Final = 0.02
 
 
 def check_cells(patient: Patient) -> Finding:
-    """Can every cell be loaded that was asked for?"""
+    """Check that every cell that was asked for can be loaded."""
     name = "cells"
     if not patient.alive or patient.seen is None:
         return skip(name, "no daemon runs")
@@ -61,7 +61,7 @@ def check_cells(patient: Patient) -> Finding:
 
 
 def _cause(cell: str, layer: str, message: str) -> str:
-    """A line about one failure; messages begin with the path of the file, which ends as the cell's id."""
+    """Describe a failure in a line; messages begin with the path of the file, which ends as the cell's id."""
     before, found, cause = message.partition(f"{cell}: ")
     return f"{cell} ({layer}): {cause if found and before.startswith('/') else message}"
 

@@ -38,7 +38,7 @@ _CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1
 
 
 def check_daemon(patient: Patient) -> Finding:
-    """How is the daemon?"""
+    """Check the state of the daemon."""
     name = "daemon"
     if patient.seen is None:
         return warn(name, patient.unreadable, "join its group, or run it with sudo")
@@ -89,7 +89,7 @@ def check_daemon(patient: Patient) -> Finding:
 
 
 def check_leftovers(patient: Patient) -> Finding:
-    """Is memory held by segments that no daemon looks after?"""
+    """Check for memory in segments that no daemon looks after."""
     name = "leftovers"
     found: dict[str, tuple[int, int]] = {}
     with_chunks: set[str] = set()
@@ -167,7 +167,7 @@ def _logind_setting(machine: Machine, key: str) -> str:
 
 
 def check_logind(patient: Patient) -> Finding:
-    """Will the session manager delete the segments at logout?"""
+    """Check whether the session manager will delete the segments at logout."""
     name, machine, uid = "logout", patient.machine, patient.runs_as
     if uid <= SYSTEM_UIDS:
         return ok(name, "the daemon runs as a system account: logind does not delete its segments")
@@ -186,7 +186,7 @@ def check_logind(patient: Patient) -> Finding:
 
 
 def check_reload(patient: Patient) -> Finding:
-    """Could the map be read the last time?"""
+    """Check that the map could be read the last time."""
     name = "reload"
     if not patient.alive or patient.seen is None:
         return skip(name, "no daemon runs")
@@ -213,7 +213,7 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
 def check_pins(patient: Patient) -> Finding:
-    """Can the kernel tell which processes map a segment?"""
+    """Check that the kernel reports whether any process maps a segment."""
     name = "leases"
     try:
         directory = ShmDirectory(patient.shm_dir)
@@ -242,7 +242,7 @@ def check_pins(patient: Patient) -> Finding:
 
 
 def check_descriptors(patient: Patient) -> Finding:
-    """How many clients does the limit of open files allow?"""
+    """Check how many clients the limit of open files allows."""
     limits = _LIMIT.search(patient.machine.text(f"/proc/{patient.pid}/limits")) if patient.pid else None
     hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     whose = f"of the daemon (pid {patient.pid})" if limits else "here"

@@ -49,7 +49,7 @@ def mount_of(machine: Machine, path: str) -> _Mount:
 
 
 def check_shared_memory(patient: Patient) -> Finding:
-    """Is the file system large enough for the budget?"""
+    """Check that the file system is large enough for the budget."""
     name, path = "shared memory", patient.shm_dir
     try:
         state = os.statvfs(patient.machine.path(path))
@@ -87,7 +87,7 @@ def _enough(budget: int) -> str:
 
 
 def check_container(patient: Patient) -> Finding:
-    """Does a container see enough shared memory?"""
+    """Check that a container sees enough shared memory."""
     name = "container"
     machine = patient.machine
     marks = ("/.dockerenv", "/run/.containerenv")
@@ -134,7 +134,7 @@ def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
 
 
 def check_memory_limit(patient: Patient) -> Finding:
-    """Would the cgroup's limit kill the daemon before its budget is full?
+    """Check whether the cgroup's limit would kill the daemon before its budget is full.
 
     Segments are charged to the group, as the daemon reckons when it chooses its budget; what its processes
     use beside them is measured while it runs.
@@ -159,7 +159,7 @@ def check_memory_limit(patient: Patient) -> Finding:
 
 
 def check_huge_pages(patient: Patient) -> Finding:
-    """Are segments on huge pages, and does that pay on this kernel?"""
+    """Check whether segments are on huge pages, and whether that pays on this kernel."""
     name, machine = "huge pages", patient.machine
     mount = mount_of(machine, patient.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
@@ -193,7 +193,7 @@ _SERVICE_CACHE: Final = "/var/cache/shmmap"
 
 
 def check_disk_cache(patient: Patient) -> Finding:
-    """Is the cache directory the daemon's, and can more be kept in it?"""
+    """Check that the cache directory is the daemon's, and that there is room in it."""
     name, uid = "disk cache", patient.runs_as
     if not patient.config.cache_bytes:
         return skip(name, "nothing is kept: cache_bytes is 0")

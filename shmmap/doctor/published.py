@@ -34,7 +34,7 @@ def _counters(patient: Patient) -> Mapping[str, int]:
 
 
 def check_link(patient: Patient) -> Finding:
-    """Does the store answer, and how soon?"""
+    """Check that the store answers, and how soon."""
     name = "link"
     if not _is_published(patient):
         return skip(name, FILES)
@@ -64,7 +64,7 @@ def check_link(patient: Patient) -> Finding:
 
 
 def check_credentials(patient: Patient) -> Finding:
-    """Where do credentials come from, and does the store take them?"""
+    """Check where credentials come from, and that the store takes them."""
     name = "credentials"
     if not _is_published(patient):
         return skip(name, FILES)
@@ -83,7 +83,7 @@ def check_credentials(patient: Patient) -> Finding:
 
 
 def _hidden(patient: Patient) -> str:
-    """What cannot be seen of the daemon's own credentials; empty if nothing."""
+    """Say what cannot be seen of the daemon's own credentials; empty if nothing."""
     if not patient.alive or patient.environment is not None:
         return ""
     account = account_name(patient.runs_as)
@@ -91,7 +91,7 @@ def _hidden(patient: Patient) -> str:
 
 
 def check_clock(patient: Patient) -> Finding:
-    """Does this machine's clock agree with the store's?"""
+    """Check that this machine's clock agrees with the store's."""
     name = "clock"
     if not _is_published(patient):
         return skip(name, FILES)
@@ -110,7 +110,7 @@ def check_clock(patient: Patient) -> Finding:
 
 
 def check_versions(patient: Patient) -> Finding:
-    """Is what is served what is offered, and how old is it?"""
+    """Check that the version offered is the one served, and how old it is."""
     name = "versions"
     if not _is_published(patient):
         return skip(name, FILES)

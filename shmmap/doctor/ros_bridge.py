@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bridges to ROS 2: do they run, and do nodes wait for them that they cannot answer?
+"""Bridges to ROS 2: whether they run, and which nodes wait for them that they cannot answer.
 
 A bridge tells it by a file beside the daemon's socket, ``INSTANCE.ros-bridge-DOMAIN.json``, and holds a lock
 on that file while it runs.
@@ -31,7 +31,7 @@ _LOCKED: Final = 0
 
 
 def check_ros_bridge(patient: Patient) -> Finding:
-    """Can every ROS node that asks a bridge be answered?"""
+    """Check that every ROS node that asks a bridge can be answered."""
     name = "ROS bridge"
     told = [one for path in _files(patient) if (one := _told(patient, path)) is not None]
     if not told:
@@ -65,7 +65,7 @@ def _files(patient: Patient) -> list[str]:
 
 
 def _told(patient: Patient, path: str) -> dict[str, Any] | None:
-    """What a bridge says; None if it does not run, or says what no bridge says."""
+    """Read a bridge's file; None if the bridge does not run, or the file is not a bridge's."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         fd = os.open(patient.machine.path(path), flags)

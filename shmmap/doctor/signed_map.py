@@ -30,7 +30,7 @@ _ADVICE: Final = {
 
 
 def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
-    """What is wrong with the signature of the map that is served, and with the version that is offered.
+    """List what is wrong with the signature of the map that is served, and with the version offered.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
 
 
 def refused_offer(counters: Mapping[str, int]) -> tuple[str, str]:
-    """What is wrong with the version that the map's origin offers, and advice; empty if it is taken."""
+    """Say why the version that the map's origin offers is not taken, and what to do; empty if it is taken."""
     at = counters.get("published_refusal", 0)
     cause = REFUSALS[at] if at < len(REFUSALS) else REFUSALS[-1]
     if not cause:
@@ -63,7 +63,7 @@ def signature_lines(counters: Mapping[str, int], now_s: float) -> list[str]:
 
 
 def check_signature(patient: Patient) -> Finding:
-    """Is the map verified, and in time?"""
+    """Check that the map is verified, and its signature not expired."""
     name = "signature"
     if not patient.alive or patient.seen is None:
         return skip(name, "no daemon runs")
@@ -96,7 +96,7 @@ def _times(counters: Mapping[str, int]) -> tuple[float, float]:
 
 
 def _expiry(counters: Mapping[str, int], now_s: float) -> str:
-    """That the signature has expired; empty if it has not.  The clock may be behind the signing time."""
+    """Say when the signature expired; empty if it has not.  The clock may be behind the signing time."""
     signed_s, until_s = _times(counters)
     if not until_s or until_s > max(now_s, signed_s):
         return ""
