@@ -245,7 +245,7 @@ class NotPermitted(ShmmapError):
 
 
 class LimitReached(ShmmapError):
-    """This process may have no more of something: files, threads, memory; the message names the limit."""
+    """A limit of this process is reached: on files, threads or memory; the message names it."""
 
     code = "limit_reached"
     exit_code = 71  # EX_OSERR of sysexits.h

@@ -145,7 +145,7 @@ def in_chunk(indices: Indices) -> tuple[Indices, Indices]:
 
 
 def voxels_of(key: ChunkKey, places: NDArray[np.integer]) -> Indices:
-    """Indices of voxels, (N, 3), by their places in a chunk: the inverse of `in_chunk`."""
+    """Return the indices of voxels, (N, 3), at places in a chunk: the inverse of `in_chunk`."""
     brick, within = np.divmod(np.asarray(places, dtype=np.int64), BRICK_VOXELS)
     low = np.stack(
         [

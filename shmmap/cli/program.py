@@ -79,6 +79,7 @@ class Parser(argparse.ArgumentParser):
         self.error(f"{message}; did you mean {near[0]}?" if near else message)
 
     def error(self, message: str) -> NoReturn:
+        """Complain about the command line and exit; name a misspelt option first."""
         words, self._words = self._words, []
         options = (word for word in words if word.startswith("--") and len(word) > len("--"))
         unknown = [word for word in options if word.split("=")[0] not in self._option_string_actions]

@@ -107,7 +107,7 @@ class Cell:
         return self.points
 
     def __bool__(self) -> bool:
-        """True: a cell without points is a cell, too."""
+        """Return True: a cell without points is a cell, too."""
         return True
 
     def __repr__(self) -> str:

@@ -65,7 +65,7 @@ def groups_of(uid: int) -> set[int]:
 
 
 def check_group(diagnosis: Diagnosis) -> Finding:
-    """Is this account a member of the group that may connect?"""
+    """Check that this account is a member of the group that may connect."""
     name = "group"
     gid = -1
     if diagnosis.config.group.isdigit():
@@ -106,7 +106,7 @@ def check_group(diagnosis: Diagnosis) -> Finding:
 
 
 def check_socket(diagnosis: Diagnosis) -> Finding:
-    """Does the daemon answer, and which accounts may connect?"""
+    """Check that the daemon answers, and say which accounts may connect."""
     from shmmap.client.discovery import check_socket as connect
 
     name, path = "socket", diagnosis.socket
@@ -153,7 +153,7 @@ def _access(path: str) -> str:
 
 
 def check_map_access(diagnosis: Diagnosis) -> Finding:
-    """Can the daemon read the map, wherever it lies?"""
+    """Check that the daemon can read the map, wherever it lies."""
     name, path = "map", diagnosis.map_path
     if not path and (diagnosis.config.live or (diagnosis.seen is not None and diagnosis.seen.live)):
         return ok(name, "none is served: the daemon keeps live maps alone")
@@ -267,7 +267,7 @@ _LOCKED: Final = 0
 
 
 def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
-    """Do bridges to ROS 2 run, and can every node that asks one be answered?
+    """Check that bridges to ROS 2 run, and that every node that asks one can be answered.
 
     A bridge reports in a file beside the daemon's socket, ``INSTANCE.ros-bridge-DOMAIN.json``, and holds a
     lock on that file while it runs.
@@ -309,7 +309,7 @@ def _files(diagnosis: Diagnosis) -> list[str]:
 
 
 def _read_status(diagnosis: Diagnosis, path: str) -> dict[str, Any] | None:
-    """What a bridge says; None if it does not run, or says what no bridge says."""
+    """Read a bridge's file; None if the bridge does not run, or the file is not a bridge's."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         fd = os.open(diagnosis.machine.path(path), flags)

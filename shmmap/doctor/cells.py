@@ -24,7 +24,7 @@ MAX_MISS_SHARE: Final = 0.02
 
 
 def check_cells(diagnosis: Diagnosis) -> Finding:
-    """Can every cell be loaded that was asked for?"""
+    """Check that every cell that was asked for can be loaded."""
     name = "cells"
     if not diagnosis.alive or diagnosis.seen is None:
         return skip(name, "no daemon runs")
@@ -60,7 +60,7 @@ def check_cells(diagnosis: Diagnosis) -> Finding:
 
 
 def _cause(cell: str, layer: str, message: str) -> str:
-    """A line about one failure; messages begin with the path of the file, which ends as the cell's id."""
+    """Describe a failure in a line; messages begin with the path of the file, which ends as the cell's id."""
     before, found, cause = message.partition(f"{cell}: ")
     return f"{cell} ({layer}): {cause if found and before.startswith('/') else message}"
 

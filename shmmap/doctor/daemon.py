@@ -38,7 +38,7 @@ _CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1
 
 
 def check_daemon(diagnosis: Diagnosis) -> Finding:
-    """Does the daemon run, answer and match the installed version?"""
+    """Check that the daemon runs, answers and matches the installed version."""
     name = "daemon"
     if diagnosis.seen is None:
         return warn(name, diagnosis.unreadable, "join its group, or run it with sudo")
@@ -89,7 +89,7 @@ def check_daemon(diagnosis: Diagnosis) -> Finding:
 
 
 def check_leftovers(diagnosis: Diagnosis) -> Finding:
-    """Is memory held by segments that no daemon looks after?"""
+    """Check for memory in segments that no daemon looks after."""
     name = "leftovers"
     found: dict[str, tuple[int, int]] = {}
     with_chunks: set[str] = set()
@@ -167,7 +167,7 @@ def _logind_setting(machine: Machine, key: str) -> str:
 
 
 def check_logind(diagnosis: Diagnosis) -> Finding:
-    """Will the session manager delete the segments at logout?"""
+    """Check whether the session manager will delete the segments at logout."""
     name, machine, uid = "logout", diagnosis.machine, diagnosis.runs_as
     if uid <= SYSTEM_UIDS:
         return ok(name, "the daemon runs as a system account: logind does not delete its segments")
@@ -186,7 +186,7 @@ def check_logind(diagnosis: Diagnosis) -> Finding:
 
 
 def check_reload(diagnosis: Diagnosis) -> Finding:
-    """Could the map be read the last time?"""
+    """Check that the map could be read the last time."""
     name = "reload"
     if not diagnosis.alive:
         return skip(name, "no daemon runs")
@@ -213,7 +213,7 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
 def check_pins(diagnosis: Diagnosis) -> Finding:
-    """Can the kernel tell which processes map a segment?"""
+    """Check that the kernel reports whether any process maps a segment."""
     name = "leases"
     try:
         directory = ShmDirectory(diagnosis.shm_dir)
@@ -242,7 +242,7 @@ def check_pins(diagnosis: Diagnosis) -> Finding:
 
 
 def check_descriptors(diagnosis: Diagnosis) -> Finding:
-    """How many clients does the limit of open files allow?"""
+    """Check how many clients the limit of open files allows."""
     limits = _LIMIT.search(diagnosis.machine.text(f"/proc/{diagnosis.pid}/limits")) if diagnosis.pid else None
     hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     whose = f"of the daemon (pid {diagnosis.pid})" if limits else "here"

@@ -58,7 +58,7 @@ def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
 
 
 def check_live_maps(diagnosis: Diagnosis) -> Finding:
-    """Can every chunk be loaded and saved, and is none lost?"""
+    """Check that every chunk can be loaded and saved, and none is lost."""
     name, rows = "live maps", _rows(diagnosis)
     if not rows:
         running = "this daemon keeps none" if diagnosis.alive else "no daemon runs"
@@ -93,7 +93,7 @@ def check_live_maps(diagnosis: Diagnosis) -> Finding:
 
 
 def check_live_disk(diagnosis: Diagnosis) -> Finding:
-    """Can the daemon write where live maps are kept, and is there room?"""
+    """Check that the daemon can write where live maps are kept, and that there is room."""
     name = "live disk"
     places = _places(diagnosis)
     if not places:
@@ -145,7 +145,7 @@ def _places(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def _existing(diagnosis: Diagnosis, path: str) -> str:
-    """The path, or the nearest directory above that is there: the daemon makes the rest."""
+    """Return the path, or the nearest directory above that is there: the daemon makes the rest."""
     while path != "/":
         try:
             os.stat(diagnosis.machine.path(path))
@@ -183,7 +183,7 @@ def _is_in(path: str, directory: str) -> bool:
 
 
 def check_live_memory(diagnosis: Diagnosis) -> Finding:
-    """Is the place of chunks in order, and does no reader take much?"""
+    """Check that the place of chunks is in order, and that no reader takes much."""
     name, rows = "live memory", _rows(diagnosis)
     if not rows and not diagnosis.config.live:
         return skip(name, "no live map is set up")
@@ -228,7 +228,7 @@ def _huge_pages(diagnosis: Diagnosis, path: str) -> str:
 
 
 def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:
-    """What is wrong with the directory where mappers put their scans."""
+    """Say what is wrong with the directory where mappers put their scans."""
     marks = f"{path}/shmmap-live.{diagnosis.config.instance}.marks"
     if not _rows(diagnosis):
         return ""

@@ -49,7 +49,7 @@ def mount_of(machine: Machine, path: str) -> _Mount:
 
 
 def check_shared_memory(diagnosis: Diagnosis) -> Finding:
-    """Is the file system large enough for the budget?"""
+    """Check that the file system is large enough for the budget."""
     name, path = "shared memory", diagnosis.shm_dir
     try:
         state = os.statvfs(diagnosis.machine.path(path))
@@ -84,7 +84,7 @@ def _enough(budget: int) -> str:
 
 
 def check_container(diagnosis: Diagnosis) -> Finding:
-    """Does a container see enough shared memory?"""
+    """Check that a container sees enough shared memory."""
     name = "container"
     machine = diagnosis.machine
     marks = ("/.dockerenv", "/run/.containerenv")
@@ -131,7 +131,7 @@ def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
 
 
 def check_memory_limit(diagnosis: Diagnosis) -> Finding:
-    """Would the cgroup's limit kill the daemon before its budget is full?
+    """Check whether the cgroup's limit would kill the daemon before its budget is full.
 
     Segments are charged to the group, as the daemon reckons when it chooses its budget; what its processes
     use beside them is measured while it runs.
@@ -156,7 +156,7 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
 
 
 def check_huge_pages(diagnosis: Diagnosis) -> Finding:
-    """Are segments on huge pages, and does that pay on this kernel?"""
+    """Check whether segments are on huge pages, and whether that pays on this kernel."""
     name, machine = "huge pages", diagnosis.machine
     mount = mount_of(machine, diagnosis.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
@@ -190,7 +190,7 @@ _SERVICE_CACHE: Final = "/var/cache/shmmap"
 
 
 def check_disk_cache(diagnosis: Diagnosis) -> Finding:
-    """Is the cache directory the daemon's, and can more be kept in it?"""
+    """Check that the cache directory is the daemon's, and that there is room in it."""
     name, uid = "disk cache", diagnosis.runs_as
     if not diagnosis.config.cache_bytes:
         return skip(name, "nothing is kept: cache_bytes is 0")

@@ -40,7 +40,7 @@ def _is_published(diagnosis: Diagnosis) -> bool:
 
 
 def check_link(diagnosis: Diagnosis) -> Finding:
-    """Does the store answer, and how soon?"""
+    """Check that the store answers, and how soon."""
     name = "link"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -70,7 +70,7 @@ def check_link(diagnosis: Diagnosis) -> Finding:
 
 
 def check_credentials(diagnosis: Diagnosis) -> Finding:
-    """Where do credentials come from, and does the store take them?"""
+    """Check where credentials come from, and that the store takes them."""
     name = "credentials"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -89,7 +89,7 @@ def check_credentials(diagnosis: Diagnosis) -> Finding:
 
 
 def _hidden(diagnosis: Diagnosis) -> str:
-    """What cannot be seen of the daemon's own credentials; empty if nothing."""
+    """Say what cannot be seen of the daemon's own credentials; empty if nothing."""
     if not diagnosis.alive or diagnosis.environment is not None:
         return ""
     account = account_name(diagnosis.runs_as)
@@ -97,7 +97,7 @@ def _hidden(diagnosis: Diagnosis) -> str:
 
 
 def check_clock(diagnosis: Diagnosis) -> Finding:
-    """Does this machine's clock agree with the store's?"""
+    """Check that this machine's clock agrees with the store's."""
     name = "clock"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -116,7 +116,7 @@ def check_clock(diagnosis: Diagnosis) -> Finding:
 
 
 def check_versions(diagnosis: Diagnosis) -> Finding:
-    """Is what is served what is offered, and how old is it?"""
+    """Check that the version offered is the one served, and how old it is."""
     name = "versions"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -144,7 +144,7 @@ def check_versions(diagnosis: Diagnosis) -> Finding:
 
 
 def check_signature(diagnosis: Diagnosis) -> Finding:
-    """Is the map verified, and in time?"""
+    """Check that the map is verified, and its signature not expired."""
     name = "signature"
     if not diagnosis.alive:
         return skip(name, "no daemon runs")

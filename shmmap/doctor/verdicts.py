@@ -153,7 +153,7 @@ _ADVICE: Final = {
 
 
 def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
-    """What is wrong with the signature of the map that is served, and with the version that is offered.
+    """List what is wrong with the signature of the map that is served, and with the version offered.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
 
 
 def refused_offer(counters: Mapping[str, int]) -> tuple[str, str]:
-    """What is wrong with the version that the map's origin offers, and advice; empty if it is taken."""
+    """Say why the version that the map's origin offers is not taken, and what to do; empty if it is taken."""
     at = counters.get("published_refusal", 0)
     cause = REFUSALS[at] if at < len(REFUSALS) else REFUSALS[-1]
     if not cause:
@@ -193,7 +193,7 @@ def signature_times(counters: Mapping[str, int]) -> tuple[float, float]:
 
 
 def signature_expiry(counters: Mapping[str, int], now_s: float) -> str:
-    """That the signature has expired; empty if it has not.  The clock may be behind the signing time."""
+    """Say when the signature expired; empty if it has not.  The clock may be behind the signing time."""
     signed_s, until_s = signature_times(counters)
     if not until_s or until_s > max(now_s, signed_s):
         return ""
@@ -201,4 +201,5 @@ def signature_expiry(counters: Mapping[str, int], now_s: float) -> str:
 
 
 def valid_until(until_s: float) -> str:
+    """Say until when a verified signature is valid."""
     return f"verified, valid until {format_utc(until_s)}"

@@ -27,7 +27,7 @@ _HINTS: Final = {
 
 @contextlib.contextmanager
 def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[IO[bytes]]:
-    """A file that has its name only once it is complete and on the disk.
+    """Open a file that gets its name only once it is complete and on the disk.
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ class FileReader:
         self.close()
 
     def fileno(self) -> int:
-        """The open file's descriptor."""
+        """Return the open file's descriptor."""
         return self._fd
 
     def close(self) -> None:

@@ -173,7 +173,7 @@ class TextReader(FileReader):
             )
 
     def _line_at(self, offset: int) -> int:
-        """Number of the line that begins at a byte of the file, counted from 1."""
+        """Return the number, counted from 1, of the line that begins at a byte of the file."""
         line, at = 1, 0
         newline = b"\r" if self._bare_cr else b"\n"
         while part := os.pread(self._fd, min(_HEAD_BYTES, offset - at), at):

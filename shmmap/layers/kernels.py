@@ -98,7 +98,7 @@ def count_points(
 
 @compiled(types.int64(int32[::1], int32, int32[::1], int32[::1]))
 def number_voxels(table: Any, least: Any, counts: Any, places: Any) -> Any:
-    """Number the voxels that have at least ``least`` points, in the order of the table.
+    """Assign rows to the voxels that have at least ``least`` points, in the order of the table.
 
     ``table`` holds counts on entry, row numbers or -1 afterwards; ``counts`` and ``places`` (at least
     as long as there are occupied voxels) receive each row's count and position.  Returns the rows.

@@ -172,7 +172,7 @@ class _Words:
         return self._tokens[self._at]
 
     def take(self, kind: str, value: str | None = None) -> str | None:
-        """The next token if it is this one, else None."""
+        """Take the next token if it is this one, else return None."""
         found, text = self._tokens[self._at]
         if found != kind or (value is not None and text != value):
             return None

@@ -184,7 +184,7 @@ def shortened(text: str) -> str:
 
 
 def list_some(names: list[str]) -> str:
-    """The first few of ``names``, and how many there are when that is not all."""
+    """List the first few of ``names``, and say how many there are when that is not all."""
     some = ", ".join(names[:_NAMED_IN_PROBLEMS])
     return some if len(names) <= _NAMED_IN_PROBLEMS else f"{some}, ... ({len(names)} in all)"
 

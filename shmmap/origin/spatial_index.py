@@ -114,6 +114,7 @@ class Grid:
 
     @property
     def nbytes(self) -> int:
+        """Memory of the arrays."""
         return int(self.keys.nbytes + self.cells.nbytes)
 
     def runs(self, bounds: Bounds, slack: float, circle: Circle | None = None) -> tuple[Indices, Indices]:

@@ -25,7 +25,7 @@ class PrepareProgress(Protocol):
     """How far a run is."""
 
     def stage(self, name: str, total: int) -> None:
-        """A stage of ``total`` cells begins."""
+        """Begin a stage of ``total`` cells."""
 
     def advance(self, cells: int) -> None:
         """More cells are done."""

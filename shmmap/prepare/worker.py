@@ -79,7 +79,7 @@ class CellPoints:
         )
 
     def points(self, spec: LayerSpec) -> CellSource:
-        """The columns that one layer takes: exactly those, whatever the others need."""
+        """Return the columns that one layer takes: exactly those, whatever the others need."""
         if self._read is None:
             self._read = self._reader.read(self._source, self._box, self._needs)
         names = spec.source_columns

@@ -93,7 +93,7 @@ class PackedArray:
 
 
 def _head(count: int) -> bytes:
-    """The head of an array of ``count`` elements."""
+    """Encode the head of an array of ``count`` elements."""
     if count < 16:
         return bytes((0x90 | count,))
     if count < 1 << 16:

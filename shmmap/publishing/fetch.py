@@ -217,7 +217,7 @@ def _cells_of(shard: Shard) -> Iterator[_Cell]:
 
 
 def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
-    """The size that all cells have along an axis, such that a corner and it give the box again."""
+    """Find the size that all cells have along an axis, such that a corner and it give the box again."""
     sizes = high - low
     for size in (round(float(sizes[0]), 9), float(sizes[0])):
         if (low + size == high).all():

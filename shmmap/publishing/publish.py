@@ -255,7 +255,7 @@ class _Run:
         return wanted or f"/{last}/"
 
     def _known_layers(self) -> Iterator[LayerObjects]:
-        """The objects of the version before, by shard and layer; none where all is sent again."""
+        """Yield the objects of the version before, by shard and layer; none where all is sent again."""
         root = self._before
         if root is None or self._resend:
             return

@@ -403,7 +403,7 @@ class _Slice:
                 yield task
 
     def _around(self, number: int, shard: Shard) -> list[Shard]:
-        """A shard and those with cells that its own may look into."""
+        """Return a shard and those with cells that its own may look into."""
         if not self._halo_m:
             return [shard]
         low, high = shard.boxes[:, :2].min(axis=0), shard.boxes[:, 2:].max(axis=0)
@@ -453,7 +453,7 @@ class _Slice:
                 self._rows[number] = self._send_shard(making)
 
     def _number_of(self, task: CellTask) -> int:
-        """Number of the shard that a task's cell is in."""
+        """Return the number of the shard that a task's cell is in."""
         return int(np.searchsorted(self._first, task.number, side="right")) - 1
 
     def _send_shard(self, making: _Making) -> _ShardRow:

@@ -158,7 +158,7 @@ def no_threads_left(what: str = "") -> LimitReached:
 
 
 def _group_limit() -> str | None:
-    """What the control group of this process allows, or the strictest of those above it."""
+    """Return what the control group of this process allows, or the strictest of those above it."""
     limits = []
     try:
         with open("/proc/self/cgroup", encoding="utf-8") as file:

@@ -131,7 +131,7 @@ class Snapshot:
 
 
 def _in_use(kind: type[_Row], data: bytes, step: int) -> list[_Row]:
-    """The rows of a table that are in use, but for those that were being changed."""
+    """Read the rows of a table that are in use, but for those that were being changed."""
     from shmmap.statistics.rows import unpack_row
 
     found = []

@@ -308,7 +308,7 @@ class DaemonProcess:
         return sorted(pid for pid in processes_marked(self.instance, _MARK) if pid != own)
 
     def segments(self) -> list[str]:
-        """Published and retired segments, sorted; statistics and lock are not among them."""
+        """List published and retired segments, sorted; statistics and lock are not among them."""
         own = re.compile(rf"shmmap\.{self.instance}\.[0-9a-f]{{16}}(\.zombie)?")
         return sorted(name for name in os.listdir(self.shm_dir) if own.fullmatch(name))
 

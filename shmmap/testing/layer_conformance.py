@@ -145,7 +145,7 @@ def _check_columns(spec: LayerSpec, table: LayerTable, source: Mapping[str, NDAr
 
 
 def _check_segment(spec: LayerSpec, table: LayerTable) -> None:
-    """The table fits a segment, and comes back out of it."""
+    """Check that the table fits a segment, and comes back out of it."""
     origin = SegmentOrigin("/cell.pcd", _BOX, "map", NO_SOURCE, bytes(16), 0, 0)
     fd = os.memfd_create("layer")
     try:

@@ -101,7 +101,7 @@ def _check_shape(text: str, name: str) -> None:
 
 
 def _parameters(root: yaml.Node, name: str) -> yaml.Node:
-    """What holds the parameters: the whole file, or what a node's ``ros__parameters`` is."""
+    """Find the mapping of parameters: the whole file, or the ``ros__parameters`` of a node."""
     if not isinstance(root, yaml.MappingNode):
         raise ConfigError(f"{name}: no parameters: need lines such as m_resolution: 0.05", origin=name)
     nodes: dict[str, yaml.Node] = {
@@ -141,7 +141,7 @@ def _named(node: yaml.Node, name: str, prefix: str) -> Iterator[tuple[str, yaml.
 
 
 def _value(node: yaml.Node) -> tuple[Value, str]:
-    """A value as ROS 2 understands it, which takes 1e-1 for a number; PyYAML does not."""
+    """Read a value as ROS 2 does, which takes 1e-1 for a number; PyYAML does not."""
     if not isinstance(node, yaml.ScalarNode):
         return None, ""
     text = str(node.value)

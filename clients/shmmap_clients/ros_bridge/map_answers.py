@@ -343,7 +343,7 @@ class MapAnswers:
         return [one for one, take in zip(self._catalogue.cells, inside, strict=True) if take]
 
     def _known(self, ids: Sequence[str]) -> Sequence[str]:
-        """These ids, of very many those that the map has: the others are left out of answers anyway."""
+        """Return the ids; of very many only those of the map: answers leave out the others anyway."""
         if _is_one_slice(ids):
             return ids
         self._catalogue.refresh(self._client)

@@ -225,7 +225,7 @@ class MapMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudM
 @dataclass
 @sample
 class GetPartialRequest(IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Request_"):
-    """Which cells touch an area?"""
+    """A request for the cells that touch an area."""
 
     client: uint64
     number: int64
@@ -250,7 +250,7 @@ class GetPartialResponse(
 class GetDifferentialRequest(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Request_"
 ):
-    """Which cells touch an area, beside those that the client has?"""
+    """A request for the cells that touch an area, without those that the client has."""
 
     client: uint64
     number: int64
@@ -277,7 +277,7 @@ class GetDifferentialResponse(
 class GetSelectedRequest(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Request_"
 ):
-    """Which cells have these ids?"""
+    """A request for the cells with these ids."""
 
     client: uint64
     number: int64

@@ -126,7 +126,7 @@ STATE_STYLES: Final = {
 
 
 def live_problems(row: LiveMapRow) -> list[str]:
-    """What is wrong with a live map, a line each."""
+    """List what is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
     if row.damaged_count:
         found.append(f"damaged files, missing chunks: {row.damaged_count:,}; `shmmap live ls` names them")

@@ -314,7 +314,7 @@ class MapWindow:
         return dict(self._follower.state.versions)
 
     def points_around(self, x: float, y: float, radius: float, *, layer: str | None = None) -> PointsAround:
-        """Views of the window's cells that touch a circle; nothing is copied.
+        """Return views of the window's cells that touch a circle; nothing is copied.
 
         `PointsAround.covered` says whether they are all that the map has there: a pose that has jumped, or
         outrun a daemon that died, is not to be mistaken for an empty place.

@@ -90,7 +90,7 @@ class _Sorted:
             del self._blocks[at], self._lasts[at]
 
     def greatest(self, count: int) -> list[_Entry]:
-        """The greatest entries, greatest first."""
+        """Return the greatest entries, greatest first."""
         found: list[_Entry] = []
         for block in reversed(self._blocks):
             found += block[: -1 - (count - len(found)) : -1]

@@ -80,7 +80,7 @@ class EventLog:
         self._subscribers.clear()
 
     def publish(self, kind: Callable[..., events.Event], *fields: object) -> None:
-        """Number, remember and send an event made of ``kind`` and its own fields."""
+        """Send an event made of ``kind`` and its own fields, numbered, and remember it."""
         self.last += 1
         now_ns = self._clock_ns()
         data = encode_event(kind(self.last, self.epoch, now_ns, *fields))

@@ -175,7 +175,7 @@ class Prefetcher:
         return swapped
 
     def _wished(self, key: Key, index: int, nbytes: int) -> Resident:
-        """What a wish would be in memory, to compare it with what is there."""
+        """Return a wish as it would be in memory, to compare it with what is there."""
         box = self._cache.catalogue.box(index)
         return Resident("", key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=self._now_s)
 

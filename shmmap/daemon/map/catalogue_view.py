@@ -73,7 +73,7 @@ class Pages(Protocol):
         """Return the page of a cell."""
 
     def cells(self, page: int) -> range:
-        """Indices of a page's cells, here or not."""
+        """Return the indices of a page's cells, here or not."""
 
     def cells_surely_in(self, area: Area) -> int:
         """How many cells the pages have that lie wholly in an area: it has as many at least."""
@@ -201,7 +201,7 @@ class CatalogueView(Protocol):
         """Size of a cell's source as last known."""
 
     def ready(self, index: int, layer: str) -> Ready | None:
-        """What is known of a layer that the origin has ready made; None: it is computed here.
+        """Return what is known of a layer that the origin has ready made; None: it is computed here.
 
         Of ``points`` it may be None, too: where their size is only guessed, and their version is `version`.
         """

@@ -189,7 +189,7 @@ class PublishedView:
         return int(page.shard.layers[POINTS].raws[row])
 
     def ready(self, index: int, layer: str) -> Ready | None:
-        """What is known of a layer that is published; None: it is computed here."""
+        """Return what is known of a layer that is published; None: it is computed here."""
         builder_version = self._ready.get(layer)
         if builder_version is None:
             return None

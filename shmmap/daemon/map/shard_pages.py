@@ -87,7 +87,7 @@ class _News:
 
 
 def _shared_out(page: Page) -> list[dict[bytes, int]]:
-    """Indices of a page's cells by name, for each table of names."""
+    """Map names to indices of a page's cells, for each table of names."""
     tables: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
     for index, name in enumerate(page.shard.names, page.first):
         tables[hash(name) % NAME_TABLES][name] = index
@@ -244,7 +244,7 @@ class ShardPages:
         return bisect.bisect_right(self._first, index) - 1
 
     def cells(self, page: int) -> range:
-        """Indices of a page's cells."""
+        """Return the indices of a page's cells."""
         return range(self._first[page], self._first[page + 1])
 
     def cells_surely_in(self, area: Area) -> int:

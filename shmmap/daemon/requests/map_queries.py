@@ -166,7 +166,7 @@ class MapQueries:
             connection.reply(encode(page or self.page(one.message, empty=True)))
 
     def page(self, message: messages.Metadata, *, empty: bool = False) -> messages.MetadataPage | None:
-        """A page of the list; if a page of the map has to come first None, or one without rows if ``empty``.
+        """List a page; if a page of the map has to come first, return None, or one without rows if ``empty``.
 
         Raises
         ------
@@ -275,7 +275,7 @@ class MapQueries:
         return indices.tolist(), listed[at + 1] << ROW_BITS if at + 1 < len(listed) else None
 
     def _changes_since(self, map_version: int) -> _Changes | None:
-        """What changed, remembered for the pages that follow; None where that is not known."""
+        """Find what changed, and remember it for the pages that follow; None where that is not known."""
         between = map_version, self._catalogue.map_version
         if self._changes is None or self._changes.between != between:
             change = self.map_switch.changes_since(map_version)

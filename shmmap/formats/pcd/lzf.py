@@ -55,7 +55,7 @@ def reachable(input_bytes: int, output_bytes: int) -> bool:
 
 @lru_cache(maxsize=1)
 def _native() -> Callable[[_Bytes, _Bytes], bool] | None:
-    """liblzf's own function, which the extension module carries; None where it does not show it.
+    """Find liblzf's own function in the extension module; None where the module does not export it.
 
     The module's function allocates its result twice, which costs as much as half the decompression
     in page faults; the C function writes to the buffer that it is given.

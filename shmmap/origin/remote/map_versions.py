@@ -181,7 +181,7 @@ def list_entries(store: Store) -> list[int]:
 
 
 def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
-    """The entries of what is and was current, the latest first; ends where the one before has no entry."""
+    """Yield the entries of what is and was current, latest first, until one's predecessor has no entry."""
     version = current.version
     for _ in range(_MAX_VERSIONS):
         try:

@@ -84,7 +84,7 @@ def _run_ls(args: argparse.Namespace) -> int:
 
 
 def _problems_of(row: LiveMapRow) -> list[str]:
-    """What is wrong with a live map, a line each."""
+    """List what is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
     return [*found, *row.damaged]
 

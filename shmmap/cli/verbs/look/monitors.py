@@ -76,7 +76,7 @@ def run_health(args: argparse.Namespace) -> int:
 
 
 def _troubles(found: Snapshot) -> list[str]:
-    """What clients lack although the daemon answers."""
+    """List what clients lack although the daemon answers."""
     counts = found.counters
     counted_troubles = (
         (counts.get("refused_over_budget_1min", 0), "cells refused for lack of memory in the last minute"),
