@@ -60,7 +60,7 @@ def test_no_pytest_is_needed() -> None:
 
 
 def test_a_daemon_without_a_framework(divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SHMMAP_INSTANCE", "somebody-else")
+    monkeypatch.setenv("SHMMAP_INSTANCE", "another-user")
     with DaemonProcess(divided_map.root) as daemon:
         with shmmap.connect(daemon.endpoint) as client:
             assert len(client.around(0.0, 0.0, 100.0)) == len(divided_map.corners)
@@ -107,7 +107,7 @@ def test_a_stopped_daemon_is_not_ready(divided_map: DividedMap) -> None:
         assert daemon.wait_ready()
 
 
-def test_directories_go_with_an_object_that_nobody_disposes_of(divided_map: DividedMap) -> None:
+def test_directories_go_with_an_object_that_is_never_disposed_of(divided_map: DividedMap) -> None:
     daemon = DaemonProcess(divided_map.root)
     directories = (daemon.runtime_dir, daemon.shm_dir, daemon.scratch_dir)
     assert all(os.path.isdir(path) for path in directories)
