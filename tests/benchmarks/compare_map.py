@@ -67,15 +67,15 @@ def town_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
 
 def street_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
     """Divide the street's map; return it and the drive's scans."""
-    way = street()
-    cloud = shmmap.read_cloud(way.map_file).xyz
+    drive = street()
+    cloud = shmmap.read_cloud(drive.map_file).xyz
     with MapWriter(directory / "map", durable=False) as writer:
         writer.add({"xyz": cloud})
         writer.finish()
-    trajectory = read_trajectory(way.scan_poses_file)
+    trajectory = read_trajectory(drive.scan_poses_file)
 
     def scans() -> Iterator[Scene]:
-        for n, scan in enumerate(ScanSequence(way.scan_folder, trajectory)):
+        for n, scan in enumerate(ScanSequence(drive.scan_folder, trajectory)):
             if n < updates and scan.T_map_sensor is not None:
                 yield scan.xyz, scan.T_map_sensor, None
 

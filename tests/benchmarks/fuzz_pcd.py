@@ -75,7 +75,7 @@ def seeds() -> list[bytes]:
 
 
 def mutate(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
-    """Change a file in one to a few ways."""
+    """Make one to a few changes in a file."""
     out = bytearray(data)
     end = out.find(b"DATA ") + 24
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):

@@ -240,7 +240,7 @@ class Measuring:
 
 def cpu_us(checkout: Path, *arguments: str) -> float:
     """CPU time of a Python program of a checkout, microseconds."""
-    # numpy's threads, just started, spin as long as the process lives
+    # numpy's threads, just started, spin as long as the process runs
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     pid = os.posix_spawn(
         python(checkout),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The client in C++ beside the one in Python: the same bytes, whatever is damaged, and no byte beyond them.
 
-What both clients do in the same way is tested with both in ``tests/process``.
+What both clients do alike is tested with both in ``tests/process``.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def test_real_maps_too(daemon: DaemonFactory, cpp_program: Path, data_dir: Path)
     assert equal_bytes(cpp_program, one.endpoint, layers) > 1e6
 
 
-def test_what_it_lets_go_can_be_freed(
+def test_what_it_releases_can_be_freed(
     daemon: DaemonFactory, cpp_program: Path, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)

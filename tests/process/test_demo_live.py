@@ -60,7 +60,7 @@ def test_nothing_is_lost(tmp_path: Path) -> None:
     assert report["daemon_killed_at"] == 40
     assert report["daemon_chunks"] > 0, "those that were in memory"
     assert report["mapper_killed_at"] == 20
-    assert report["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been on their way"
+    assert report["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been in flight"
     picture = ElementTree.parse(report["svg"]).getroot()
     text = " ".join(element.text or "" for element in picture.iter(f"{SVG}text"))
     for word in ("61 scans", "height", "on disk only", "sensor's path", "active cells"):

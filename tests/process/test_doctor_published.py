@@ -19,7 +19,7 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.accounts import STRANGER
+from tests.support.accounts import OTHER_USER
 from tests.support.command_line import doctor, publish
 from tests.support.compiled_programs import built_preload
 from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
@@ -224,7 +224,7 @@ def test_no_other_address_is_asked(
 
 
 @pytest.mark.root
-def test_another_account_is_told_what_it_cannot_see(
+def test_another_account_learns_what_it_cannot_see(
     bucket: DaemonProcess, web: FaultyWeb, tmp_path: Path
 ) -> None:
     until_row(bucket, "versions", "is served")
@@ -238,7 +238,7 @@ def test_another_account_is_told_what_it_cannot_see(
         "import shmmap.cli.verbs.look.doctor, shmmap.doctor.checks, shmmap.client.client\n"
         "import shmmap.client.discovery\n"
         "import shmmap.client.event_stream, shmmap.daemon.config, msgspec, shmmap.service.program\n"
-        f"os.setgroups([]); os.setgid({STRANGER}); os.setuid({STRANGER})\n"
+        f"os.setgroups([]); os.setgid({OTHER_USER}); os.setuid({OTHER_USER})\n"
         "sys.exit(main(sys.argv[1:]))"
     )
     words = ["--instance", bucket.instance, "--runtime-dir", bucket.runtime_dir, "--shm-dir", bucket.shm_dir]

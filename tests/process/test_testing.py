@@ -109,7 +109,7 @@ def test_a_stopped_daemon_is_not_ready(divided_map: DividedMap) -> None:
         assert daemon.wait_ready()
 
 
-def test_directories_go_with_an_object_that_nobody_disposes_of(divided_map: DividedMap) -> None:
+def test_directories_go_with_an_object_that_is_never_disposed_of(divided_map: DividedMap) -> None:
     daemon = DaemonProcess(divided_map.root)
     directories = (daemon.runtime_dir, daemon.shm_dir, daemon.scratch_dir)
     assert all(os.path.isdir(path) for path in directories)

@@ -181,7 +181,7 @@ void print(const shmmap::Happening& happening) {
   std::cout << "\n";
 }
 
-/// Mutate a message again and again; whatever comes of it is an answer or an error.
+/// Mutate a message many times; each must give an answer or an error.
 void fuzz(unsigned seed, int count, const std::string& hex) {
   std::string message;
   for (std::size_t at = 0; at + 1 < hex.size(); at += 2)

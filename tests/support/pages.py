@@ -179,7 +179,7 @@ class Terminal:
 
 
 class Reader:
-    """A reader to whom nothing is configured.
+    """A reader with nothing configured.
 
     Parameters
     ----------

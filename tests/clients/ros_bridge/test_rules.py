@@ -83,9 +83,9 @@ def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
 # --- turns --------------------------------------------------------------------------------------------
 
 
-def request(who: str, number: int = 0) -> Request:
+def request(client: str, number: int = 0) -> Request:
     server: Any = None
-    return Request(server, number, Requester(who, incompatible=False, vendor=""), 0)
+    return Request(server, number, Requester(client, incompatible=False, vendor=""), 0)
 
 
 def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:

@@ -50,7 +50,7 @@ def bridge(socket: str, domain: int, status: object) -> subprocess.Popen[str]:
     return made
 
 
-def test_doctor_names_strangers_of_bridges_that_run(socket: str, tmp_path: Path) -> None:
+def test_doctor_names_incompatible_peers_of_running_bridges(socket: str, tmp_path: Path) -> None:
     assert finding(socket, tmp_path).skipped
     fast = {"service": "/map/get_partial_pointcloud_map", "vendor": "Fast DDS"}
     status = {"domain": 3, "clients": 5, "strangers": [fast, fast, {"service": "/x", "vendor": ""}]}

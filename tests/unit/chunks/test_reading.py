@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies of a chunk that somebody writes are whole, and voxels are found where they are."""
+"""Copies of a chunk that is being written are whole, and voxels are found where they are."""
 
 from __future__ import annotations
 

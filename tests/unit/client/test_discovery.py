@@ -247,7 +247,7 @@ def test_a_daemon_that_ends_while_one_connects(place: Path) -> None:
         thread.join()
 
 
-def test_all_places_are_told_about(place: Path) -> None:
+def test_all_places_are_named(place: Path) -> None:
     with listening(place / "stale.sock"):
         pass
     with pytest.raises(StaleSocket) as caught:

@@ -46,7 +46,7 @@ from tests.support import connections
 from tests.support.daemon_process import stop
 
 EPOCH = 77
-PATIENCE_S = 240.0
+TIMEOUT_S = 240.0
 EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 
 
@@ -171,7 +171,7 @@ class InnerDaemon:
         self.stopped_at_s = time.monotonic()
 
     def session(self, name: str = "") -> Session:
-        """Open a session of a process that nobody watches."""
+        """Open a session of a process that is not watched."""
         connection = connections.of(reply=lambda data: self.replies.append((session, decode_reply(data))))
         session = self.sessions.open(connection, name, self.now_s())
         return session
@@ -201,7 +201,7 @@ class InnerDaemon:
 
     def run_until(self, done: Callable[[], object]) -> None:
         """Turn until ``done()``."""
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + TIMEOUT_S
         while not done():
             self.turn()
             assert time.monotonic() < end_s, "the daemon never came to it"
@@ -234,7 +234,7 @@ class InnerDaemon:
 
     @contextlib.contextmanager
     def loaders_standing_still(self) -> Iterator[list[int]]:
-        """Stop the loaders (one is started if there is none); on the way out they go on."""
+        """Stop the loaders (one is started if there is none); when the block ends they go on."""
         if not len(self.pool):
             self.pool.start_one()
         self.run_until(lambda: all(worker.ready for worker in self.pool))

@@ -75,7 +75,7 @@ def test_an_old_version_stays_until_the_new_one_can_be_reached(
     reply = one.cells_of(2)
     assert (reply.cells, reply.removed, reply.removed_packed) == ((), (), b"")
     assert [failed.code for failed in reply.failed] == ["offline"]
-    fresh = one.everything(3)  # who has none of it gets the old one, marked
+    fresh = one.everything(3)  # a client without it gets the old one, marked
     assert [Path(cell.id).name for cell in fresh.cells if cell.stale] == [CELL]
 
 
@@ -107,7 +107,7 @@ def test_a_window_asks_until_it_comes(
         assert (len(window.cells), window.complete) == (16, True)
 
 
-def test_who_gives_up_ends_as_with_a_busy_daemon(
+def test_a_client_that_gives_up_ends_as_with_a_busy_daemon(
     whole: Callable[..., WholeDaemon], small_map: DividedMap, out_of_reach: Path
 ) -> None:
     assert out_of_reach.exists()

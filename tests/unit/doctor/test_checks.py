@@ -726,3 +726,46 @@ def test_what_has_expired_and_is_refused_is_both_said() -> None:
     # a clock that is behind changes nothing about that
     behind = {**counters, SIGNED: seconds(30)}
     assert len(verdicts.trust_problems(behind, time.time() - 86400)) == 2
+
+
+# --- whether the cache is too small: the same verdict for every verb that prints it -----------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({}, "large enough: nothing evicted for room, nothing refused"),
+        (
+            {"evictions": 29},
+            (
+                "large enough: nothing evicted for room or refused in the last 10 min"
+                " (29 evicted for room since the start)"
+            ),
+        ),
+        (
+            {"evictions": 29, "refused_over_budget": 4},
+            (
+                "large enough: nothing evicted for room or refused in the last 10 min"
+                " (29 evicted for room and 4 refused since the start)"
+            ),
+        ),
+        ({"refused_quota": 9}, "large enough: nothing evicted for room, nothing refused"),
+        (
+            {"evictions_10min": 50, "misses_10min": 500, "loads_after_eviction_10min": 5, "evictions": 50},
+            "large enough: 50 evicted for room in the last 10 min, hardly any asked for again",
+        ),
+        (
+            {"evictions_10min": 50, "misses_10min": 50, "loads_after_eviction_10min": 30},
+            "TOO SMALL: 30 loads in the last 10 min (60 % of all) were of cells evicted before",
+        ),
+        (
+            {"refused_over_budget_10min": 2, "bytes_pinned": 1 << 20, "budget_bytes": 1 << 20},
+            "TOO SMALL: 2 cells refused in the last 10 min; clients use 1.0 MiB of 1.0 MiB",
+        ),
+    ],
+)
+def test_the_verdict_on_the_cache(values: dict[str, int], text: str) -> None:
+    assert set(values) <= set(COUNTER_NAMES)
+    verdict = cache_verdict(values)
+    assert verdict.text == text
+    assert ("--budget" in verdict.hint) == verdict.too_small == text.startswith("TOO SMALL")

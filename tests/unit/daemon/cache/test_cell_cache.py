@@ -30,7 +30,7 @@ from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon
 
 
 def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: DividedMap) -> None:
-    """After 1, 2, 4, ... and at most 30 seconds, however often somebody asks; at once when it changed."""
+    """After 1, 2, 4, ... and at most 30 seconds, however often a client asks; at once when it changed."""
     path = small_map.pcd_dir / "0_0.pcd"
     whole = path.read_bytes()
     path.write_bytes(whole[:-3])
@@ -61,7 +61,7 @@ def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: Divi
 def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each try costs a loader: that somebody asks again is no reason for another one."""
+    """Each try costs a loader: another request is no reason for another try."""
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "crash:0_0.pcd")
     one = inner(small_map.root)
     session = one.session()
@@ -116,7 +116,7 @@ class Puppet:
         self.one.run_until(lambda: len(self.worker.queue) == count)
         return [job for job in self.worker.queue.values() if isinstance(job, worker_messages.Job)]
 
-    def told(self) -> object:
+    def received(self) -> object:
         """The next message but those that name the directory that the map is read through."""
         while True:
             message = worker_messages.decode_to_worker(self.channel.recv(65536))
@@ -127,7 +127,7 @@ class Puppet:
         self.channel.send(worker_messages.encode(message))
 
     def done(self, job: worker_messages.Job) -> worker_messages.Done:
-        """What to say of a job, whose file is filled."""
+        """Return the loader's reply to a job, whose file is filled."""
         if job.number in self.worker.segments:
             os.posix_fallocate(self.worker.segments[job.number], 0, 4096)
         state = SourceStamp.of(os.stat(job.source.name))
@@ -152,7 +152,7 @@ def ask(one: InnerDaemon, request: int) -> None:
     "nonsense", [b"\xc1", b"\x91\xa4what", b"\x90", b"\xff" * 1000, b"\x92\xa4done\xc0", b"\x91\xc4\x01x"]
 )
 def test_a_loader_that_sends_nonsense_is_ended(puppet: Puppet, nonsense: bytes) -> None:
-    """A file may have had its way with the loader's memory: it costs the cell it was at."""
+    """A file may have corrupted the loader's memory: it costs the cell it was at."""
     one = puppet.one
     ask(one, 1)
     first = puppet.queue(4)[0]
@@ -304,8 +304,8 @@ def test_a_loader_that_is_killed(puppet: Puppet, monkeypatch: pytest.MonkeyPatch
     (failed,) = one.cells_of(1).failed
     assert failed.code == "load_failed"
     allowed = "out of memory: the kernel killed the loader (the control group allows 300 MiB)"
-    told = allowed if kills else "the loader was killed (signal SIGKILL): by a person or a program"
-    assert failed.message == f"{job.source.name}: {told}"
+    said = allowed if kills else "the loader was killed (signal SIGKILL): by a person or a program"
+    assert failed.message == f"{job.source.name}: {said}"
     (failure,) = one.scheduler.loads.failures.values()
     assert (failure.stamp is None) is bool(kills)
     puppet.channel.close()
@@ -324,7 +324,7 @@ def test_done_without_a_segment(puppet: Puppet) -> None:
     puppet.channel.close()
 
 
-def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
+def test_answers_that_no_question_asked_for(puppet: Puppet) -> None:
     """Numbers that were never given, needs of nothing: no harm."""
     one = puppet.one
     ask(one, 1)
@@ -335,9 +335,9 @@ def test_answers_to_nobody_s_question(puppet: Puppet) -> None:
     for job in queue:
         puppet.say(puppet.done(job))
     assert len(one.cells_of(1).cells) == 4
-    *jobs, decision = (puppet.told() for _ in range(5))
+    *jobs, decision = (puppet.received() for _ in range(5))
     assert jobs == queue
-    assert decision == worker_messages.Decision(True), "and none of a job that nobody has"
+    assert decision == worker_messages.Decision(True), "and none of a job that does not exist"
     assert not wait_readable([puppet.channel.fileno()], 0.0)
     assert (one.ledger.reserved_bytes, one.scheduler.room.awaiting_grant) == (0, {})
     puppet.channel.close()
@@ -347,10 +347,10 @@ def test_more_needed_than_there_will_ever_be(puppet: Puppet) -> None:
     one = puppet.one
     one.ask(one.session(), Selected(1, ("0_0.pcd",), wait=30.0))
     (job,) = puppet.queue(1)
-    assert puppet.told() == job
+    assert puppet.received() == job
     puppet.say(worker_messages.Need(job.number, one.ledger.budget_bytes))
     one.run_until(lambda: wait_readable([puppet.channel.fileno()], 0.0))
-    assert puppet.told() == worker_messages.Decision(False)
+    assert puppet.received() == worker_messages.Decision(False)
     puppet.say(worker_messages.Failed(job.number, "over_budget", "it does not fit"))
     assert [failure.code for failure in one.cells_of(1).failed] == ["over_budget"]
     puppet.channel.close()

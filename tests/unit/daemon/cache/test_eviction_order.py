@@ -199,7 +199,7 @@ def test_the_work_for_a_victim_does_not_depend_on_how_many_there_are(count: int)
 
 
 def test_few_come_back_at_a_time() -> None:
-    """Of those whose time has come, and of all that are reconsidered."""
+    """Of those that are due, and of all that are reconsidered."""
     worth = Worth()
     order, some = settled(4 * BATCH, worth)
     for one in some:

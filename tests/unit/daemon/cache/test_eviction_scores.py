@@ -115,8 +115,8 @@ def test_behind_goes_before_ahead() -> None:
 
 
 def test_a_route_counts() -> None:
-    """What the client comes to after a turn stays; what is nearer, but not on its way, goes."""
+    """What the client comes to after a turn stays; what is nearer, but not on its path, goes."""
     driver = client(0.0, 0.0, 10.0, 0.0, (0.0, 0.0), (400.0, 0.0), (400.0, 800.0))
-    on_the_way, nearer = made("on the way", 390, 780), made("nearer", -200, 0)
-    assert ordered([on_the_way, nearer], driver) == [nearer, on_the_way]
-    assert ordered([on_the_way, nearer], client(0.0, 0.0, 10.0, 0.0)) == [on_the_way, nearer]
+    on_route, nearer = made("on the route", 390, 780), made("nearer", -200, 0)
+    assert ordered([on_route, nearer], driver) == [nearer, on_route]
+    assert ordered([on_route, nearer], client(0.0, 0.0, 10.0, 0.0)) == [on_route, nearer]

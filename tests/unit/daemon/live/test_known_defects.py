@@ -40,7 +40,7 @@ Position = tuple[float, float, float]
 
 
 def crossing() -> list[tuple[Marks, Position]]:
-    """Scans on a way over borders and corners of chunks, to negative ones and back, with their places."""
+    """Scans on a path over borders and corners of chunks, to negative ones and back, with their places."""
     marker, rng = Marker(RESOLUTION, FILTER), np.random.default_rng(13)
     found = []
     for x, y in ((6.0, 6.0), (11.0, 9.0), (14.0, 14.0), (6.0, 6.0), (-2.0, 6.0), (-14.0, -1.0), (6.0, 6.0)):
@@ -214,7 +214,7 @@ class _KeepsAll(PagedMap):
 
 
 def growth(shm: Path, kind: type[PagedMap], scans: int) -> int:
-    """Bytes that a map takes more after so many scans, marked and saved, of a place that it knows."""
+    """Bytes by which a map grows in ``scans`` scans, marked and saved, of a place that it knows."""
     points = np.random.default_rng(3).normal(0.0, 3.0, (300, 3))
     marker, pose = Marker(RESOLUTION, FILTER), np.eye(4)
     world = World(shm, CutDisk(), kind)
@@ -237,7 +237,7 @@ def growth(shm: Path, kind: type[PagedMap], scans: int) -> int:
 
 
 def test_leak(shm: Path) -> None:
-    """v1: each voxel passed through was appended to a list that nobody emptied.
+    """v1: each voxel passed through was appended to a list that was never emptied.
 
     From 82 MB to 743 MB, for a map of 10 MB.
     """
@@ -288,7 +288,7 @@ def test_reload_before_save(
         world.map.move("mapper", FAR_AWAY)
         world.map.residency.asked_bytes = 10**10  # room is needed
         world.turn()
-        assert world.map.residency.saving == len(marks.keys), "all of it is on its way to the disk"
+        assert world.map.residency.saving == len(marks.keys), "all of it is being saved"
         world.turn()
         world.send(marks, at)
         assert world.map.residency.saving >= len(marks.keys), "and still is, with what came instead, if any"
@@ -319,17 +319,17 @@ class _StopsAtOnce(PagedMap):
         return True
 
 
-class _LeavesWhatIsOnItsWay(PagedMap):
+class _LeavesRunningSaves(PagedMap):
     @property
     def all_durable(self) -> bool:
         return not self.residency._dirty
 
 
 @pytest.mark.parametrize(
-    ("kind", "right"), [(PagedMap, True), (_StopsAtOnce, False), (_LeavesWhatIsOnItsWay, False)]
+    ("kind", "right"), [(PagedMap, True), (_StopsAtOnce, False), (_LeavesRunningSaves, False)]
 )
 def test_dirty_chunks_lost_at_exit(shm: Path, kind: type[PagedMap], *, right: bool) -> None:
-    """v1 and v2: who stopped looked at the flag before the queue; 29 changed chunks, none of them written.
+    """v1 and v2: the writer looked at its stop flag before its queue; 29 changed chunks were not written.
 
     Here the disk is full for a while, and the machine goes off at the end.
     """

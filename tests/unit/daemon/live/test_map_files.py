@@ -197,7 +197,7 @@ def test_a_file_system_that_cannot_exchange_names(exchanges: bool) -> None:
     assert sorted(disk.names()) == ["0_0_0.chunk", "map.json"], "the older one goes"
 
 
-def test_who_reads_a_file_that_is_written_over_reads_the_one_in_its_place(
+def test_a_reader_of_a_file_that_is_written_over_reads_the_one_in_its_place(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     folder = Folder(tmp_path)
@@ -324,14 +324,14 @@ class Drive:
     def __init__(self, disk: CutDisk) -> None:
         self.durable: dict[ChunkKey, int] = {}
         self.mappers = 0
-        self.lives = 0
+        self.run = 0
         self._disk = disk
 
     def go(self, rng: random.Random) -> None:
         made = MapFiles(self._disk, SETTINGS)
         self.map_id = made.map_id
         saved: dict[ChunkKey, int] = {key: row.version for key, row in made.rows.items()}
-        self.lives = made.begin_run()
+        self.run = made.begin_run()
         for _ in range(30):
             what = rng.random()
             key = rng.choice(KEYS)
@@ -356,13 +356,13 @@ def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int, exchanges
     rng = random.Random(seed)
     disk = CutDisk(rng.randint(0, 70), exchanges)
     durable: dict[ChunkKey, int] = {}
-    mappers = lives = 0
+    mappers = run = 0
     for _ in range(4):
         drive = Drive(disk)
         with contextlib.suppress(PowerCut):
             drive.go(rng)
         durable = {**durable, **{key: max(v, durable.get(key, 0)) for key, v in drive.durable.items()}}
-        mappers, lives = max(mappers, drive.mappers), max(lives, drive.lives)
+        mappers, run = max(mappers, drive.mappers), max(run, drive.run)
         disk = disk.after(lambda: rng.random() < 0.5, lambda size: rng.randint(-size, size))
         made = MapFiles(disk, SETTINGS)
         assert not made.missing
@@ -373,13 +373,13 @@ def test_a_power_cut_at_any_operation_loses_nothing_durable(seed: int, exchanges
             assert version_of(made, key) == made.rows[key].version
         assert not [name for name in disk.names() if name.endswith(".tmp")]
         assert made.add_mapper(0, "next").number > mappers
-        assert made.begin_run() > lives
+        assert made.begin_run() > run
         mappers += 1
         disk.operations, disk.exchanges = rng.randint(0, 70), exchanges
 
 
 @pytest.mark.parametrize("defect", ["sync", "sync_names", "early"])
-def test_such_a_cut_would_lose_something_if_nobody_waited_for_the_disk(
+def test_such_a_cut_would_lose_something_without_waiting_for_the_disk(
     monkeypatch: pytest.MonkeyPatch, defect: str
 ) -> None:
     """What the tests above find is not nothing."""
@@ -517,7 +517,7 @@ def test_any_bit_of_any_file_may_flip() -> None:
         assert len(again.applied) <= 1
 
 
-def test_what_a_manifest_says_of_scans_that_nobody_sent_does_not_count() -> None:
+def test_what_a_manifest_says_of_scans_that_were_never_sent_does_not_count() -> None:
     disk = CutDisk()
     stored(disk)
     MapFiles(disk, SETTINGS).write_manifest({1: SCANS_AHEAD + 7, 9: 3})

@@ -48,7 +48,7 @@ def test_an_unchanged_file_is_not_loaded_again(broken: InnerDaemon) -> None:
     assert not broken.loads.by_key
 
 
-def test_who_does_not_wait_is_told_at_once(broken: InnerDaemon, small_map: DividedMap) -> None:
+def test_a_request_without_wait_is_answered_at_once(broken: InnerDaemon, small_map: DividedMap) -> None:
     """And a loader is sent to look, so that the next one gets the mended file."""
     with broken.loaders_standing_still():
         ask(broken, 2, wait_s=None)

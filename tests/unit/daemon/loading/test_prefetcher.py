@@ -70,7 +70,7 @@ def prefetching(inner: Inner, street: DividedMap) -> Callable[..., InnerDaemon]:
     return factory
 
 
-def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[..., InnerDaemon]) -> None:
+def test_a_moving_client_finds_its_cells_in_memory(prefetching: Callable[..., InnerDaemon]) -> None:
     one = prefetching()
     drive = Drive(one)
     one.run_until(lambda: idle(one))
@@ -208,7 +208,7 @@ def test_what_is_nearly_a_demand_takes_the_last_loader_too(
     one.run_until(lambda: idle(one))
 
 
-def test_as_many_are_under_way_as_there_are_free_places(prefetching: Callable[..., InnerDaemon]) -> None:
+def test_as_many_are_fetched_as_there_are_free_places(prefetching: Callable[..., InnerDaemon]) -> None:
     """Some are kept, and a demand has one at once."""
     one = prefetching()
     one.pool.places = 8
@@ -285,7 +285,7 @@ def test_no_more_than_its_share_of_the_budget(prefetching: Callable[..., InnerDa
 
 
 def test_a_full_share_gives_up_what_is_needed_later(prefetching: Callable[..., InnerDaemon]) -> None:
-    """A client turns round: what lies ahead of it now takes the place of what nobody comes to any more."""
+    """A client turns round: what lies ahead of it now takes the place of what no client comes to any more."""
     one = prefetching()
     each = one.cache.estimate(0, "points")
     one.scheduler.prefetcher.share = (6.5 * each) / one.ledger.budget_bytes
@@ -370,7 +370,7 @@ def test_an_origin_that_comes_back_is_used_at_once(
 def test_broken_files_are_no_matter_of_where_they_come_from(
     prefetching: Callable[..., InnerDaemon], street: DividedMap
 ) -> None:
-    """One after the other on the way: each is tried once for now, and what lies behind them is fetched."""
+    """One after the other on the path: each is tried once for now, and what lies behind them is fetched."""
     broken = [f"{x}_{y}.pcd" for x in (-300, -280) for y in (-20, 0, 20)]
     for name in broken:
         Path(street.id(name)).write_bytes(b"no points")

@@ -195,10 +195,10 @@ def test_a_dead_loader_gets_no_job(inner: Inner, small_map: DividedMap) -> None:
     assert names(one.cells_of(2)) == ["0_0.pcd"]
 
 
-def test_a_parent_that_vanishes_again_and_again(
+def test_a_parent_that_vanishes_repeatedly(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The cause is unknown; the load that was under way each time is given up at last."""
+    """The cause is unknown; the load that ran each time is given up at last."""
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
     one = inner(small_map.root)
     wanted = ("0_0.pcd", "20_20.pcd")

@@ -19,12 +19,12 @@ from tests.unit.daemon.inner_daemon import EVERYWHERE, InnerDaemon
 HALF = BoxMessage(-1e3, -1e3, -1.0, 1e3)
 
 
-class LongWay(Exception):
+class ColdPath(Exception):
     """The request was answered with what covers everything."""
 
 
-def long_way(*_: object) -> NoReturn:
-    raise LongWay
+def cold_path(*_: object) -> NoReturn:
+    raise ColdPath
 
 
 @pytest.fixture
@@ -64,18 +64,18 @@ def test_what_others_hold_does_not_count(
 ) -> None:
     """What is in memory may come to more than one session may have: it is answered from versions, too."""
     inner, everything = warm
-    monkeypatch.setattr(cell_requests, "difference", long_way)
+    monkeypatch.setattr(cell_requests, "difference", cold_path)
     sizes = [cell.bytes for cell in everything.cells]
     inner.cells._quota.nbytes = sum(sizes[:2])
     assert inner.ledger.resident_bytes > inner.cells._quota.nbytes
     held = [cell.version for cell in everything.cells]
     assert len(differential(inner, 2, EVERYWHERE, held[2:]).cells) == 2
-    with pytest.raises(LongWay):
+    with pytest.raises(ColdPath):
         differential(inner, 3, EVERYWHERE, held[3:])
 
 
 def test_what_another_request_got_is_not_forgotten(warm: tuple[InnerDaemon, Cells]) -> None:
-    """Two windows of one client: each says what it holds, and the session has both's until it lets go."""
+    """Two windows of one client: each says what it holds, and the session holds both's until released."""
     inner, everything = warm
     session = inner.session()
     half = Differential(2, HALF)

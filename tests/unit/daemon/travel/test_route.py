@@ -78,7 +78,7 @@ def test_where_it_passes_a_place_twice_the_client_is_where_it_comes_to_next(lap:
     assert route.find(250.0, 1.0, before) == pytest.approx(before + 20.0)
 
 
-def test_a_street_is_taken_both_ways() -> None:
+def test_a_street_is_driven_in_both_directions() -> None:
     """A client that comes back along a street is not taken to go backwards along its first pass."""
     route = Route([(0.0, 0.0), (1000.0, 0.0), (1000.0, 300.0), (500.0, 300.0), (500.0, 0.0), (0.0, 0.0)])
     # 2100 m along it is back on the first street, 500 m from its beginning
@@ -97,7 +97,7 @@ def test_a_client_that_leaves_its_route_and_comes_back() -> None:
     assert route.find(600.0, 50.0, None) == pytest.approx(600.0)
     assert route.find(100.0, 0.0, 600.0) == pytest.approx(600.0 - BEHIND_M) or route.find(
         100.0, 0.0, 600.0
-    ) == pytest.approx(100.0), "it went back a long way"
+    ) == pytest.approx(100.0), "it went back far"
 
 
 def town(corners: int, radius: float) -> list[tuple[float, float]]:

@@ -207,7 +207,7 @@ def test_nothing_to_export(directory: Path, kind: Format) -> None:
 
 
 def test_one_chunk_at_a_time(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No chunk is read before the one before it was let go of."""
+    """No chunk is read before the last one was released."""
     import gc
     import weakref
 

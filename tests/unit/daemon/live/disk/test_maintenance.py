@@ -24,7 +24,7 @@ from tests.support.live_reference import contents, stored_drive
 
 
 def checked(directory: Path) -> CheckedMap:
-    """Check a map as everybody may, who changes nothing."""
+    """Check a map without changing it, as any account may."""
     before = contents(directory)
     with opened_folder_to_read(str(directory)) as files:
         found = check(files, str(directory))
@@ -312,7 +312,7 @@ def test_another_process_works_with_it(tmp_path: Path) -> None:
 
 
 def test_a_file_that_goes_while_the_map_is_checked(tmp_path: Path) -> None:
-    """A daemon has put it aside: it is missing, and not damaged."""
+    """A daemon has quarantined it: it is missing, and not damaged."""
     stored_drive(tmp_path)
     gone = largest(tmp_path)
 
@@ -348,7 +348,7 @@ def lived_in(directory: Path) -> dict[str, bytes]:
     return own
 
 
-def test_moved_aside(tmp_path: Path) -> None:
+def test_a_reset_moves_the_map_s_files(tmp_path: Path) -> None:
     for number in (1, 2):
         own = lived_in(tmp_path)
         own = {name: data for name, data in own.items() if "/" not in name and name not in OTHERS}
@@ -359,9 +359,9 @@ def test_moved_aside(tmp_path: Path) -> None:
         assert (done.files, done.bytes) == (len(own), sum(map(len, own.values())))
         assert contents(tmp_path / f"reset.{number}") == own
         assert {path.name for path in tmp_path.iterdir() if path.is_file()} == OTHERS.keys()
-        aside = Folder(tmp_path / f"reset.{number}")
-        assert check(aside, "").good
-        aside.close()
+        moved = Folder(tmp_path / f"reset.{number}")
+        assert check(moved, "").good
+        moved.close()
 
 
 def test_deleted(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_jitter_at_a_border_moves_nothing() -> None:
         assert one.next_eviction(float(number)) is None
 
 
-def test_only_what_is_near_nobody_makes_room_for_what_is_near() -> None:
+def test_only_what_is_near_no_client_makes_room_for_what_is_near() -> None:
     one = Residency(Limits(27 * 10, radius=1, hysteresis=0.0, loads=100), new_bytes=10)
     one.move("a", (0.5, 0.5, 0.5))
     while (chunk := one.next_load(0.0)) is not None:
@@ -190,10 +190,10 @@ def test_clean_chunks_stay_until_their_room_is_needed() -> None:
     flush(one)
     for now_s in (20.0, 25.0, 1e6):
         assert one.next_eviction(now_s) is None
-        assert one.next_event_s(now_s) == math.inf, "and nobody looks for what may go"
+        assert one.next_event_s(now_s) == math.inf, "and nothing looks for what may go"
 
 
-def test_what_nobody_wants_is_given_up_first_the_furthest_of_it() -> None:
+def test_what_no_client_wants_is_given_up_first_furthest_first() -> None:
     one = Residency(Limits(10**9, radius=1, loads=100))
     one.move("a", (0.5, 0.5, 0.5))
     for x in (0, 1, 2, 9, 4):
@@ -289,7 +289,7 @@ def test_where_one_file_cannot_be_written_no_other_is_tried_at_once() -> None:
     assert one.next_save(50.0 + RETRY_S) is chunks[1]
 
 
-def test_what_has_no_memory_keeps_nobody_from_what_has() -> None:
+def test_a_scan_without_memory_does_not_hold_up_others() -> None:
     one = Residency(Limits(40, radius=0, loads=9), new_bytes=10)
     chunks = []
     for x in range(3):
@@ -339,7 +339,7 @@ def test_a_chunk_near_a_client_that_cannot_be_read_is_tried_again() -> None:
 # --- giving up many ------------------------------------------------------------------------------
 
 
-def test_where_memory_is_short_nobody_waits_for_the_next_review() -> None:
+def test_where_memory_is_short_no_scan_waits_for_the_next_review() -> None:
     """Scans that come from elsewhere each: what they need takes the place of the last one's at once."""
     one = Residency(Limits(40, radius=0, loads=100, saves=100), new_bytes=10)
     for number in range(20):
@@ -359,7 +359,7 @@ def test_where_memory_is_short_nobody_waits_for_the_next_review() -> None:
 
 
 def test_giving_up_is_not_a_search_each_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of so many chunks each is looked at some times, not once for every other one."""
+    """Each of the chunks is looked at a few times, not once for every other one."""
     one = Residency(Limits(10**9, radius=0, loads=10**6, linger_s=0.0))
     for number in range(2000):
         one.adopt(ChunkKey(number, 0, 0), version=1, saved=1, nbytes=10, active=0, now_s=0.0)

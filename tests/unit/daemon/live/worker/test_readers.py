@@ -111,7 +111,7 @@ def test_what_changed_and_what_left(served: Served) -> None:
 
 
 def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> None:
-    """So many rows, so many that left, and all numbers as long as they get."""
+    """As many rows and as many gone chunks as there may be, with the longest numbers."""
     served.map.changes.note_changed(ChunkKey(0, 0, 0))
     since = served.map.changes.number
     for x in range(20_000):
@@ -124,10 +124,10 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
     found = page(served, since=first, saved=True)
     assert found.since_known
     assert len(found.rows) == MAX_CHUNK_ROWS
-    assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes where nobody has raised that"
+    assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes unless that limit was raised"
 
 
-def test_chunks_on_their_way_in_are_listed(served: Served) -> None:
+def test_chunks_that_are_being_loaded_are_listed(served: Served) -> None:
     """But not to a client that asks what changed: it cannot read them yet."""
     there, coming = ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
     live = served.live
@@ -289,7 +289,7 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
             assert served.answer(served.ask(lambda n: messages.LiveVoxels(n, "lidar"), session)).count == 0
         served.map.on_disconnect(3)
         assert not served.answers.keys() & {*waits, left}
-        assert served.map.readers.next_turn_s(served.now_s) > served.now_s, "nobody turns in vain"
+        assert served.map.readers.next_turn_s(served.now_s) > served.now_s, "no turn in vain"
     finally:
         goes_on.set()
     for ticket in waits:
@@ -299,7 +299,7 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
 
 
 def test_the_end_waits_for_no_reader_s_files(served: Served) -> None:
-    """Of so many that were asked for, at most those that are being read just now are read."""
+    """Of all that were asked for, at most those that are being read just now are read."""
     for x in range(100):
         on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
     begun, goes_on, read = threading.Event(), threading.Event(), []
