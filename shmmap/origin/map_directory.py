@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.formats.cloud import cloud_suffix
 from shmmap.formats.coordinate_system import degrees_warning
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
@@ -284,7 +285,7 @@ def load_single_pcd(path: str) -> Catalogue:
     except OSError as error:
         raise MapMissing(f"cannot read {path}: {error.strerror}") from error
     _refuse_large(path, "file", status.st_size, MAX_SINGLE_PCD_BYTES)
-    with PcdReader(path) as reader:
+    with _opened_pcd(path) as reader:
         points_bytes = reader.header.points * reader.header.point_bytes
         _refuse_large(path, "points", points_bytes, _MAX_POINT_BYTES)
         for _ in reader.blocks():
@@ -295,6 +296,16 @@ def load_single_pcd(path: str) -> Catalogue:
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
     problems = [f"{path}: {warning}"] if (warning := degrees_warning(lower, upper)) else []
     return Catalogue.from_cells([(path, box, SourceStamp.of(status))], problems=problems)
+
+
+def _opened_pcd(path: str) -> PcdReader:
+    """Open a PCD file; a file of another kind is refused for what it is called, with what is readable."""
+    try:
+        return PcdReader(path)
+    except MapDataError as error:
+        if error.cause == "not_pcd":
+            cloud_suffix(path)
+        raise
 
 
 def _refuse_large(path: str, what: str, size: int, limit: int) -> None:

@@ -216,6 +216,18 @@ def test_nothing_there(tmp_path: Path) -> None:
     assert MapMissing("x").exit_code == 66
 
 
+def test_one_file_that_is_no_cloud_says_which_files_are_read(tmp_path: Path) -> None:
+    for name, says in (("README.md", "files that end in .md are not read"), ("README", "without a suffix")):
+        path = tmp_path / name
+        path.write_text("# A map\n")
+        with pytest.raises(MapDataError, match=says) as caught:
+            open_map(path).load()
+        assert caught.value.exit_code == 65
+        assert caught.value.hint.startswith("readable are .pcd, .las, ")
+    write_pcd(tmp_path / "map", np.zeros((1, 3), np.float32))
+    assert len(open_map(tmp_path / "map").load()) == 1, "a PCD file may be called anything"
+
+
 def test_what_is_no_file_costs_its_own_cell_alone(tmp_path: Path) -> None:
     root = autoware_map(tmp_path)
     cells = root / "pointcloud_map.pcd"
