@@ -224,7 +224,7 @@ def test_one_file_that_is_no_cloud_says_which_files_are_read(tmp_path: Path) -> 
             open_map(path).load()
         assert caught.value.exit_code == 65
         assert caught.value.hint.startswith("readable are .pcd, .las, ")
-    write_pcd(tmp_path / "map", np.zeros((1, 3), np.float32))
+    write_pcd(tmp_path / "map", dict.fromkeys("xyz", np.zeros(1, np.float32)))
     assert len(open_map(tmp_path / "map").load()) == 1, "a PCD file may be called anything"
 
 
