@@ -47,7 +47,7 @@ MAX_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES
 MAPPERS: Final = 32
 """Mappers whose last scan a chunk remembers."""
 OUT_OF_SERVICE: Final = 1
-"""Value of ``state``, 0 in service: such a chunk does not change any more, and another one may have its key."""
+"""Value of ``state``, 0 in service: such a chunk changes no more, and another one may have its key."""
 
 MAGIC: Final = b"SHMCHUNK"
 BYTE_ORDER: Final = 0x01020304
