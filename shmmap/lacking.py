@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "area_text",
+    "empty_layers",
     "extent_text",
     "failure_lines",
     "judge",
@@ -115,12 +116,18 @@ def _nothing(client: Client, found: CellSet, area: Area | None) -> list[tuple[st
     """Where a complete answer has nothing in it, what is said and the hint."""
     if not found.cells:
         return [no_cell_there(client.welcome, area)] if area is not None else []
+    empty = empty_layers(found)
+    return [(empty, "")] if empty else []
+
+
+def empty_layers(found: CellSet) -> str:
+    """Say which layers have no points in any of the cells; empty where all have some."""
     rows: dict[str, int] = {}
     for cell in found.cells:
         rows[cell.layer] = rows.get(cell.layer, 0) + cell.points
     empty = [layer for layer, points in rows.items() if not points]
     cells = counted(len({cell.id for cell in found.cells}), "cell")
-    return [(f"{', '.join(empty)}: no points in {cells}", "")] if empty else []
+    return f"{', '.join(empty)}: no points in {cells}" if empty else ""
 
 
 def _asked(found: CellSet) -> int:

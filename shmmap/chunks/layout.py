@@ -26,7 +26,6 @@ __all__ = [
     "BRICK_BYTES",
     "CHUNKS_VERSION",
     "HEADER_BYTES",
-    "IN_SERVICE",
     "MAPPERS",
     "MAX_BYTES",
     "OUT_OF_SERVICE",
@@ -47,9 +46,8 @@ BRICK_BYTES: Final = 2 * BRICK_VOXELS
 MAX_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES
 MAPPERS: Final = 32
 """Mappers whose last scan a chunk remembers."""
-IN_SERVICE: Final = 0
 OUT_OF_SERVICE: Final = 1
-"""Values of ``state``: a chunk out of service does not change any more, and another one may have its key."""
+"""Value of ``state``, 0 in service: such a chunk changes no more, and another one may have its key."""
 
 MAGIC: Final = b"SHMCHUNK"
 BYTE_ORDER: Final = 0x01020304

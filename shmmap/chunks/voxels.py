@@ -38,9 +38,8 @@ __all__ = [
 CHUNK_SHIFT: Final = 6
 CHUNK_SIDE: Final = 1 << CHUNK_SHIFT
 """Voxels along each edge of a chunk."""
-BRICK_SHAPE: Final = (8, 8, 4)
-"""Voxels of a brick along x, y, z."""
 BRICK_VOXELS: Final = 256
+"""Voxels of a brick: 8 x 8 x 4, along x, y and z."""
 BRICKS: Final = 1024
 """Bricks of a chunk: 8 x 8 x 16."""
 CHUNK_VOXELS: Final = BRICKS * BRICK_VOXELS

@@ -6,29 +6,30 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from shmmap.cli.options import numbers
 from shmmap.cli.program import nothing_found
 from shmmap.errors import BadRequest
+from shmmap.lacking import near_cells_hint
 from shmmap.lacking import no_cell_there as nothing_there
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from shmmap.client.client import Client
     from shmmap.client.map_listing import CellInfo
     from shmmap.geometry import Area
+    from shmmap.protocol.messages import Evicted, Pinned
 
 __all__ = [
     "BoxTuple",
+    "act_on_cells",
     "add_area_options",
     "add_area_or_ids",
     "add_cells_argument",
     "area_from",
     "around",
-    "cells_meant",
-    "check_cells_argument",
     "moved_by",
     "no_cell_there",
     "print_near_cells",
@@ -36,6 +37,7 @@ __all__ = [
 ]
 
 BoxTuple = tuple[float, float, float, float]
+Answer = TypeVar("Answer", "Evicted", "Pinned")
 
 
 def add_area_options(
@@ -121,28 +123,58 @@ def add_cells_argument(parser: argparse.ArgumentParser) -> None:
     add_area_options(parser, parser.add_mutually_exclusive_group())
 
 
-def check_cells_argument(args: argparse.Namespace, verb: str, *, optional: bool = False) -> Area | None:
-    """Return the area that stands for the cells, None for ids or ``--all``; refuse none or several of them.
+def act_on_cells(
+    args: argparse.Namespace,
+    verb: str,
+    ask: Callable[[Client, list[str] | None], Answer],
+    show: Callable[[Answer], None],
+    *,
+    nothing: Answer,
+    optional: bool = False,
+) -> int:
+    """Have the daemon do something with the cells that `add_cells_argument` names; returns the exit code.
+
+    Parameters
+    ----------
+    ask
+        Given the client and the ids, None for ``--all``; returns the daemon's answer.
+    show
+        Prints an answer, without ids that the map does not have unless ``--json`` is given.
+    nothing
+        The answer that ``--json`` shows where an area touches no cell.
+    optional
+        No cells may be given.
 
     Raises
     ------
     BadRequest
         Cells and an area, or neither where something has to be said.
     """
+    from shmmap.cli.daemon_address import connect
+    from shmmap.cli.screens.output import print_line
+
     area = area_from(args)
     given = [bool(args.cells), area is not None, getattr(args, "all", False)]
     if sum(given) > 1 or (not any(given) and not optional):
         choices = "cells, an area or --all" if "all" in args else "cells or an area"
         only = "only one of: " if any(given) else ""
         raise BadRequest(f"{verb}: give {only}{choices}", hint=f"shmmap {verb} --help")
-    return area
-
-
-def cells_meant(args: argparse.Namespace, client: Client, area: Area | None) -> list[str]:
-    """Return the ids of the cells that are named or that touch the area."""
-    if area is None:
-        return list(args.cells)
-    return [cell.id for cell in client.metadata(area) if _at_height(area, cell)]
+    with connect(args) as client:
+        cells: list[str] | None = None if getattr(args, "all", False) else list(args.cells)
+        if area is not None:
+            cells = [cell.id for cell in client.metadata(area) if _at_height(area, cell)]
+            if not cells:
+                if args.json:
+                    show(nothing)
+                return no_cell_there(args, client, area)
+        answer = ask(client, cells)
+        hint = near_cells_hint(client, answer.unknown)
+    show(answer)
+    if not args.json:
+        for name in answer.unknown:
+            print_line(f"unknown cell: {name}")
+    print_near_cells(hint)
+    return 1 if answer.unknown else 0
 
 
 def _at_height(area: Area, cell: CellInfo) -> bool:

@@ -117,7 +117,6 @@ def list_cells(
     session: Session,
     area: geometry.Area | None,
     since: int | None,
-    timeout_s: float | None = None,
     most: int | None = None,
 ) -> MapListing:
     """Ask for all pages of the daemon's list; see `shmmap.Client.metadata`.
@@ -135,7 +134,6 @@ def list_cells(
             page = session.ask(
                 lambda n, at=start: messages.Metadata(n, message, since, at, _PAGE_ROWS),  # type: ignore[misc]
                 messages.MetadataPage,
-                timeout_s=timeout_s,
             )
             if listing is None:
                 listing = MapListing(

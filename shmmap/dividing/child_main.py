@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import socket
 import sys
 import time
@@ -19,7 +18,7 @@ from shmmap.dividing.divide import divide
 from shmmap.dividing.settings import DivideSettings
 from shmmap.errors import MapDataError, ShmmapError
 from shmmap.origin.map_report import LINK_NAME, read_report
-from shmmap.processes.end_with_parent import die_with
+from shmmap.processes.start_child import channel_to_parent
 
 __all__ = ["main"]
 
@@ -70,9 +69,7 @@ def _frame_before(out: str) -> tuple[float, float, float] | None:
 
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT UNIT VERTICAL_UNIT``; returns the error's exit code."""
-    channel = _Channel(socket.socket(fileno=int(arguments[0])))
-    die_with(int(arguments[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    channel = _Channel(channel_to_parent(arguments))
     os.nice(_NICENESS)
     # as `shmmap divide` does it, so that both give the same map; changed clouds keep the frame clients know
     settings = DivideSettings(

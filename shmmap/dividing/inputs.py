@@ -88,7 +88,11 @@ def check_unchanged(files: Sequence[InputFile]) -> None:
 
 
 def _refuse(error: OSError) -> NoReturn:
-    raise MapMissing(f"cannot read {error.filename}: {error.strerror}") from error
+    is_missing = isinstance(error, FileNotFoundError)
+    raise MapMissing(
+        f"cannot read {error.filename}: {error.strerror}",
+        hint=f"name clouds ({', '.join(CLOUD_SUFFIXES)}) or directories of them" if is_missing else "",
+    ) from error
 
 
 def check_output_place(inputs: Sequence[str], files: Sequence[InputFile], out: str) -> None:

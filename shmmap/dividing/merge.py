@@ -35,6 +35,7 @@ MERGED_ENCODINGS: Final = ("binary", "ascii")
 """Encodings that can be written without holding all points."""
 
 _BLOCK_BYTES: Final = 16 << 20
+_MEMORY_BYTES: Final = 1 << 30
 _Move = tuple[float, float, float]
 
 
@@ -58,7 +59,6 @@ def merge(
     keep_frame: bool = False,
     common_fields: bool = False,
     force: bool = False,
-    memory_bytes: int = 1 << 30,
     progress: Progress | None = None,
 ) -> MergedCloud:
     """Write all points of ``inputs`` to one PCD file, which appears complete or not at all.
@@ -97,7 +97,7 @@ def merge(
         for path in names:
             for file in _checked_inputs(path, out):
                 source = open_source(
-                    file.path, memory_bytes=memory_left(memory_bytes) // 2, scratch_dir=os.path.dirname(out)
+                    file.path, memory_bytes=memory_left(_MEMORY_BYTES) // 2, scratch_dir=os.path.dirname(out)
                 )
                 stack.callback(source.close)
                 choose_units([source], "", "")  # refuses feet: a PCD file cannot say so

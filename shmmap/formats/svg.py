@@ -212,29 +212,19 @@ class Axes:
     height: float
 
     @classmethod
-    def fitted(
-        cls,
-        page: Page,
-        box: BoxTuple,
-        top: float,
-        max_height: float,
-        *,
-        left: float | None = None,
-        max_width: float | None = None,
-    ) -> Axes:
-        """Make axes with one scale for x and y: as large as fits, in the middle between left and right.
+    def fitted(cls, page: Page, box: BoxTuple, top: float, max_height: float) -> Axes:
+        """Make axes with one scale for x and y: as large as fits, in the middle of the page.
 
         Parameters
         ----------
-        top, max_height, left, max_width
-            Where there is room, pixels; from one margin of the page to the other if None.
+        top, max_height
+            Where there is room, pixels: from one margin of the page to the other.
         """
-        left = page.margin if left is None else left
-        max_width = page.right - left if max_width is None else max_width
+        max_width = page.right - page.margin
         span_x, span_y = max(box[2] - box[0], 1e-9), max(box[3] - box[1], 1e-9)
         scale = min(max_width / span_x, max_height / span_y)
         width = span_x * scale
-        return cls(page, box, left + (max_width - width) / 2, top, width, span_y * scale)
+        return cls(page, box, page.margin + (max_width - width) / 2, top, width, span_y * scale)
 
     @property
     def bottom(self) -> float:
@@ -338,17 +328,15 @@ class Axes:
         for value, text in y_labels:
             self.page.text(self.left - 7, self.place(0, value)[1] + 4, text, text_anchor="end", **small)
 
-    def scale_bar(self, y: float, *, right: float | None = None) -> None:
-        """Draw a bar of 1, 2 or 5 times a power of ten metres, with its label to the left.
+    def scale_bar(self, y: float) -> None:
+        """Draw a bar of 1, 2 or 5 times a power of ten metres at the right, with its label to the left.
 
         Parameters
         ----------
         y
             Base line of the label.
-        right
-            Where the bar ends; at the page's margin if None.
         """
-        right = self.page.right if right is None else right
+        right = self.page.right
         longest = _SCALE_BAR_PX / self.scale
         power = 10.0 ** math.floor(math.log10(longest))
         metres = max(step * power for step in (1, 2, 5) if step * power <= longest)

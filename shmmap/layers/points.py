@@ -29,8 +29,6 @@ def build_points(
     cell_id: str,
     box: tuple[float, float, float, float],
     frame_id: str = "map",
-    path: str = "",
-    keep_non_finite: bool = False,
     reserve: Callable[[int], None] | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> SegmentHeader:
@@ -48,10 +46,6 @@ def build_points(
         its contents mean nothing.
     cell_id, box, frame_id
         For the segment's header; ``box`` is (min_x, min_y, max_x, max_y) in metres.
-    path
-        The name used in messages when ``source`` is a descriptor.
-    keep_non_finite
-        Keep points whose x, y or z is NaN or infinite.
     reserve
         Called with the segment's size in bytes before anything is allocated; it refuses by raising.
     warn
@@ -68,7 +62,7 @@ def build_points(
     OSError
         ENOSPC if the file system is full.
     """
-    with PcdReader(source, path=path, keep_non_finite=keep_non_finite) as reader:
+    with PcdReader(source) as reader:
         stamp = SourceStamp.of(os.fstat(reader.fileno()))
         rows = reader.header.points
         writer = _started(reader, rows, segment_fd, reserve, cell_id, box, frame_id)

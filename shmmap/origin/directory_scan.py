@@ -7,14 +7,13 @@ import array
 import contextlib
 import os
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shmmap.errors import MapMissing
-from shmmap.origin.cell_names import common_directory
 from shmmap.origin.map_layout import is_pcd
 from shmmap.origin.metadata import list_some
 
@@ -69,38 +68,36 @@ class _Found:
         self.names = []
 
 
-def scan(roots: Sequence[str], *, recursive: bool, at: Callable[[str], str] = str) -> ScannedFiles:
-    """List the PCD files in and among ``roots`` (absolute paths of directories and files).
+def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> ScannedFiles:
+    """List the PCD files in ``root``, the absolute path of a directory; of a file that one.
 
     ``at`` says where to find what a path names.
 
-    A file that is reached twice counts once.  Symbolic links are followed and keep their own names;
-    a directory reached twice is listed once.  Hidden directories are passed over when recursing, and
-    names that are no UTF-8 everywhere.
+    Symbolic links are followed and keep their own names; a directory reached twice is listed once.  Hidden
+    directories are passed over when recursing, and names that are no UTF-8 everywhere.
 
     Raises
     ------
     MapMissing
-        One of the roots cannot be read.
+        The root cannot be read.
     """
-    prefix = common_directory([os.path.join(root, "") if os.path.isdir(at(root)) else root for root in roots])
+    prefix = os.path.join(root if os.path.isdir(at(root)) else os.path.dirname(root), "")
     skip = len(os.fsencode(prefix))
     found = _Found()
     problems: dict[str, list[str]] = {}
     directories: dict[str, os.stat_result] = {}
     seen: set[tuple[int, int]] = set()
     pending: list[tuple[bytes, bytes]] = []  # where a directory is found, and its path
-    for root in roots:
-        place, path = os.fsencode(at(root)), os.fsencode(root)
-        try:
-            status = os.stat(place)
-            if stat.S_ISDIR(status.st_mode):
-                os.scandir(place).close()
-                pending.append((place, path))
-            else:
-                found.add(path[skip:], status)
-        except OSError as error:
-            raise MapMissing(f"cannot read {root}: {error.strerror}") from error
+    root_place, path = os.fsencode(at(root)), os.fsencode(root)
+    try:
+        status = os.stat(root_place)
+        if stat.S_ISDIR(status.st_mode):
+            os.scandir(root_place).close()
+            pending.append((root_place, path))
+        else:
+            found.add(path[skip:], status)
+    except OSError as error:
+        raise MapMissing(f"cannot read {root}: {error.strerror}") from error
     while pending:
         place, directory = pending.pop()
         try:

@@ -7,12 +7,12 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from shmmap.errors import MapDataError, MapMissing
+from shmmap.formats.cloud import cloud_suffix
 from shmmap.formats.coordinate_system import degrees_warning
 from shmmap.formats.pcd.reader import PcdReader
 from shmmap.origin.catalogue import Catalogue
@@ -58,7 +58,6 @@ def open_map(
     path: str | os.PathLike[str],
     *,
     metadata: str | os.PathLike[str] | None = None,
-    pcd_paths: Sequence[str | os.PathLike[str]] = (),
     strict: bool = False,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> MapDirectory:
@@ -70,8 +69,6 @@ def open_map(
         A map directory, a directory of cells, one PCD file, or a metadata file.
     metadata
         The metadata file, where it is not beside or among the cells.
-    pcd_paths
-        PCD files and directories to use instead of what is found at ``path``.
     strict
         Behave like Autoware's loader: integer corners only, no unknown keys, an entry without its
         file is an error, directories are not searched recursively.
@@ -86,7 +83,6 @@ def open_map(
     return MapDirectory(
         path=absolute_path(path),
         metadata=None if metadata is None else absolute_path(metadata),
-        pcd_paths=tuple(absolute_path(p) for p in pcd_paths),
         strict=strict,
         cache_dir=default_cache_directory() if cache_dir is None else os.path.abspath(cache_dir),
     ).checked()
@@ -101,14 +97,13 @@ class MapDirectory:
 
     path: str
     metadata: str | None = None
-    pcd_paths: tuple[str, ...] = ()
     strict: bool = False
     cache_dir: str = ""
     cached_from_cells: int = _CACHED_FROM_CELLS
 
     def checked(self) -> MapDirectory:
         """Return self, or raise `MapMissing` if there is no map."""
-        find_layout(self.path, self.metadata, self.pcd_paths)
+        find_layout(self.path, self.metadata)
         return self
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
@@ -127,7 +122,7 @@ class MapDirectory:
             The metadata is wrong, fits none of the files, or (strict) lacks some of them.
         """
         opened = OpenedDirectories()
-        layout = find_layout(self.path, self.metadata, self.pcd_paths, opened)
+        layout = find_layout(self.path, self.metadata, opened)
         catalogue = self._catalogue(self._key(layout), fresh, before, opened)
         catalogue.opened = opened
         if layout.metadata is not None:
@@ -150,7 +145,7 @@ class MapDirectory:
         return read_apart(self.path, words, earlier, tuple(opened.descriptors.values()))
 
     def _key(self, layout: MapLayout) -> str:
-        return json.dumps([layout.roots, layout.metadata, self.strict])
+        return json.dumps([layout.root, layout.metadata, self.strict])
 
     def scanned(
         self, max_bytes: int = MAX_METADATA_BYTES, opened: OpenedDirectories | None = None
@@ -160,7 +155,7 @@ class MapDirectory:
         Metadata of more bytes is refused before anything else is looked at.
         """
         opened = opened or OpenedDirectories()
-        layout = find_layout(self.path, self.metadata, self.pcd_paths, opened)
+        layout = find_layout(self.path, self.metadata, opened)
         key = self._key(layout)
         sidecar = sidecar_file(self.cache_dir, key)
         scanned_ns = time.time_ns()
@@ -169,10 +164,10 @@ class MapDirectory:
             # looked at before it is read: a change meanwhile then differs from what is written down
             sources = [Source.of(layout.metadata, _status(layout.metadata, opened))]
             data = metadata_bytes(layout.metadata, max_bytes, at=opened.at(layout.metadata))
-        files = scan(layout.roots, recursive=not self.strict, at=opened.at)
+        files = scan(layout.root, recursive=not self.strict, at=opened.at)
         if not len(files.names):
             raise MapMissing(
-                f"there is no PCD file in {', '.join(layout.roots)}",
+                f"there is no PCD file in {layout.root}",
                 hint="a divided map is a directory of PCD files; `shmmap divide` makes one of other clouds",
             )
         if layout.metadata is None:
@@ -180,9 +175,7 @@ class MapDirectory:
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
         del data  # of ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
-        if len(catalogue) >= self.cached_from_cells and all(
-            os.path.isdir(opened.at(root)) for root in layout.roots
-        ):
+        if len(catalogue) >= self.cached_from_cells and os.path.isdir(opened.at(layout.root)):
             sources += [Source.of(path, status) for path, status in files.directories.items()]
             save_sidecar(sidecar, key, sources, catalogue, scanned_ns)
         return catalogue
@@ -220,12 +213,12 @@ def _joined(
     entry = order[at[has_entry]]
     lacks_file = np.ones(len(entries.names), dtype=np.bool_)
     lacks_file[entry] = False
-    problems = [*layout.problems, *files.problems, *(f"{metadata}: {text}" for text in entries.problems)]
+    problems = [*files.problems, *(f"{metadata}: {text}" for text in entries.problems)]
     if lacks_file.any():
         listed = list_some([os.fsdecode(name) for name in entries.names[lacks_file].tolist()])
         if strict or len(entry) == 0:
             raise MapDataError(
-                f"these entries have no file in {', '.join(layout.roots)}: {listed}",
+                f"these entries have no file in {layout.root}: {listed}",
                 path=metadata,
                 cause="missing_files",
             )
@@ -284,7 +277,7 @@ def load_single_pcd(path: str) -> Catalogue:
     except OSError as error:
         raise MapMissing(f"cannot read {path}: {error.strerror}") from error
     _refuse_large(path, "file", status.st_size, MAX_SINGLE_PCD_BYTES)
-    with PcdReader(path) as reader:
+    with _opened_pcd(path) as reader:
         points_bytes = reader.header.points * reader.header.point_bytes
         _refuse_large(path, "points", points_bytes, _MAX_POINT_BYTES)
         for _ in reader.blocks():
@@ -295,6 +288,16 @@ def load_single_pcd(path: str) -> Catalogue:
     box = (float(lower[0]), float(lower[1]), float(upper[0]), float(upper[1]))
     problems = [f"{path}: {warning}"] if (warning := degrees_warning(lower, upper)) else []
     return Catalogue.from_cells([(path, box, SourceStamp.of(status))], problems=problems)
+
+
+def _opened_pcd(path: str) -> PcdReader:
+    """Open a PCD file; a file of another kind is refused for what it is called, with what is readable."""
+    try:
+        return PcdReader(path)
+    except MapDataError as error:
+        if error.cause == "not_pcd":
+            cloud_suffix(path)
+        raise
 
 
 def _refuse_large(path: str, what: str, size: int, limit: int) -> None:

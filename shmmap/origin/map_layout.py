@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -120,17 +120,14 @@ class MapLayout:
 
     Attributes
     ----------
-    roots
-        Absolute paths of the directories and files that hold the cells.
+    root
+        Absolute path of the directory that holds the cells, or of the one file.
     metadata
         Absolute path of the metadata file, or None when there is none.
-    problems
-        Paths that were named but do not exist.
     """
 
-    roots: tuple[str, ...]
+    root: str
     metadata: str | None
-    problems: tuple[str, ...] = ()
 
 
 def is_pcd(name: bytes) -> bool:
@@ -156,9 +153,7 @@ def absolute_path(path: str | os.PathLike[str]) -> str:
     return os.path.realpath(path) if misled else text
 
 
-def find_layout(
-    path: str, metadata: str | None, pcd_paths: Sequence[str], opened: OpenedDirectories | None = None
-) -> MapLayout:
+def find_layout(path: str, metadata: str | None, opened: OpenedDirectories | None = None) -> MapLayout:
     """Find the parts of the map at ``path``; all paths are absolute.
 
     Parameters
@@ -167,8 +162,6 @@ def find_layout(
         A map directory, a directory of cells, one PCD file, or a metadata file.
     metadata
         The metadata file, where it is somewhere else.
-    pcd_paths
-        Files and directories to use instead of what is found at ``path``.
     opened
         Is given the map's directories to open; all that is looked at is looked at through these.
 
@@ -182,8 +175,6 @@ def find_layout(
     opened.open(path)
     if metadata is not None:
         opened.open(os.path.dirname(metadata))
-    for directory in pcd_paths:
-        opened.open(directory)
     try:
         os.stat(opened.at(path))
     except OSError as error:
@@ -201,19 +192,9 @@ def find_layout(
     cells = os.path.join(path, _CELLS_NAME)
     opened.open(cells)
     root = cells if os.path.exists(opened.at(cells)) else path
-    if pcd_paths:
-        roots = tuple(p for p in pcd_paths if os.path.exists(opened.at(p)))
-        if not roots:
-            raise MapMissing(
-                f"none of the PCD paths exists: {', '.join(pcd_paths)}",
-                hint="name files or directories of files",
-            )
-        problems = tuple(f"invalid path: {p}" for p in pcd_paths if p not in roots)
-    else:
-        roots, problems = (root,), ()
     if metadata is None and os.path.isdir(opened.at(path)):
         metadata = _find_metadata(path, root, opened)
-    return MapLayout(roots, metadata, problems)
+    return MapLayout(root, metadata)
 
 
 def _find_metadata(path: str, root: str, opened: OpenedDirectories) -> str | None:

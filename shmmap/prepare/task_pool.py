@@ -72,16 +72,10 @@ FromWorker: TypeAlias = CellDone | Ready
 encode: Final = msgspec.msgpack.Encoder().encode
 _task: Final[msgspec.msgpack.Decoder[CellTask]] = msgspec.msgpack.Decoder(CellTask)
 _done: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
-
-
-def decode_task(data: bytes) -> CellTask:
-    """Return the message for a worker."""
-    return _task.decode(data)
-
-
-def decode_done(data: bytes) -> FromWorker:
-    """Return a worker's message."""
-    return _done.decode(data)
+decode_task: Final = _task.decode
+"""Reads a message for a worker."""
+decode_done: Final = _done.decode
+"""Reads a worker's message."""
 
 
 _FAILED_STARTS: Final = 3

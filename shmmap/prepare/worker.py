@@ -7,8 +7,6 @@ A file that crashes it costs that one cell; it dies with the process that starte
 from __future__ import annotations
 
 import os
-import signal
-import socket
 import sys
 from dataclasses import replace
 from typing import Final
@@ -23,8 +21,7 @@ from shmmap.layers.points import LAYER
 from shmmap.layers.sources import FILES, CellJob, CellSource, SourceReader
 from shmmap.layers.spec import LayerSpec, layer_spec
 from shmmap.prepare.task_pool import CellDone, CellTask, LayerDone, Ready, decode_task, encode
-from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES, channel_to_parent
 from shmmap.segment.version import Source
 
 __all__ = ["CellPoints", "main"]
@@ -134,9 +131,7 @@ def _digest(path: str) -> bytes:
 
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID CACHE_DIR CACHE_BYTES RECOGNISE``, the last 0 or 1."""
-    channel = socket.socket(fileno=int(arguments[0]))
-    die_with(int(arguments[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    channel = channel_to_parent(arguments)
     os.nice(_NICENESS)
     cache = LayerCache(arguments[2], limit_bytes=int(arguments[3]))
     recognise = bool(int(arguments[4]))

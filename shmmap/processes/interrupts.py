@@ -77,18 +77,10 @@ def _put_back(handlers: Mapping[signal.Signals, Callable[[int, FrameType | None]
 
 
 @contextlib.contextmanager
-def scratch_directory(prefix: str, parent: str | None = None) -> Iterator[str]:
-    """Make a temporary directory, and remove it with all it holds whatever happens.
-
-    Parameters
-    ----------
-    prefix
-        Start of its name.
-    parent
-        Where; by default where `tempfile` puts things.
-    """
+def scratch_directory(prefix: str) -> Iterator[str]:
+    """Make a temporary directory whose name begins so, and remove it with all it holds whatever happens."""
     with interrupts_later():
-        path = tempfile.mkdtemp(prefix=prefix, dir=parent)
+        path = tempfile.mkdtemp(prefix=prefix)
     try:
         yield path
     finally:

@@ -17,13 +17,16 @@ import socket
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NoReturn
+
+from shmmap.processes.end_with_parent import die_with
 
 __all__ = [
     "MAX_PACKET_BYTES",
     "ForkedProcess",
     "channel",
+    "channel_to_parent",
     "fork_child",
     "how_ended",
     "packet_buffer",
@@ -90,7 +93,7 @@ def start_child(
     Parameters
     ----------
     module
-        It has the kernel end it with its parent, see `shmmap.processes.end_with_parent`.
+        It begins with `channel_to_parent`.
     *arguments
         Further arguments.
     new_session
@@ -124,6 +127,21 @@ def start_child(
         ours.close()
         raise
     return process, ours
+
+
+def channel_to_parent(arguments: Sequence[str]) -> socket.socket:
+    """Begin a child that `start_child` has started: return its end of the channel.
+
+    The kernel ends the child with its parent, and Ctrl-C is the parent's to handle.
+
+    Parameters
+    ----------
+    arguments
+        Those of the child's program, which begin with ``CHANNEL_FD PARENT_PID``.
+    """
+    die_with(int(arguments[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return socket.socket(fileno=int(arguments[0]))
 
 
 class ForkedProcess:

@@ -27,8 +27,6 @@ __all__ = [
     "PublishSettings",
     "SliceSettings",
     "decode_sent",
-    "decode_settings",
-    "decode_slice_settings",
     "write_known_objects",
 ]
 
@@ -113,24 +111,9 @@ class NotSent(msgspec.Struct, array_like=True, tag="not_sent"):
 
 FromWorker: TypeAlias = CellSent | NotSent | Ready
 
-_settings: Final[msgspec.json.Decoder[PublishSettings]] = msgspec.json.Decoder(PublishSettings)
-_slice_settings: Final[msgspec.json.Decoder[SliceSettings]] = msgspec.json.Decoder(SliceSettings)
 _sent: Final[msgspec.msgpack.Decoder[FromWorker]] = msgspec.msgpack.Decoder(FromWorker)
-
-
-def decode_settings(text: str) -> PublishSettings:
-    """Read a worker's argument."""
-    return _settings.decode(text)
-
-
-def decode_slice_settings(text: str) -> SliceSettings:
-    """Read the argument of a slice's worker."""
-    return _slice_settings.decode(text)
-
-
-def decode_sent(data: bytes) -> FromWorker:
-    """Read a worker's message."""
-    return _sent.decode(data)
+decode_sent: Final = _sent.decode
+"""Reads a worker's message."""
 
 
 _ROW: Final = np.dtype([("content", "S32"), ("sha256", "V32"), ("size", "<u4"), ("raw", "<u4")])

@@ -52,17 +52,13 @@ class Pruned:
     kept_bytes: int = 0
 
 
-def prune_versions(
-    store: Store, *, keep_days: float = KEEP_DAYS, progress: PrepareProgress, now_s: float | None = None
-) -> Pruned:
+def prune_versions(store: Store, *, keep_days: float = KEEP_DAYS, progress: PrepareProgress) -> Pruned:
     """Remove versions that have not been current for ``keep_days``, and what only they have.
 
     Parameters
     ----------
     keep_days
         7 or more.
-    now_s
-        Unix time; None: the clock's.
 
     Raises
     ------
@@ -74,7 +70,7 @@ def prune_versions(
     refuse_read_only(store)
     if not keep_days >= LEAST_KEEP_DAYS:
         raise BadRequest(f"versions are kept for {LEAST_KEEP_DAYS:g} days at least")
-    old_s = (time.time() if now_s is None else now_s) - keep_days * _DAY_S
+    old_s = time.time() - keep_days * _DAY_S
     current = require_current(store)
     _require_signed(store, current)
     result = Pruned()

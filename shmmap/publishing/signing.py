@@ -54,7 +54,7 @@ from shmmap.origin.remote.signed_metadata import (
 )
 from shmmap.origin.remote.store import Store, put_over, refuse_read_only
 
-__all__ = ["LIFETIMES", "ROLES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
+__all__ = ["LIFETIMES", "ROOT_FILE", "MapSigner", "Refreshed", "Rotated"]
 
 ROOT_FILE: Final = "ROOT.json"
 LIFETIMES: Final = {
@@ -64,7 +64,6 @@ LIFETIMES: Final = {
     Timestamp.type: timedelta(days=7),
 }
 _KEYS: Final = {Root.type: "root", Targets.type: "targets", Snapshot.type: "online", Timestamp.type: "online"}
-ROLES: Final = tuple(_KEYS)
 _MAX_TRIES: Final = 1000
 _MAX_KEY_BYTES: Final = 1 << 16
 _Role = TypeVar("_Role", Root, Timestamp, Snapshot, Targets)

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Final
 
+import msgspec
+
 from shmmap.errors import LoadFailed, MapDataError, MapMissing, Offline, ShmmapError
 from shmmap.layers.build import cache_key
 from shmmap.layers.contract import Box
@@ -35,7 +37,7 @@ from shmmap.origin.remote.published_object import (
 from shmmap.origin.remote.zstd_frame import unpack_frame
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.processes.start_child import MAX_PACKET_BYTES
-from shmmap.publishing.messages import TASKS_AHEAD, CellSent, KnownObjects, NotSent, decode_slice_settings
+from shmmap.publishing.messages import TASKS_AHEAD, CellSent, KnownObjects, NotSent, SliceSettings
 from shmmap.publishing.worker import CellMaker, Sender, make_and_send, run_worker
 from shmmap.segment.version import Source, Stamp
 
@@ -177,7 +179,7 @@ class _Tasks:
 
 
 def _work(channel: socket.socket, argument: str) -> None:
-    settings = decode_slice_settings(argument)
+    settings = msgspec.json.decode(argument, type=SliceSettings)
     store = open_store(
         settings.url,
         insecure_http=settings.insecure_http,

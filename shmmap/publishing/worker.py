@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import socket
 import sys
 import threading
@@ -40,15 +39,14 @@ from shmmap.origin.remote.published_object import (
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.task_pool import CellTask, Ready, decode_task, encode
 from shmmap.prepare.worker import CellPoints
-from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import MAX_PACKET_BYTES
+from shmmap.processes.start_child import MAX_PACKET_BYTES, channel_to_parent
 from shmmap.publishing.messages import (
     TASKS_AHEAD,
     CellSent,
     KnownObjects,
     LayerSent,
     NotSent,
-    decode_settings,
+    PublishSettings,
 )
 from shmmap.publishing.new_version import send_object
 from shmmap.quantities import format_bytes
@@ -257,7 +255,7 @@ class Sender:
 
 
 def _work(channel: socket.socket, argument: str) -> None:
-    settings = decode_settings(argument)
+    settings = msgspec.json.decode(argument, type=PublishSettings)
     store = open_store(
         settings.url,
         insecure_http=settings.insecure_http,
@@ -302,9 +300,7 @@ def make_and_send(
 
 def run_worker(arguments: list[str], work: Callable[[socket.socket, str], None]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID SETTINGS``: ``work`` takes the channel and the settings."""
-    channel = socket.socket(fileno=int(arguments[0]))
-    die_with(int(arguments[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    channel = channel_to_parent(arguments)
     os.nice(_NICENESS)
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):
         work(channel, arguments[2])

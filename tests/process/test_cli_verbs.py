@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from shmmap.cli.entry import build_parser
 from shmmap.cli.json_output import output_kinds
-from shmmap.cli.parser import build_parser
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import ROOT, Deadline

@@ -235,7 +235,7 @@ def test_another_account_learns_what_it_cannot_see(
     program = (
         "import os, sys\n"
         "from shmmap.cli.entry import main\n"
-        "import shmmap.cli.verbs.look.doctor, shmmap.doctor.checks, shmmap.client.client\n"
+        "import shmmap.cli.verbs.look.monitors, shmmap.doctor.checks, shmmap.client.client\n"
         "import shmmap.client.discovery\n"
         "import shmmap.client.event_stream, shmmap.daemon.config, msgspec, shmmap.service.program\n"
         f"os.setgroups([]); os.setgid({OTHER_USER}); os.setuid({OTHER_USER})\n"

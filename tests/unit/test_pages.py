@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from shmmap.cli.parser import build_parser
+from shmmap.cli.entry import build_parser
 from tests.support.daemon_process import ROOT
 from tests.support.pages import Page, all_pages, read_page
 

@@ -181,11 +181,6 @@ class RosBridge:
         """Names of all services."""
         return [server.name for server in self._servers]
 
-    @property
-    def status_path(self) -> str:
-        """Where ``shmmap doctor`` reads how the bridge is; empty where it cannot."""
-        return self._status.path
-
     def stop(self) -> None:
         """End `run`; may be called from a signal handler."""
         self._stop.set()

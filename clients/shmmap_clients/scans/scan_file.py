@@ -19,7 +19,7 @@ from shmmap.errors import MapMissing
 from shmmap.layers import build_layer
 from shmmap_clients.scans.bin_layout import BinLayout, guess_layout
 
-__all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "read_scan_fields", "thinned"]
+__all__ = ["MIN_RANGE_M", "SCAN_SUFFIXES", "ScanReader", "read_scan", "thinned"]
 
 SCAN_SUFFIXES: Final = (".pcd", ".npz", ".bin")
 MIN_RANGE_M: Final = 0.5
@@ -149,12 +149,6 @@ def read_scan(path: str | os.PathLike[str]) -> NDArray[np.floating]:
         The file is not what its name says.
     """
     return ScanReader(min_range=0.0).points(path)
-
-
-def read_scan_fields(path: str | os.PathLike[str]) -> Columns:
-    """Return all columns of a scan by name, as `ScanReader.read`; rows that are not finite left out."""
-    reader = ScanReader(min_range=0.0)
-    return reader.screened(reader.read(path))[0]
 
 
 def _from_npz(name: str) -> Columns:

@@ -38,6 +38,7 @@ GLYPHS: Final = {
 
 _ORDER: Final = ("zombie", "stale", "fetched", "resident")  # the last of a cell's states is what is drawn
 
+_OUTLINE_POINTS: Final = 180
 CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wide
 
 
@@ -141,16 +142,16 @@ def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
     return grid
 
 
-def _outline(client: ClientRow, points: int = 180) -> list[tuple[float, float]]:
+def _outline(client: ClientRow) -> list[tuple[float, float]]:
     window = client.window
     if window is None:
         return []
     if window.shape == "circle":
-        turns = [2 * math.pi * i / points for i in range(points)]
+        turns = [2 * math.pi * i / _OUTLINE_POINTS for i in range(_OUTLINE_POINTS)]
         return [
             (window.x + window.half_x * math.cos(t), window.y + window.half_y * math.sin(t)) for t in turns
         ]
-    steps = [2 * i / (points // 4) - 1 for i in range(points // 4)]
+    steps = [2 * i / (_OUTLINE_POINTS // 4) - 1 for i in range(_OUTLINE_POINTS // 4)]
     sides = [side for s in steps for side in ((s, -1.0), (s, 1.0), (-1.0, s), (1.0, s))] + [(1.0, 1.0)]
     return [(window.x + a * window.half_x, window.y + b * window.half_y) for a, b in sides]
 

@@ -37,6 +37,7 @@ __all__ = [
 
 
 _EDGES: Final = 2  # blanks left and right of a table
+_GAP: Final = 3  # blanks between columns
 
 _NARROWEST: Final = 20  # columns that text needs to be worth breaking
 
@@ -152,15 +153,13 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         console.print(hidden, soft_wrap=True)
 
 
-def columns_that_fit(
-    columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int, *, gap: int = 3
-) -> list[int]:
+def columns_that_fit(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> list[int]:
     """Return the indices of the columns that are not spare, and of the others that fit, least spare first."""
     widths = [max(map(len, texts)) for texts in zip([column.name for column in columns], *rows, strict=True)]
     shown: list[int] = []
     for level in sorted({0, *(column.spare for column in columns)}):
         more = [index for index, column in enumerate(columns) if column.spare == level]
-        if not level or sum(widths[index] + gap for index in shown + more) - gap <= width:
+        if not level or sum(widths[index] + _GAP for index in shown + more) - _GAP <= width:
             shown += more
     return sorted(shown)
 

@@ -29,7 +29,7 @@ from shmmap.daemon.loading import worker_messages
 from shmmap.daemon.loading.worker_main import WorkerSettings, limit_memory, work
 from shmmap.kernel_cache import compiled_mark
 from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import receive_packet
+from shmmap.processes.start_child import channel_to_parent, receive_packet
 from shmmap.version import __version__
 
 __all__ = ["main"]
@@ -160,13 +160,12 @@ def main(arguments: list[str]) -> int:
     that a loader may take, bytes; directory and size of the disk cache, empty and 0 where there is none; of
     a published map what `shmmap.origin.remote.opened_store.ServedFrom` says.
     """
-    die_with(int(arguments[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
+    ours = channel_to_parent(arguments)
     signal.signal(signal.SIGIO, signal.SIG_IGN)
     take_slices(0)  # the short ones are for processes that serve
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
         score.write(_OOM_SCORE)
-    with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
+    with ours as channel, contextlib.suppress(ConnectionError):
         gc.collect()
         gc.freeze()  # a collection in a loader would copy what all of them share
         data, _ = receive_packet(channel, bytearray(MAX_SETTINGS_BYTES))

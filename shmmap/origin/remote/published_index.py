@@ -496,7 +496,7 @@ def pack_shard(shard: Shard) -> bytes:
     )
 
 
-def unpack_shard(frame: bytes | memoryview, root: Root, number: int, *, name: str = "") -> Shard:
+def unpack_shard(frame: bytes | memoryview, root: Root, number: int) -> Shard:
     """Verify and read the object of a root's shard.
 
     Raises
@@ -504,7 +504,7 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int, *, name: st
     MapDataError
         If it is not that object, or no sound shard of this root (cause ``damaged``).
     """
-    name = name or f"shard {root.keys[number].tolist()}"
+    name = f"shard {root.keys[number].tolist()}"
     wrong = Damage(name)
     if sha256(frame).digest() != root.shard_sha256(number):
         raise wrong("its SHA-256 is not its name")

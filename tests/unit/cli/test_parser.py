@@ -13,9 +13,8 @@ from shmmap.cli import json_output
 from shmmap.cli.areas import area_from
 from shmmap.cli.daemon_address import endpoint
 from shmmap.cli.daemon_address import instance as instance_of
-from shmmap.cli.entry import main
+from shmmap.cli.entry import GROUPS, NUMBER_OPTIONS, VERBS, build_parser, main, verb_first
 from shmmap.cli.options import numbers, seconds
-from shmmap.cli.parser import GROUPS, NUMBER_OPTIONS, VERBS, build_parser, verb_first
 from shmmap.cli.program import join_negative_values
 from shmmap.cli.verbs.cells.query import held_cell
 from shmmap.errors import BadRequest

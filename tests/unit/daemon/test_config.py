@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap.cli.parser import build_parser
+from shmmap.cli.entry import build_parser
 from shmmap.daemon.config import (
     DROPPED,
     RENAMED,

@@ -58,6 +58,13 @@ def test_bad_inputs_leave_nothing(
     assert sorted(os.listdir(tmp_path)) == before
 
 
+def test_an_input_that_is_not_there_says_what_could_be_named(tmp_path: Path) -> None:
+    for name in ("gone.pcd", "gone"):
+        with pytest.raises(MapMissing, match=f"{name}: No such file") as caught:
+            divide_quickly([tmp_path / name], tmp_path / "map")
+        assert caught.value.hint.startswith("name clouds (.pcd, .las, ")
+
+
 @pytest.mark.parametrize("settings", [{}, {"leaf": 0.5}, {"encoding": "ascii"}])
 def test_a_run_that_fails_leaves_no_file_open(tmp_path: Path, settings: dict[str, Any]) -> None:
     good = cloud_file(tmp_path / "good.pcd", xyzircaedt(20_000, reach=90.0))

@@ -140,13 +140,6 @@ def test_a_file_that_changes_meanwhile_is_refused(tmp_path: Path, segment: int) 
     assert caught.value.cause == "changed"
 
 
-def test_keeping_all_points(tmp_path: Path, segment: int) -> None:
-    path = tmp_path / "cell.pcd"
-    path.write_bytes(pcd([column(name, "F4", [1.0, math.nan]) for name in "xyz"], "binary"))
-    header = build_points(str(path), segment, cell_id="cell", box=BOX, keep_non_finite=True)
-    assert (header.rows, header.dropped_points, header.z_max) == (2, 0, 1.0)
-
-
 def outside(tmp_path: Path, xyz: np.ndarray, layer: str = "points") -> int:
     write_pcd(tmp_path / "a.pcd", {axis: xyz[:, i] for i, axis in enumerate("xyz")})
     fd = os.memfd_create("segment")

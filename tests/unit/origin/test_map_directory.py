@@ -74,21 +74,12 @@ def test_metadata_beside_or_inside_a_directory_of_any_name(tmp_path: Path) -> No
     check(root, cells)
 
 
-def test_explicit_paths(tmp_path: Path) -> None:
+def test_metadata_elsewhere(tmp_path: Path) -> None:
     cells, elsewhere = tmp_path / "cells", tmp_path / "elsewhere"
     put_cells(cells)
     elsewhere.mkdir()
     (elsewhere / "m.yaml").write_text(metadata_text())
     check(cells, cells, metadata=elsewhere / "m.yaml")
-    files = [cells / name for name in NAMES]
-    check(elsewhere, cells, metadata=elsewhere / "m.yaml", pcd_paths=files)
-    # a file listed by itself and through its directory is one cell
-    check(elsewhere, cells, metadata=elsewhere / "m.yaml", pcd_paths=[*files, cells])
-    catalogue = open_map(
-        cells, metadata=elsewhere / "m.yaml", pcd_paths=[files[0], cells / "none.pcd"]
-    ).load()
-    assert len(catalogue) == 1
-    assert f"invalid path: {cells / 'none.pcd'}" in catalogue.problems
 
 
 def test_nested_folders_of_the_divider_s_large_grid(tmp_path: Path) -> None:
@@ -211,9 +202,19 @@ def test_nothing_there(tmp_path: Path) -> None:
         open_map(tmp_path, metadata=tmp_path / "none.yaml")
     with pytest.raises(MapMissing, match="no PCD file"):
         open_map(tmp_path).load()
-    with pytest.raises(MapMissing, match="none of the PCD paths"):
-        open_map(tmp_path, pcd_paths=[tmp_path / "none.pcd"])
     assert MapMissing("x").exit_code == 66
+
+
+def test_one_file_that_is_no_cloud_says_which_files_are_read(tmp_path: Path) -> None:
+    for name, says in (("README.md", "files that end in .md are not read"), ("README", "without a suffix")):
+        path = tmp_path / name
+        path.write_text("# A map\n")
+        with pytest.raises(MapDataError, match=says) as caught:
+            open_map(path).load()
+        assert caught.value.exit_code == 65
+        assert caught.value.hint.startswith("readable are .pcd, .las, ")
+    write_pcd(tmp_path / "map", dict.fromkeys("xyz", np.zeros(1, np.float32)))
+    assert len(open_map(tmp_path / "map").load()) == 1, "a PCD file may be called anything"
 
 
 def test_what_is_no_file_costs_its_own_cell_alone(tmp_path: Path) -> None:

@@ -6,17 +6,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Final
 
-from shmmap.cli.areas import (
-    add_cells_argument,
-    cells_meant,
-    check_cells_argument,
-    no_cell_there,
-    print_near_cells,
-)
+from shmmap.cli.areas import act_on_cells, add_cells_argument
 from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import counted, print_json, print_line
-from shmmap.lacking import near_cells_hint
 
 if TYPE_CHECKING:
     from shmmap.client.client import Client
@@ -99,25 +92,22 @@ def add_evict(subparsers: Subparsers) -> None:
 
 def run_evict(args: argparse.Namespace) -> int:
     """Evict, and print what became free."""
-    from shmmap.cli.daemon_address import connect
+    from shmmap.protocol.messages import Evicted
 
-    area = check_cells_argument(args, "evict")
-    with connect(args) as client:
-        cells = None if args.all else cells_meant(args, client, area)
-        if area is not None and not cells:
-            if args.json:
-                from shmmap.cli.verbs.cells import outputs
+    kept: list[str] = []
 
-                print_json(outputs.Eviction(0, 0, 0, []))
-            return no_cell_there(args, client, area)
+    def ask(client: Client, cells: list[str] | None) -> Evicted:
         answer = client.evict(cells)
-        hint = near_cells_hint(client, answer.unknown)
-        kept = _kept(client, cells) if answer.kept and not args.json else []
-    if args.json:
-        from shmmap.cli.verbs.cells import outputs
+        if answer.kept and not args.json:
+            kept.extend(_kept(client, cells))
+        return answer
 
-        print_json(outputs.Eviction(answer.freed, answer.pinned, answer.kept, list(answer.unknown)))
-    else:
+    def show(answer: Evicted) -> None:
+        if args.json:
+            from shmmap.cli.verbs.cells import outputs
+
+            print_json(outputs.Eviction(answer.freed, answer.pinned, answer.kept, list(answer.unknown)))
+            return
         print_line(f"{counted(answer.freed, 'segment')} freed")
         if answer.pinned:
             print_line(f"{counted(answer.pinned, 'segment')} retired, freed when no client maps them")
@@ -127,10 +117,8 @@ def run_evict(args: argparse.Namespace) -> int:
             print_line(f"  {line}")
         if len(kept) > _NAMED:
             print_line(f"  and {len(kept) - _NAMED:,} more, see `shmmap pin`")
-        for name in answer.unknown:
-            print_line(f"unknown cell: {name}")
-    print_near_cells(hint)
-    return 1 if answer.unknown else 0
+
+    return act_on_cells(args, "evict", ask, show, nothing=Evicted(0, 0, 0))
 
 
 def _kept(client: Client, cells: list[str] | None) -> list[str]:

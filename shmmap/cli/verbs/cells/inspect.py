@@ -176,7 +176,7 @@ def _as_map(path: str, found: list[CloudDescription]) -> outputs.ServedMap | Non
     from shmmap.origin.map_report import far_cells_notes
 
     try:
-        if find_layout(absolute_path(path), None, ()).metadata is None:
+        if find_layout(absolute_path(path), None).metadata is None:
             return None
         catalogue = open_map(path).load(fresh=True)
     except (MapDataError, MapMissing) as error:

@@ -6,19 +6,15 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from shmmap.cli.areas import (
-    add_cells_argument,
-    cells_meant,
-    check_cells_argument,
-    no_cell_there,
-    print_near_cells,
-)
+from shmmap.cli.areas import act_on_cells, add_cells_argument
 from shmmap.cli.options import Subparsers, add_daemon_options, add_layer_option, add_verb, layers_from
 from shmmap.cli.program import add_allow_empty
 from shmmap.cli.screens.output import Column, format_bytes, print_json, print_line, print_table
-from shmmap.lacking import near_cells_hint
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from shmmap.client.client import Client
     from shmmap.protocol.messages import Pinned
 
 __all__ = ["add_pin", "add_unpin", "run_pin", "run_unpin"]
@@ -50,39 +46,33 @@ def add_pin(subparsers: Subparsers) -> None:
 
 def run_pin(args: argparse.Namespace) -> int:
     """Pin, and print the pinned cells."""
-    from shmmap.cli.daemon_address import connect
-
-    area = check_cells_argument(args, "pin", optional=True)
-    with connect(args) as client:
-        cells = cells_meant(args, client, area)
-        if area is not None and not cells:
-            if args.json:
-                from shmmap.cli.verbs.cells import outputs
-
-                print_json(outputs.Pins([], []))
-            return no_cell_there(args, client, area)
-        answer = client.pin(cells, layers_from(args))
-        hint = near_cells_hint(client, answer.unknown)
-    return _print_pins(answer, hint, as_json=args.json)
+    layers = layers_from(args)
+    return _change_pins(args, "pin", lambda client, cells: client.pin(cells or (), layers), optional=True)
 
 
-def _print_pins(answer: Pinned, hint: str, *, as_json: bool) -> int:
-    """Print what is pinned, and a hint about unknown ids; returns the exit code."""
-    if as_json:
-        from shmmap.cli.verbs.cells import outputs
+def _change_pins(
+    args: argparse.Namespace,
+    verb: str,
+    ask: Callable[[Client, list[str] | None], Pinned],
+    *,
+    optional: bool = False,
+) -> int:
+    """Change what is pinned, and print what is pinned then; returns the exit code."""
+    from shmmap.protocol.messages import Pinned
 
-        rows = [outputs.Pin(cell.id, cell.layer, cell.state, cell.bytes) for cell in answer.cells]
-        print_json(outputs.Pins(rows, list(answer.unknown)))
-    else:
-        if answer.cells:
+    def show(answer: Pinned) -> None:
+        if args.json:
+            from shmmap.cli.verbs.cells import outputs
+
+            rows = [outputs.Pin(cell.id, cell.layer, cell.state, cell.bytes) for cell in answer.cells]
+            print_json(outputs.Pins(rows, list(answer.unknown)))
+        elif answer.cells:
             table = [[cell.id, cell.layer, cell.state, format_bytes(cell.bytes)] for cell in answer.cells]
             print_table(_COLUMNS, table)
         elif not answer.unknown:
             print_line("nothing is pinned")
-        for name in answer.unknown:
-            print_line(f"unknown cell: {name}")
-    print_near_cells(hint)
-    return 1 if answer.unknown else 0
+
+    return act_on_cells(args, verb, ask, show, nothing=Pinned(0, ()), optional=optional)
 
 
 def add_unpin(subparsers: Subparsers) -> None:
@@ -105,17 +95,4 @@ def add_unpin(subparsers: Subparsers) -> None:
 
 def run_unpin(args: argparse.Namespace) -> int:
     """End pins, and print what stays pinned."""
-    from shmmap.cli.daemon_address import connect
-
-    area = check_cells_argument(args, "unpin")
-    with connect(args) as client:
-        cells = None if args.all else cells_meant(args, client, area)
-        if area is not None and not cells:
-            if args.json:
-                from shmmap.cli.verbs.cells import outputs
-
-                print_json(outputs.Pins([], []))
-            return no_cell_there(args, client, area)
-        answer = client.unpin(cells)
-        hint = near_cells_hint(client, answer.unknown)
-    return _print_pins(answer, hint, as_json=args.json)
+    return _change_pins(args, "unpin", lambda client, cells: client.unpin(cells))

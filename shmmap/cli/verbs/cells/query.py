@@ -29,7 +29,14 @@ from shmmap.cli.screens.output import (
     rows_text,
 )
 from shmmap.errors import BadRequest
-from shmmap.lacking import failure_lines, near_cells_hint, not_covered, pending_lines, unknown_ids
+from shmmap.lacking import (
+    empty_layers,
+    failure_lines,
+    near_cells_hint,
+    not_covered,
+    pending_lines,
+    unknown_ids,
+)
 
 if TYPE_CHECKING:
     from shmmap.client.cell_set import CellSet
@@ -128,14 +135,8 @@ def run(args: argparse.Namespace) -> int:
 def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, found: CellSet) -> int:
     """Return the exit code of a complete answer; where there is nothing in it, say so."""
     if found.cells:
-        held = args.held is not None
-        rows: dict[str, int] = {}
-        for cell in found.cells:
-            rows[cell.layer] = rows.get(cell.layer, 0) + cell.points
-        empty = [layer for layer, points in rows.items() if not points]
-        if empty and not held:
-            cells = len({cell.id for cell in found.cells})
-            return nothing_found(args, f"{', '.join(empty)}: no points in {counted(cells, 'cell')}")
+        if args.held is None and (empty := empty_layers(found)):
+            return nothing_found(args, empty)
     elif area is not None and (args.held is None or not len(client.metadata(area))):
         return no_cell_there(args, client, area)
     return 0

@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap health`` and ``shmmap metrics``: what scripts and monitors ask."""
+"""``shmmap health``, ``metrics`` and ``doctor``: what scripts and monitors ask, and what is wrong."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
-from shmmap.cli.screens.output import counted, format_duration, print_json, print_line
+from shmmap.cli.screens.output import counted, format_duration, print_hanging, print_json, print_line
 from shmmap.doctor.verdicts import trust_problems
-from shmmap.errors import DaemonUnreachable
+from shmmap.errors import DaemonUnreachable, NoSocket
 
 if TYPE_CHECKING:
+    from shmmap.doctor.verdicts import Finding
     from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["add_health", "add_metrics", "run_health", "run_metrics"]
-
+__all__ = ["add_doctor", "add_health", "add_metrics", "run_doctor", "run_health", "run_metrics"]
 
 _HEALTH_EXIT = """\
 Exit code: 0 healthy, 1 starting, unreachable, paused or hung, 69 dead or never started; with --strict
@@ -130,3 +131,60 @@ def run_metrics(args: argparse.Namespace) -> int:
     found = read_statistics(name, directory)
     sys.stdout.write(exposition(found, name))
     return DaemonUnreachable.exit_code if found.state in ("absent", "dead") else 0
+
+
+_DOCTOR_EXIT = """\
+Exit code: 0 no finding is `fail`, 1 one is, 78 the configuration has a mistake."""
+
+
+def add_doctor(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "doctor",
+        run_doctor,
+        help="find problems and suggest fixes",
+        description="Check the daemon, its socket and group, the map, shared memory and its limits, live "
+        "maps, where a published map comes from, the bridge to ROS, and what was left behind.  Changes "
+        "nothing.  Run it as the user whose program has a problem.",
+        output="look.outputs.Diagnosis",
+        epilog=_DOCTOR_EXIT,
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        default="",
+        help="the daemon's settings (default: the installed service's)",
+    )
+    add_statistics_options(parser)
+
+
+def run_doctor(args: argparse.Namespace) -> int:
+    """Print every finding."""
+    from shmmap.cli import daemon_address
+    from shmmap.daemon.config import installed_config_file, load_config
+    from shmmap.doctor.checks import diagnose, examine
+    from shmmap.doctor.verdicts import worst
+
+    file = args.config or installed_config_file()
+    flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}
+    if flags["endpoint"]:
+        with contextlib.suppress(NoSocket):
+            flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
+    findings = diagnose(examine(load_config(flags, file=file), file))
+    if args.json:
+        from shmmap.cli.verbs.look import outputs
+
+        print_json(outputs.Diagnosis(worst(findings), findings))
+    else:
+        _print_findings(findings)
+    return 1 if worst(findings) == "fail" else 0
+
+
+def _print_findings(findings: list[Finding]) -> None:
+    width = max(len(one.name) for one in findings)
+    for one in findings:
+        state = "skip" if one.skipped else one.state
+        print_hanging(f"{state.ljust(4)}  {one.name.ljust(width)}  ", one.fact)
+        if one.advice:
+            print_hanging(f"{' ' * (width + 6)}  -> ", one.advice)

@@ -1,21 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap status``: one screen about the daemon, read from its statistics segment."""
+"""``shmmap status`` and ``shmmap clients``: one screen about the daemon, and who is connected to it."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
-from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
+from shmmap.cli.options import Subparsers, add_daemon_options, add_statistics_options, add_verb
 from shmmap.cli.screens.output import (
+    Column,
     counted,
     format_bytes,
     format_duration,
     format_metres,
+    print_hanging,
     print_json,
+    print_line,
     print_pairs,
+    print_table,
+    user_name,
 )
 from shmmap.cli.screens.status_parts import (
     prefetch_words,
@@ -27,33 +33,34 @@ from shmmap.doctor.verdicts import cache_verdict, outage_so_far
 from shmmap.errors import DaemonUnreachable
 
 if TYPE_CHECKING:
+    from shmmap.protocol.rows import ClientRow
     from shmmap.statistics.identity import DaemonIdentity
     from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["add_parser", "run"]
+__all__ = ["add_clients", "add_status", "run_clients", "run_status"]
 
-_EXIT = """\
+_STATUS_EXIT = """\
 Exit code: 0, or 69 when the daemon is dead or was never started."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_status(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
         subparsers,
         "status",
-        run,
+        run_status,
         help="state of the daemon: memory, clients, requests, cache size",
         description="Show the state of the daemon: memory, clients, requests, loads, live maps, whether the "
         "cache is large enough, and what was fetched ahead for moving clients.  Reads its statistics in "
         "shared memory: works while the daemon is paused (SIGSTOP, a debugger) or hangs; not after "
         "`shmmap stop`.",
         output="look.outputs.Status",
-        epilog=_EXIT,
+        epilog=_STATUS_EXIT,
     )
     add_statistics_options(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_status(args: argparse.Namespace) -> int:
     """Print the state of the daemon."""
     from shmmap.cli.daemon_address import snapshot
 
@@ -64,11 +71,11 @@ def run(args: argparse.Namespace) -> int:
         print_json(Status.of(found, identity))
     else:
         uptime_s = max(time.time() - identity.started_unix_ns * 1e-9, 0.0)
-        print_pairs(_lines(found, identity, uptime_s))
+        print_pairs(_status_lines(found, identity, uptime_s))
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 
 
-def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[tuple[str, str]]:
+def _status_lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[tuple[str, str]]:
     count = found.counters
     used = count["bytes_resident"] + count["bytes_zombie"] + count["bytes_reserved"]
     budget = count["budget_bytes"]
@@ -148,3 +155,85 @@ def _lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[t
         )
         lines.append(("quota", f"{over} (--session-quota)"))
     return lines
+
+
+_CLIENTS_EXIT = """\
+Exit code: 0, or 69 when no daemon answers."""
+
+_CLIENT_COLUMNS = (
+    Column("CLIENT"),
+    Column("PID", "right"),
+    Column("USER", spare=2),
+    Column("CELLS", "right"),
+    Column("GIVEN", "right"),
+    Column("MAPPED", "right"),
+    Column("OUTDATED", "right", spare=1),
+    Column("REQUESTS", "right", spare=4),
+    Column("IDLE", "right", spare=5),
+    Column("AT", spare=3),
+    Column("COMMAND", spare=6),
+)
+
+
+_CLIENTS_LEGEND = """\
+CELLS, GIVEN: cells it was given and has not returned, and their memory
+MAPPED: mapped now, according to the kernel
+OUTDATED: the part of MAPPED that is stale (a newer version exists) or retired (out of service; freed when \
+the last client releases it)"""
+
+
+def add_clients(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "clients",
+        run_clients,
+        help="connected clients, and the memory each uses",
+        description="List connected clients, and memory mapped by unidentified processes.\n"
+        + _CLIENTS_LEGEND
+        + "\n"
+        "IDLE: time since its last request.  AT: where it said it is, metres, map frame.",
+        output="look.outputs.Clients",
+        epilog=_CLIENTS_EXIT,
+    )
+    add_daemon_options(parser)
+
+
+def run_clients(args: argparse.Namespace) -> int:
+    """Print the table."""
+    from shmmap.cli.daemon_address import connect
+
+    with connect(args) as client:
+        stats = client.stats()
+    if args.json:
+        from shmmap.cli.json_output import Client
+        from shmmap.cli.verbs.look import outputs
+
+        rows = [Client.of(row, time.monotonic_ns(), mapped=True) for row in stats.sessions]
+        print_json(outputs.Clients(rows, stats.unknown_holders, stats.unknown_bytes))
+        return 0
+    print_table(_CLIENT_COLUMNS, [_client_row(row) for row in stats.sessions])
+    if stats.unknown_holders:
+        unknown = f"{stats.unknown_holders:,} segments, {format_bytes(stats.unknown_bytes)}"
+        print_line(f"{unknown}: mapped by unidentified processes (not through the client library)")
+    if sys.stdout.isatty():
+        for line in _CLIENTS_LEGEND.splitlines():
+            names, meaning = line.split(": ", 1)
+            print_hanging(f"{names}: ", meaning)
+    return 0
+
+
+def _client_row(row: ClientRow) -> list[str]:
+    return [
+        row.client or "-",
+        str(row.pid or "?"),
+        user_name(row.uid),
+        f"{row.cells:,}",
+        format_bytes(row.bytes),
+        format_bytes(row.mapped_bytes),
+        format_bytes(row.superseded_bytes) if row.superseded else "-",
+        f"{row.requests:,}",
+        format_duration(row.idle_s(time.monotonic_ns())),
+        "-" if row.pose is None else f"{row.pose[0]:.1f},{row.pose[1]:.1f}",
+        row.command,
+    ]

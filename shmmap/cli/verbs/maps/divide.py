@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap divide IN... OUT``: clouds of any size into a divided map."""
+"""``shmmap divide`` and ``shmmap merge``: clouds of any size into a divided map, and back into one cloud."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shmmap.cli.options import Subparsers, add_json_option, add_unit_options, add_verb, numbers, size_bytes
 from shmmap.cli.program import complain
+from shmmap.cli.screens.output import counted, format_bytes
 from shmmap.cli.screens.work_progress import fields_text, print_result
 
 if TYPE_CHECKING:
     from shmmap.dividing.frame import Translation
+    from shmmap.dividing.merge import MergedCloud
     from shmmap.origin.map_report import DividedMap
 
-__all__ = ["add_parser", "metres", "run", "translation"]
+__all__ = ["add_divide", "add_merge", "metres", "run_divide", "run_merge", "translation"]
 
-_EPILOG = """\
+_DIVIDE_EPILOG = """\
 IN is a file (.pcd in every encoding, .las .laz .copc.laz, .ply .pts .xyz .xyzn .xyzrgb, or a table of
 numbers: .txt .csv .asc) or a directory of files, tables left out; all together become one map.  Files may
 be larger than memory.
@@ -27,16 +29,16 @@ Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no
 73 OUT cannot be written, 75 another run is making OUT."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_divide(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
         subparsers,
         "divide",
-        run,
+        run_divide,
         help="divide clouds into a map of square cells",
         description="Divide clouds of any size into a map of square cells that `serve` and Autoware read.",
         output="maps.outputs.divided_kind",
-        epilog=_EPILOG,
+        epilog=_DIVIDE_EPILOG,
     )
     parser.add_argument("inputs", metavar="IN", nargs="+", help="clouds, or directories of clouds")
     parser.add_argument("out", metavar="OUT", help="the map directory to make")
@@ -111,7 +113,7 @@ def add_parser(subparsers: Subparsers) -> None:
     add_json_option(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run_divide(args: argparse.Namespace) -> int:
     """Divide, and say what came out."""
     import time
 
@@ -143,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
         complain("shmmap", "interrupted", "the same command with --resume continues")
         raise
     seconds = time.monotonic() - began_s
-    print_result(made, _lines(made), seconds=seconds, as_json=args.json)
+    print_result(made, _divided_lines(made), seconds=seconds, as_json=args.json)
     return 0
 
 
@@ -172,7 +174,7 @@ def translation(text: str) -> Translation:
     return x, y, z
 
 
-def _lines(made: DividedMap) -> list[tuple[str, str]]:
+def _divided_lines(made: DividedMap) -> list[tuple[str, str]]:
     left_out = f", {made.dropped:,} not finite" if made.dropped else ""
     lines = [
         ("map", made.path),
@@ -185,3 +187,77 @@ def _lines(made: DividedMap) -> list[tuple[str, str]]:
     if made.resumed_points:
         lines.append(("resumed", f"after {made.resumed_points:,} points"))
     return [*lines, *(("note", note) for note in made.notes)]
+
+
+_MERGE_EPILOG = """\
+IN is a divided map, a directory of clouds or a cloud of any format that is read.  Points that `divide`
+shifted return to where they were, in float64.  Files are merged in the order of their paths.
+Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no point in the inputs, 66 no such input,
+73 OUT cannot be written."""
+
+
+def add_merge(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "merge",
+        run_merge,
+        help="merge a divided map, or clouds, into one PCD file",
+        description="Merge divided maps and clouds of any size into one PCD file: the inverse of `divide`.",
+        output="maps.outputs.merged_kind",
+        epilog=_MERGE_EPILOG,
+    )
+    parser.add_argument("inputs", metavar="IN", nargs="+", help="divided maps, directories, clouds")
+    parser.add_argument("out", metavar="OUT", help="the PCD file to make")
+    parser.add_argument(
+        "--encoding",
+        choices=("binary", "ascii"),
+        default="binary",
+        help="encoding of the PCD file (default: binary)",
+    )
+    parser.add_argument(
+        "--keep-frame",
+        action="store_true",
+        help="keep points where the map has them, also if `divide` shifted them",
+    )
+    parser.add_argument(
+        "--common-fields", action="store_true", help="keep only the fields that all inputs have"
+    )
+    parser.add_argument("--force", action="store_true", help="replace a file that exists")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_json_option(parser)
+
+
+def run_merge(args: argparse.Namespace) -> int:
+    """Merge, and say what came out."""
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.dividing.merge import merge
+
+    began_s = time.monotonic()
+    made = merge(
+        args.inputs,
+        args.out,
+        encoding=args.encoding,
+        keep_frame=args.keep_frame,
+        common_fields=args.common_fields,
+        force=args.force,
+        progress=StageProgress(quiet=args.quiet),
+    )
+    seconds = time.monotonic() - began_s
+    print_result(made, _merged_lines(made), seconds=seconds, as_json=args.json)
+    return 0
+
+
+def _merged_lines(made: MergedCloud) -> list[tuple[str, str]]:
+    notes = [
+        ("note", f"moved by ({', '.join(f'{v:.12g}' for v in origin)}) m, to the frame before {path}")
+        for path, origin in made.origin.items()
+    ]
+    return [
+        ("cloud", f"{made.path} ({format_bytes(made.bytes)})"),
+        ("points", f"{made.points:,} from {counted(made.files, 'file')}"),
+        ("fields", fields_text(made.fields)),
+        *notes,
+    ]

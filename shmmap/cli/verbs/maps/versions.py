@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap versions URL``: a published map's versions: going back to one, removing old ones; its keys."""
+"""``shmmap versions`` and ``shmmap fetch``: a published map's versions, and one of them as a divided map.
+
+``versions`` lists them, goes back to one, removes old ones, and renews keys.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from shmmap.cli.screens.output import (
     Column,
     counted,
     format_bytes,
+    format_duration,
     print_json,
     print_line,
     print_pairs,
@@ -32,9 +36,9 @@ if TYPE_CHECKING:
     from shmmap.prepare.run import PrepareProgress
     from shmmap.publishing.signing import MapSigner
 
-__all__ = ["add_parser", "run"]
+__all__ = ["add_fetch", "add_versions", "run_fetch", "run_versions"]
 
-_EPILOG = """\
+_VERSIONS_EPILOG = """\
 --rollback gives an old version's content a new number: vehicles never go back to a lower one.
 With a web server, versions that were never served cannot be listed.
 Exit code: 0, 2 wrong usage, 65 damaged or --trust refuses, 66 no such map or version, 69 a package is
@@ -42,17 +46,17 @@ missing, 75 the store does not answer or refuses, or another publisher was quick
 credentials or keys."""
 
 
-def add_parser(subparsers: Subparsers) -> None:
+def add_versions(subparsers: Subparsers) -> None:
     """Describe the verb."""
     parser = add_verb(
         subparsers,
         "versions",
-        run,
+        run_versions,
         help="list a published map's versions, go back to one, remove old ones",
         description="List the versions of a published map, go back to one, or remove old ones.",
         output="maps.outputs.Versions maps.outputs.RolledBack maps.outputs.Refreshed"
         " maps.outputs.rotated_kind maps.outputs.pruned_kind",
-        epilog=_EPILOG,
+        epilog=_VERSIONS_EPILOG,
     )
     parser.add_argument("url", metavar="URL", help=URL_HELP)
     what = parser.add_mutually_exclusive_group()
@@ -99,7 +103,7 @@ def _days(text: str) -> float:
     return days
 
 
-def run(args: argparse.Namespace) -> int:
+def run_versions(args: argparse.Namespace) -> int:
     """List, roll back, refresh, rotate or prune."""
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
@@ -269,3 +273,90 @@ def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
 
         until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(verified.expires_s))
         print_line(f"version {current.version} is signed, until {until}")
+
+
+_FETCH_EPILOG = """\
+Every object is compared with its hash.  DIR appears complete or not at all; a stopped run, started again,
+fetches only what is missing.  What a daemon of the same user keeps on this disk is not fetched.
+Exit code: 0, 2 wrong usage or DIR exists, 65 an object is damaged, or --trust refuses, 66 no such map or
+version, or an object is gone, 69 a package is missing, 73 DIR cannot be written, 75 the store does not
+answer or refuses, or another run is making DIR, 78 unusable credentials."""
+
+
+def add_fetch(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "fetch",
+        run_fetch,
+        help="write a published map as a divided map",
+        description="Write a published map as a divided map, which `serve` and Autoware read.",
+        output="maps.outputs.Fetched",
+        epilog=_FETCH_EPILOG,
+    )
+    parser.add_argument("url", metavar="URL", help=URL_HELP)
+    parser.add_argument("out", metavar="DIR", help="the map directory to make")
+    parser.add_argument("--at", metavar="N", type=at_least(1), help="version N instead of the current one")
+    parser.add_argument("--force", action="store_true", help="replace a divided map that exists")
+    parser.add_argument("--cache-dir", metavar="DIR", default="", help="where a daemon keeps what it fetched")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_trust_option(parser)
+    add_store_options(parser)
+    add_json_option(parser)
+
+
+def run_fetch(args: argparse.Namespace) -> int:
+    """Fetch, with progress on stderr."""
+    import os
+    import time
+
+    from shmmap.cli.screens.work_progress import StageProgress
+    from shmmap.errors import BadRequest
+    from shmmap.origin.catalogue_bytes import default_cache_directory
+
+    if args.trust is not None and args.at is not None:
+        raise BadRequest("--at does not go with --trust: only the current version is signed")
+    store = store_at(args.url, args)
+    from shmmap.origin.remote.object_tier import ObjectTier
+    from shmmap.publishing.fetch import fetch_map
+
+    began_s = time.monotonic()
+    verified = verified_at(store, args)
+    progress = StageProgress(quiet=args.quiet or args.json, unit="cells", scale=1.0)
+    cache_dir = os.path.abspath(args.cache_dir or default_cache_directory())
+    made = fetch_map(
+        store,
+        args.out,
+        version=args.at,
+        current=verified.current if verified is not None else None,
+        force=args.force,
+        tier=ObjectTier(cache_dir, limit_bytes=0),
+        progress=progress,
+    )
+    seconds = time.monotonic() - began_s
+    if args.json:
+        from shmmap.cli.verbs.maps import outputs
+
+        print_json(
+            outputs.Fetched(
+                store.url,
+                made.path,
+                made.version,
+                f"{made.map_version:016x}",
+                made.cells,
+                made.points,
+                made.fetched_cells,
+                made.fetched_bytes,
+                seconds,
+            )
+        )
+        return 0
+    print_pairs(
+        [
+            ("map", f"{made.path}, {counted(made.cells, 'cell')}, {made.points:,} points"),
+            ("version", f"{made.version} of {store.url}"),
+            ("fetched", f"{counted(made.fetched_cells, 'cell')}, {format_bytes(made.fetched_bytes)}"),
+            ("time", format_duration(seconds)),
+        ]
+    )
+    return 0

@@ -11,7 +11,6 @@ import gc
 import os
 import resource
 import select
-import signal
 import socket
 import sys
 import time
@@ -30,8 +29,7 @@ from shmmap.daemon.live.worker.opening import OpeningMap
 from shmmap.daemon.live.worker.served_map import ServedMap
 from shmmap.errors import BadRequest, ConfigError, InstanceBusy, InternalError, LiveInterrupted, ShmmapError
 from shmmap.logfmt import log, set_up_logging
-from shmmap.processes.end_with_parent import die_with
-from shmmap.processes.start_child import packet_buffer, receive_packet
+from shmmap.processes.start_child import channel_to_parent, packet_buffer, receive_packet
 from shmmap.protocol.codec import decode_request, encode, request_number
 from shmmap.protocol.live import LIVE_REQUESTS, LiveList, LiveListed, LiveMapRow
 from shmmap.protocol.messages import ErrorReply
@@ -290,10 +288,8 @@ def _limits(settings: LiveSettings, budget_bytes: int, maps: int) -> Limits:
 
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID``; the first packet names the maps."""
-    die_with(int(arguments[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the daemon's to handle
     set_up_logging()
-    with socket.socket(fileno=int(arguments[0])) as channel, contextlib.suppress(ConnectionError):
+    with channel_to_parent(arguments) as channel, contextlib.suppress(ConnectionError):
         data, _ = receive_packet(channel, packet_buffer())
         if not data:
             return 0  # the daemon did not start after all
