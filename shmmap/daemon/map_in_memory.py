@@ -11,7 +11,7 @@ import dataclasses
 import os
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -178,6 +178,8 @@ class MapInMemory:
         gid: int,
         early: Early | None = None,
         origin: FetchedFrom | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.directory = directory
         epoch = secrets.randbits(63) | 1
@@ -274,15 +276,15 @@ class MapInMemory:
                 self.map_switch,
                 pool,
                 self.waiting,
-                clock=time.monotonic,
+                clock=clock,
                 prefetch_share=config.prefetch_share,
                 outage_tolerance_s=config.outage_tolerance_s,
             )
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
-            self.adoption.take_over(time.monotonic())
+            self.adoption.take_over(clock())
             events = self.cache.events
             events.flush()
-            self.scheduler.room.watch(self.watched, time.monotonic)
+            self.scheduler.room.watch(self.watched, clock)
             undo.pop_all()
 
     def close(self, *, keep: bool) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -63,16 +63,16 @@ class World:
         self.workers: list[socket.socket] = []
         self.watched = WatchedDescriptors()
         self.buffer = packet_buffer()
+        self.wait: Callable[[float], None] = self.pass_time
         monkeypatch.setattr(relay, "start_child", self._start)
         monkeypatch.setattr(relay, "time", SimpleNamespace(monotonic=lambda: self.now_s))
-        self.statistics: list[tuple[str, int]] = []
-        shown = SimpleNamespace(
-            set=lambda name, value: self.statistics.append((name, value)),
-            show_live_maps=lambda _rows: None,
-            beat=lambda: None,
-        )
+        shown = SimpleNamespace(set=lambda *_: None, show_live_maps=lambda _: None, beat=lambda: None)
         events = LiveEvents(EventLog(1), cast("StatisticsWriter", shown))
         self.relay = LiveRelay(BEGIN, self.watched, lambda peer, _now_s: peer.pid != 2, events)
+        monkeypatch.setattr(self.relay, "_wait", lambda seconds: self.wait(seconds))
+
+    def pass_time(self, seconds: float) -> None:
+        self.now_s += seconds
 
     def _start(self, *_: object, **__: object) -> tuple[Any, socket.socket]:
         ours, theirs = channel()
@@ -240,15 +240,8 @@ def test_settings_refuse_the_start_where_there_is_nothing_else_to_serve(
         starting.relay.wait_until_serving(60.0, alone=True)
 
 
-def test_a_worker_that_says_nothing_keeps_no_client_waiting(
-    starting: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_says_nothing_keeps_nobody_waiting(starting: World) -> None:
     """Points are served; each map is shown with the problem, and clients are asked to come again."""
-
-    def wait(seconds: float) -> None:
-        starting.now_s += seconds
-
-    monkeypatch.setattr(starting.relay, "_wait", wait)
     starting.relay.start()
     starting.relay.wait_until_serving(2.0, alone=False)
     asker = Asker(1)
@@ -295,13 +288,8 @@ def test_the_end(world: World, caplog: pytest.LogCaptureFixture, unsaved: int) -
     world.relay.close(keep=False)
 
 
-def test_a_worker_that_does_not_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_does_not_end(world: World) -> None:
     """It is ended; what it had not saved by its last word counts as not saved."""
-
-    def wait(seconds: float) -> None:
-        world.now_s += seconds
-
-    monkeypatch.setattr(world.relay, "_wait", wait)
     row = msgspec.structs.replace(messages.not_served(BEGIN.maps[0], 1, ""), dirty=4, saving=1)
     world.say(messages.Status((row,)))
     world.relay.close(keep=False)
@@ -309,9 +297,7 @@ def test_a_worker_that_does_not_end(world: World, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("started", [False, True], ids=["none", "starting"])
-def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(
-    world: World, monkeypatch: pytest.MonkeyPatch, started: bool
-) -> None:
+def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(world: World, started: bool) -> None:
     world.die()
     if started:
         world.relay.start()
@@ -324,7 +310,7 @@ def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(
             assert received == [messages.End(False)]
             world.workers[-1].send(messages.encode(messages.Ended(())))
 
-    monkeypatch.setattr(world.relay, "_wait", wait)
+    world.wait = wait
     world.relay.close(keep=False)
     assert len(world.workers) == 2
     assert world.relay.unsaved == {}
@@ -332,16 +318,16 @@ def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(
 
 @pytest.mark.parametrize("dies", [False, True], ids=["hangs", "dies"])
 def test_memory_stays_where_no_worker_starts_to_save_it(
-    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, dies: bool
+    world: World, caplog: pytest.LogCaptureFixture, dies: bool
 ) -> None:
     world.die()
 
     def wait(seconds: float) -> None:
         if dies:
             world.workers[-1].close()
-        world.now_s += seconds
+        world.pass_time(seconds)
 
-    monkeypatch.setattr(world.relay, "_wait", wait)
+    world.wait = wait
     begin_s = world.now_s
     world.relay.close(keep=False)
     assert len(world.workers) == 2
@@ -356,17 +342,15 @@ def test_memory_that_is_kept_needs_no_worker(world: World) -> None:
 
 
 def test_a_turn_of_the_loop_takes_a_bounded_number_of_messages(world: World) -> None:
-    """However much the worker sends, clients are served in between."""
-    worker = world.workers[0]
-    for number in range(relay.MESSAGES_PER_TURN + 3):
-        worker.send(messages.encode(messages.Reply(10_000 + number, b"")))
-    taken: list[object] = []
-    take = world.relay._take
-    world.relay._take = lambda message: (taken.append(message), take(message))[1]  # type: ignore[method-assign,func-returns-value]
-    world.relay.on_readable()
-    assert len(taken) == relay.MESSAGES_PER_TURN
-    world.relay.on_readable()
-    assert len(taken) == relay.MESSAGES_PER_TURN + 3
+    """Whatever the worker has to say, clients are heard in between."""
+    askers = [Asker(slot) for slot in range(1, relay.MESSAGES_PER_TURN + 4)]
+    for asker in askers:
+        world.ask(asker)
+    for asked in world.heard():
+        world.workers[0].send(messages.encode(messages.Reply(asked.ticket, b"x")))
+    for most in (relay.MESSAGES_PER_TURN, len(askers)):
+        world.relay.on_readable()
+        assert sum(len(asker.answered) for asker in askers) == most
 
 
 def test_very_many_that_wait_are_refused_some_at_a_time(world: World) -> None:

@@ -132,20 +132,7 @@ def test_points_pass_layers_that_no_loader_can_take() -> None:
     assert queue.next() is layer
 
 
-def test_wanted_by_two_it_counts_once() -> None:
-    queue = LoadQueue()
-    shared, own = load(), load()
-    queue.push(shared, 9.0, "a")
-    queue.push(own, 1.0, "b")
-    queue.push(shared, 0.0, "b")
-    assert len(queue) == 2
-    assert {start(queue), start(queue)} == {shared, own}
-    assert start(queue) is None
-    queue.push(shared, 1.0, "a")  # its worker died: again
-    assert start(queue) is shared
-
-
-def test_what_no_client_waits_for_comes_last() -> None:
+def test_what_nobody_waits_for_comes_last() -> None:
     queue = LoadQueue()
     check, asked = load(0), load()
     queue.push(check, float("inf"), None)
