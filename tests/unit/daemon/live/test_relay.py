@@ -342,11 +342,11 @@ def test_memory_that_is_kept_needs_no_worker(world: World) -> None:
 
 
 def test_a_turn_of_the_loop_takes_a_bounded_number_of_messages(world: World) -> None:
-    """Whatever the worker has to say, clients are heard in between."""
+    """Whatever the worker has to say, clients are served in between."""
     askers = [Asker(slot) for slot in range(1, relay.MESSAGES_PER_TURN + 4)]
     for asker in askers:
         world.ask(asker)
-    for asked in world.heard():
+    for asked in world.received():
         world.workers[0].send(messages.encode(messages.Reply(asked.ticket, b"x")))
     for most in (relay.MESSAGES_PER_TURN, len(askers)):
         world.relay.on_readable()
