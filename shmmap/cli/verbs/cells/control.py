@@ -82,7 +82,8 @@ def run_reload(args: argparse.Namespace) -> int:
 _NAMED: Final = 20
 """Kept segments that are named one by one."""
 
-_EVICT
+_CELLS_EXIT = """\
+Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 
 def add_evict(subparsers: Subparsers) -> None:
@@ -180,9 +181,6 @@ def run_stop(args: argparse.Namespace) -> int:
         print_line(f"daemon {pid} is stopping")
     return 0
 
-
-_EXIT = """\
-Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 _PIN_COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("MEMORY", "right"))
 
