@@ -167,7 +167,7 @@ def run(config: DaemonConfig) -> int:
         check_file_size_limit(ledger.budget_bytes)
         del catalogue  # a reload replaces it
         live = _live_maps(config, memory, gid)
-        stack.push(partial(_close_live, live, signals))
+        stack.push(partial(_close, live, signals))
         reloader = Reloader(origin, lambda: memory.cache.catalogue)
         service = Service(
             config,
@@ -248,9 +248,14 @@ def _refuse_taken(path: str, activated: ActivatedSocket | None) -> None:
     refuse_taken(events_path(path))
 
 
-def _close(memory: MapInMemory, signals: StartSignals, kind: type[BaseException] | None, *_: object) -> None:
-    """Leave the segments to the next run, too, if a defect ended this one: it is like a crash."""
-    memory.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
+def _close(
+    closed: MapInMemory | LiveRelay | NoLiveMaps,
+    signals: StartSignals,
+    kind: type[BaseException] | None,
+    *_: object,
+) -> None:
+    """Leave memory to the next run, too, if a defect ended this one: it is like a crash."""
+    closed.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
 
 
 def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay | NoLiveMaps:
@@ -277,12 +282,6 @@ def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay
         relay.close(keep=True)
         raise
     return relay
-
-
-def _close_live(
-    live: LiveRelay | NoLiveMaps, signals: StartSignals, kind: type[BaseException] | None, *_: object
-) -> None:
-    live.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
 
 
 def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap reload``, ``evict`` and ``stop``: read the map again, free memory, end the daemon."""
+"""``shmmap reload``, ``evict``, ``pin``, ``unpin`` and ``stop``: what operators alone may ask of a daemon."""
 
 from __future__ import annotations
 
@@ -7,14 +7,28 @@ import argparse
 from typing import TYPE_CHECKING, Final
 
 from shmmap.cli.areas import act_on_cells, add_cells_argument
-from shmmap.cli.options import Subparsers, add_daemon_options, add_verb
+from shmmap.cli.options import Subparsers, add_daemon_options, add_layer_option, add_verb, layers_from
 from shmmap.cli.program import add_allow_empty
-from shmmap.cli.screens.output import counted, print_json, print_line
+from shmmap.cli.screens.output import Column, counted, format_bytes, print_json, print_line, print_table
 
 if TYPE_CHECKING:
-    from shmmap.client.client import Client
+    from collections.abc import Callable
 
-__all__ = ["add_evict", "add_reload", "add_stop", "run_evict", "run_reload", "run_stop"]
+    from shmmap.client.client import Client
+    from shmmap.protocol.messages import Pinned
+
+__all__ = [
+    "add_evict",
+    "add_pin",
+    "add_reload",
+    "add_stop",
+    "add_unpin",
+    "run_evict",
+    "run_pin",
+    "run_reload",
+    "run_stop",
+    "run_unpin",
+]
 
 
 _RELOAD_EXIT = """\
@@ -68,7 +82,7 @@ def run_reload(args: argparse.Namespace) -> int:
 _NAMED: Final = 20
 """Kept segments that are named one by one."""
 
-_EVICT_EXIT = """\
+_CELLS_EXIT = """\
 Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 
@@ -82,7 +96,7 @@ def add_evict(subparsers: Subparsers) -> None:
         description="Retire cells from shared memory: no client gets them any more, and their memory is "
         "freed as soon as no process maps it.  The next request loads them again.",
         output="cells.outputs.Eviction",
-        epilog=_EVICT_EXIT,
+        epilog=_CELLS_EXIT,
     )
     add_cells_argument(parser)
     parser.add_argument("--all", action="store_true", help="every cell")
@@ -166,3 +180,78 @@ def run_stop(args: argparse.Namespace) -> int:
     else:
         print_line(f"daemon {pid} is stopping")
     return 0
+
+
+_PIN_COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("MEMORY", "right"))
+
+
+def add_pin(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "pin",
+        run_pin,
+        help="keep cells in memory",
+        description="Load cells and keep them in shared memory until `shmmap unpin` or until the daemon "
+        "ends, whatever else needs memory.  Without cells: list what is pinned.",
+        output="cells.outputs.Pins",
+        epilog=_CELLS_EXIT,
+    )
+    add_cells_argument(parser)
+    add_layer_option(parser, "layers to keep (default: points)")
+    add_allow_empty(parser)
+    add_daemon_options(parser)
+
+
+def run_pin(args: argparse.Namespace) -> int:
+    """Pin, and print the pinned cells."""
+    layers = layers_from(args)
+    return _change_pins(args, "pin", lambda client, cells: client.pin(cells or (), layers), optional=True)
+
+
+def _change_pins(
+    args: argparse.Namespace,
+    verb: str,
+    ask: Callable[[Client, list[str] | None], Pinned],
+    *,
+    optional: bool = False,
+) -> int:
+    """Change what is pinned, and print what is pinned then; returns the exit code."""
+    from shmmap.protocol.messages import Pinned
+
+    def show(answer: Pinned) -> None:
+        if args.json:
+            from shmmap.cli.verbs.cells import outputs
+
+            rows = [outputs.Pin(cell.id, cell.layer, cell.state, cell.bytes) for cell in answer.cells]
+            print_json(outputs.Pins(rows, list(answer.unknown)))
+        elif answer.cells:
+            table = [[cell.id, cell.layer, cell.state, format_bytes(cell.bytes)] for cell in answer.cells]
+            print_table(_PIN_COLUMNS, table)
+        elif not answer.unknown:
+            print_line("nothing is pinned")
+
+    return act_on_cells(args, verb, ask, show, nothing=Pinned(0, ()), optional=optional)
+
+
+def add_unpin(subparsers: Subparsers) -> None:
+    """Describe the verb."""
+    parser = add_verb(
+        subparsers,
+        "unpin",
+        run_unpin,
+        help="undo pin",
+        description="Pinned cells become ordinary ones: they stay in memory until it is needed for others.  "
+        "Prints what stays pinned.",
+        output="cells.outputs.Pins",
+        epilog=_CELLS_EXIT,
+    )
+    add_cells_argument(parser)
+    parser.add_argument("--all", action="store_true", help="every pinned cell")
+    add_allow_empty(parser)
+    add_daemon_options(parser)
+
+
+def run_unpin(args: argparse.Namespace) -> int:
+    """End pins, and print what stays pinned."""
+    return _change_pins(args, "unpin", lambda client, cells: client.unpin(cells))
