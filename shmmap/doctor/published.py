@@ -83,7 +83,7 @@ def check_credentials(patient: Patient) -> Finding:
 
 
 def _hidden(patient: Patient) -> str:
-    """What cannot be seen of the daemon's own credentials; empty if nothing."""
+    """Return a note if the daemon's own credentials cannot be seen, else an empty text."""
     if not patient.alive or patient.environment is not None:
         return ""
     account = account_name(patient.runs_as)
