@@ -41,7 +41,7 @@ _unkept: list[str] = []
 
 
 def kernel_directory() -> Path | None:
-    """Directory of compiled kernels, made if missing; None, and said once, where none can be used."""
+    """Return the directory of compiled kernels, made if missing; None, logged once, if none can be used."""
     try:
         path = _place()
         with contextlib.suppress(FileExistsError):

@@ -99,7 +99,7 @@ class ChunkKey(NamedTuple):
         return low[0], low[1], low[2], high[0], high[1], high[2]
 
     def distance(self, other: ChunkKey) -> int:
-        """Chunks between two, counted along the longest axis: 1 for each of a chunk's 26 neighbours."""
+        """Return the distance to another chunk along the longest axis: 1 for each of the 26 neighbours."""
         return max(abs(a - b) for a, b in zip(self, other, strict=True))
 
 

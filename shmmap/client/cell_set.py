@@ -208,8 +208,8 @@ def cell_error(failure: FailedCell, cell_id: str) -> CellError:
 class HeldCells:
     """Held cells in wire form.
 
-    Attached cells are sent as 8 bytes of version each (``packed``), unless the daemon may not know what a
-    version means any more (``by_name``); others by name.
+    An attached cell is sent as its version, 8 bytes (``packed``).  Other cells are sent by name.  All of
+    them are (``by_name``) if the daemon may have forgotten which cell a version belongs to.
 
     Attributes
     ----------

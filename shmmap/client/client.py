@@ -198,8 +198,8 @@ class Client:
     ) -> CellSet:
         """Cells that touch an area, in id order.
 
-        An answer that lacks something, cells that failed or are still being loaded after ``wait``, or where
-        the map has no cell, is said as a `ShmmapWarning`.
+        A `ShmmapWarning` says what the answer lacks: cells that failed, cells that are still being loaded
+        after ``wait``, or any cell at all.
 
         Parameters
         ----------

@@ -78,7 +78,7 @@ class Running(Protocol):
 
 
 running: Final[set[Running]] = set()
-"""Each thread enters and leaves by itself."""
+"""What runs in threads at present; each thread adds and removes its own."""
 
 
 def enter(one: Running) -> None:

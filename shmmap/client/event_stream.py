@@ -211,7 +211,7 @@ class EventStream:
             self._ready.append(event)
 
     def _miss(self, last: int) -> None:
-        """Report that what is missing up to this number is lost: its epoch has ended."""
+        """Report the missing events up to this number as lost: the daemon run that had them is over."""
         if last >= self._expected:
             self._ready.append(MissedEvents(self.epoch, self._expected, last))
             self._expected = last + 1

@@ -89,7 +89,7 @@ def check_credentials(diagnosis: Diagnosis) -> Finding:
 
 
 def _hidden(diagnosis: Diagnosis) -> str:
-    """Say what cannot be seen of the daemon's own credentials; empty if nothing."""
+    """Return a note if the daemon's own credentials cannot be seen, else an empty text."""
     if not diagnosis.alive or diagnosis.environment is not None:
         return ""
     account = account_name(diagnosis.runs_as)

@@ -86,7 +86,7 @@ def flush_directory(path: str | os.PathLike[str]) -> None:
 
 @contextlib.contextmanager
 def writing_errors(what: str) -> Iterator[None]:
-    """Turn what the operating system refuses into `CannotWrite`, with a hint; ``what`` was to be written."""
+    """Turn an OSError into `CannotWrite`, with a hint; ``what`` is the thing to be written."""
     try:
         yield
     except ShmmapError:

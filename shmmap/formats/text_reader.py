@@ -38,7 +38,7 @@ _UNIT: Final = re.compile(r"[\[(].*")
 _NORMALS: Final = ("nx", "ny", "nz")
 _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
-"""What columns after x, y and z are, by their number, as PTS has them."""
+"""Names of the columns after x, y and z, by how many there are, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
 _LOOKED_AT: Final = 32  # rows
 _SHOWN: Final = 60

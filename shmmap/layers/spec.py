@@ -123,7 +123,7 @@ class LayerSpec:
 
     @property
     def halo_m(self) -> float:
-        """How far beyond the cell it looks, metres; that of what it is built of included."""
+        """How far beyond the cell the layer looks, metres, the layers that it is built from included."""
         return self.kind.halo_m(self.parameters) + (self.of.halo_m if self.of is not None else 0.0)
 
     @property

@@ -62,7 +62,7 @@ class Cells(Protocol):
         """64-bit version of a cell."""
 
     def ready(self, index: int, layer: str) -> ReadyLayer | None:
-        """Return what is known of a layer that the origin has ready made; None: it is computed here."""
+        """Return what is known of a layer that the origin has computed; None: it is computed here."""
 
     def box(self, index: int) -> tuple[float, float, float, float]:
         """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""

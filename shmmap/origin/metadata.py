@@ -150,7 +150,7 @@ class EntryCollector:
         self._oddities.setdefault(what, []).append(shortened(key.decode("utf-8", "replace")))
 
     def metadata(self) -> MapMetadata | None:
-        """Everything taken, or None while a resolution is missing.  A repeated key: the last one counts."""
+        """Return what was collected, None if a resolution is missing; of repeated keys the last counts."""
         if len(self.resolutions) < len(_RESOLUTIONS):
             return None
         self._flush()
@@ -297,7 +297,7 @@ def _collect_plain(block: bytes, entries: EntryCollector) -> bool:
 
 
 def _collect_each(block: bytes, entries: EntryCollector) -> bool:
-    """Take a block line by line: quotes, comments, floats, spaces, CRLF."""
+    """Read a block line by line, with quotes, comments, floats, spaces and CRLF; False if that fails."""
     position = 0
     while position < len(block):
         line = _LINE.match(block, position)  # here or nowhere: to search a long line takes time by its square

@@ -216,7 +216,7 @@ class SpatialIndex:
     boxes
         (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame, finite, min <= max.
     made
-        What was made of the same boxes before.
+        Search structure of the same boxes, if one exists already.
     """
 
     def __init__(self, boxes: Floats, made: MadeOfBoxes | None = None) -> None:

@@ -89,8 +89,8 @@ Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NA
 class Hello(msgspec.Struct, array_like=True, tag="hello"):
     """First message of a session.
 
-    ``session`` is the slot of the client's session with a previous run of the daemon, 0 for none: it
-    keeps it, so that the locks it holds still name it.
+    ``session`` is the number that the client's session had with a previous run of the daemon, 0 for none.
+    The session keeps this number, so that the locks that the client holds still name it.
     """
 
     request: int

@@ -69,7 +69,7 @@ class PlannedFile:
 
     @property
     def action(self) -> Literal["new", "changed", "same", "kept"]:
-        """What writing it means for what is there."""
+        """What an installation does to this file: create it, change it, or leave it as it is."""
         if not os.path.lexists(self.path):
             return "new"
         if self.keep:

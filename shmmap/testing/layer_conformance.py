@@ -53,12 +53,12 @@ MAY_BE_REFUSED = frozenset({"far_apart"})
 def check_layer(layer: str, cloud: str) -> LayerTable | None:
     """Build a layer of one of `CORNERS` and check everything that holds for every kind.
 
-    Returns the table; None where the builder refused the cloud, which it may only for ``far_apart``.
+    Return the table, or None if the builder refused the cloud.  It may refuse ``far_apart`` only.
 
     Raises
     ------
     InternalError
-        Naming the guarantee that the kind breaks.
+        The kind breaks a rule; the message names it.
     """
     spec = parse_layer(layer)
     _must(parse_layer(str(spec)) == spec, f"{layer} is not the same spec as its canonical form {spec}")

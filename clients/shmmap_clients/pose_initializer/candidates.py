@@ -122,7 +122,7 @@ class ParzenEstimator:
         return np.asarray(drawn[chosen], np.float64)
 
     def learn(self, candidates: NDArray[np.float64], scores: NDArray[np.float64]) -> None:
-        """Add what candidates were worth; more is better."""
+        """Add candidates and their scores; a greater score is better."""
         self._tried = np.concatenate([self._tried, candidates])
         self._scores = np.concatenate([self._scores, scores])
 

@@ -329,7 +329,7 @@ def _made(
     entries: Mapping[str, Entry],
     **others: Any,
 ) -> Any:
-    """Make a structure of the values; what it refuses is named as in the file, with the line."""
+    """Make a structure of the values; an error uses the file's name for the value, and its line."""
     given = {ours: values[name] for name, ours in names.items() if name in values}
     try:
         return kind(**given, **others)

@@ -167,7 +167,7 @@ _TURN_S: Final = 1.0
 """How long others wait for cells that one client's request has loaded."""
 _SLICE_CELLS: Final = 10_000
 _SLICE_BYTES: Final = 1 << 20
-"""Of one request to the daemon: it refuses those for more than 20 000 cells, or of more than 4 MiB."""
+"""Cells and bytes of one request to the daemon, which accepts at most 20 000 cells and 4 MiB."""
 _MOST_CELLS: Final = 100_000
 """Of one answer, repetitions included."""
 _NAMED: Final = 3
@@ -204,10 +204,10 @@ def touches(area: Any, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 class RecentCells:
-    """At most 64 MiB of cells that were answered with a moment ago.
+    """Cells of recent answers, at most 64 MiB.
 
-    Mapping a cell takes as long as sending it, and other clients ask for the same one.  Cells are kept until
-    there was no request for two seconds; then the daemon may evict them.
+    Mapping a cell takes as long as sending it, and other clients often ask for the same one.  After two
+    seconds without a request all are dropped, so that the daemon may evict them.
     """
 
     def __init__(self) -> None:

@@ -237,7 +237,7 @@ class GetPartialRequest(IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPa
 class GetPartialResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Response_"
 ):
-    """Those cells, in the order of their ids."""
+    """The cells that touch the area, in the order of their ids."""
 
     client: uint64
     number: int64
@@ -263,7 +263,7 @@ class GetDifferentialRequest(
 class GetDifferentialResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Response_"
 ):
-    """Those cells, and which ids the client may drop."""
+    """The cells that are new to the client, and the ids that it may drop."""
 
     client: uint64
     number: int64

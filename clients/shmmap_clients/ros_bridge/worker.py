@@ -128,7 +128,7 @@ class Worker(ABC):
 
     @abstractmethod
     def answer(self, message: Any, request: Request) -> Answer:
-        """Return a reply, and what to call when it was sent."""
+        """Return a reply, and a function to call once the reply has been sent."""
 
     @abstractmethod
     def empty(self, message: Any) -> Content:

@@ -56,9 +56,9 @@ class Column(NamedTuple):
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with everything that no terminal should be sent written as Python writes it.
+    """Return ``text`` with unprintable characters replaced by Python escapes, such as ``\\x1b``.
 
-    That is control and format characters, line breaks, and the bytes of a file's name that are no text.
+    These are control and format characters, line breaks, and bytes of a file name that are no text.
     """
     if text.isprintable():
         return text

@@ -267,9 +267,9 @@ class MapWindow:
     def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
         """Whether all that the map has within a circle is in the window, in all its layers.
 
-        False where the circle reaches beyond what was last answered, where it touches a cell that has
-        failed, while any cell of the window is being loaded, of which no older version is attached, and while
-        the daemon does not know all that the map has in the window.
+        It is False if the circle reaches beyond the last answer or touches a cell that has failed; while a
+        cell of the window is being loaded and has no older version attached; and while the daemon does not
+        know all cells in the window.
 
         Parameters
         ----------

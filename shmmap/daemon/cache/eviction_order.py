@@ -121,7 +121,7 @@ class Deferred:
             heapq.heappush(self._heap, (until_s, self._number, resident))
 
     def take(self, resident: Resident) -> bool:
-        """Remove a segment; whether it was there."""
+        """Remove a segment, and return whether it was there."""
         return self._until_s.pop(resident, None) is not None
 
     def first(self) -> tuple[float, Resident] | None:

@@ -120,7 +120,7 @@ MAX_EVENTS_PER_TURN: Final = 16
 """Clients looked at in one turn: many of them must not drive all else out of the log."""
 MAX_MISSED_CELLS: Final = 1 << 12
 MAX_WAITING_CLIENTS: Final = 1 << 8
-"""Cells that clients wait for, and clients that wait for one of them, that are remembered."""
+"""Most cells whose misses are remembered, and most clients remembered for each of them."""
 
 
 @dataclass(eq=False, slots=True)

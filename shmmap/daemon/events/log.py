@@ -160,7 +160,7 @@ class MinuteLog:
         self._due_s: dict[str, float] = {}
 
     def count(self, event: str, of: str, nbytes: int) -> None:
-        """Add one of an event, of a client or for a reason, and its bytes."""
+        """Count an event and its bytes; ``of`` is the client or the reason that the log line names."""
         self._counts.setdefault(event, Counter())[of] += 1
         self._bytes[event] += nbytes
 

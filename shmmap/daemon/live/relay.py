@@ -405,11 +405,11 @@ class LiveRelay:
 
     @property
     def next_s(self) -> float:
-        """Return when to refuse requests to a worker that ended: at once, some at a time."""
+        """When the next step is due: at once while requests to a worker that ended are left, else never."""
         return 0.0 if self._tickets.are_lost else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Refuse some of them."""
+        """Refuse some of the requests to a worker that ended."""
         del now_s
         self._tickets.refuse_some()
 

@@ -42,7 +42,7 @@ __all__ = [
 
 
 LOADS: Final = 64
-"""Loads from which their time is estimated."""
+"""Number of last loads from which the time of a load is estimated."""
 IN_A_ROW: Final = 4
 """Loads that fail one after the other before the origin, not single files, is taken to be the cause."""
 PROBE_S: Final = 0.5
@@ -161,7 +161,7 @@ class ClientPath:
 
     @property
     def pace_s(self) -> float:
-        """Seconds that the client takes for a metre at its greatest speed of late."""
+        """Seconds that the client takes for a metre at its greatest recent speed."""
         return 1.0 / max(self.motion.fastest_mps, SLOWEST_MPS)
 
     @property

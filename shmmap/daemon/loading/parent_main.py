@@ -156,9 +156,9 @@ def _send_last(end: socket.socket, message: worker_messages.Ended) -> None:
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID``.
 
-    The first packet has the settings, with zero bytes between them: the directory of segments, the memory
-    that a loader may take, bytes; directory and size of the disk cache, empty and 0 where there is none; of
-    a published map what `shmmap.origin.remote.opened_store.ServedFrom` says.
+    The first packet has the settings, separated by zero bytes: the directory of segments; the memory that a
+    loader may take, bytes; the disk cache's directory and size, empty and 0 without one; for a published map
+    also the fields of `shmmap.origin.remote.opened_store.ServedFrom`.
     """
     ours = channel_to_parent(arguments)
     signal.signal(signal.SIGIO, signal.SIG_IGN)

@@ -39,9 +39,9 @@ __all__ = ["AT_ONCE", "PublishedReader"]
 AT_ONCE: Final = 32
 """Objects that a loader fetches at once, as long as they are small."""
 MAX_BYTES: Final = 8 << 20
-"""Of larger ones fewer are fetched or held at once; always one."""
+"""Most bytes of objects that are fetched or held at once; a single object may be larger."""
 _STACK_BYTES: Final = 512 << 10
-"""Of a thread: what a loader may take of memory counts them whole."""
+"""Stack of a thread, small because the loader's limit of memory counts all of it."""
 
 
 @dataclass(eq=False, slots=True)

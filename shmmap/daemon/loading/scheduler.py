@@ -72,7 +72,7 @@ class MisplacedCells:
         self._to_check = deque(self._versions)
 
     def check_some(self, most: int) -> None:
-        """Forget those of some cells that are not what they were."""
+        """Check at most this many cells, and forget those that have changed or left the map."""
         for _ in range(min(most, len(self._to_check))):
             cell_id = self._to_check.popleft()
             index = self._cache.catalogue.find(cell_id)

@@ -374,7 +374,7 @@ class ShardPages:
         return PageNews(come, lost)
 
     def try_again(self) -> None:
-        """Have fetched again what could not be had."""
+        """Fetch again the pages that could not be fetched before."""
         lost, self._lost = self._lost, set()
         self.want(lost, 0.0)
         self._lost |= lost  # until they come

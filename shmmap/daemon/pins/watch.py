@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking the kernel who uses a segment, and having it report when a process closes one.
+"""Ask the kernel which processes use a segment, and have it report when a process closes one.
 
-A retired segment that is still mapped stays open here (our own descriptor is the one that the lease
-is asked for, so it does not count), and the kernel is asked to report when any process closes or
-unmaps it.  So nothing of ours ever looks like a close, and no timer has to look now and then.
+The daemon keeps a retired segment open while a client maps it.  The kernel reports when any process closes
+or unmaps it, so no timer has to look.  The daemon asks through the descriptor that it keeps open, which the
+kernel does not count: looking opens and closes nothing, and causes no report itself.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class _Answer:
     handles, pending
         Cells that `encode` has not encoded yet.
     failed
-        Still without the holders of memory.
+        Failed cells; who holds the memory is added later.
     """
 
     residents: list[Resident] = field(default_factory=list)

@@ -28,7 +28,7 @@ __all__ = ["WarmDifference", "difference", "warm_difference"]
 
 @dataclass(eq=False, slots=True)
 class WarmDifference:
-    """The difference where all of the area is in memory."""
+    """The difference for an area whose cells are all in memory."""
 
     residents: list[Resident]
     removed: tuple[str, ...]

@@ -62,9 +62,9 @@ class Paging:
             self.watched.watch(self._fd, self.collect, "map")
 
     def is_ready(self, new: CatalogueView, try_again: Callable[[], None]) -> bool:
-        """Whether another state of the map knows all that is known of the one that is served.
+        """Return whether a new state of the map has all pages that the served state has.
 
-        Else its pages are fetched, and ``try_again`` is called when some have come.
+        If not, fetch the missing pages, and call ``try_again`` when some have come.
         """
         self._stop_following_the_next()
         pages, served = new.pages, self.cache.pages

@@ -35,7 +35,7 @@ MAX_CELLS: Final = 200_000
 """Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
 OVERDUE_PER_TURN: Final = 256
 LARGE: Final = 1024
-"""Cells of a request for which a single step is worth a turn of its own, where it is done for all at once."""
+"""More cells than this make a request large: a step that handles all of them gets a turn of its own."""
 
 Awaited = TypeVar("Awaited")
 
@@ -346,7 +346,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def map_changed(self) -> None:
-        """Have what waits for pages found again: pages are others now."""
+        """Have requests that wait for pages find their cells again: the map has other pages now."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:

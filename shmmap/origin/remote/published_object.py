@@ -379,7 +379,7 @@ def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray
 
 
 def _mm_origin(unpacked: bytes | bytearray | memoryview) -> NDArray[np.float64] | None:
-    """Where the counts of points in millimetres begin; None where they are exact."""
+    """Return the origin from which points in millimetres count; None if points are exact."""
     (flags,) = _FLAGS.unpack_from(unpacked, FLAGS_AT)
     return np.array(_MM_ORIGIN.unpack_from(unpacked, MM_ORIGIN_AT)) if flags & MILLIMETRES else None
 
@@ -525,5 +525,5 @@ def unpack_source(source: Source) -> Mapping[str, LayerSource]:
 
 
 def stamp_of(source: Source) -> Stamp:
-    """Return the stamp of a cell, which its points' content says."""
+    """Return the stamp of a cell: the first bytes of its points' content digest."""
     return unpack_source(source)[POINTS].content[:STAMP_BYTES]

@@ -6,9 +6,9 @@ Importing this module compiles the kernels, or loads them from numba's cache (te
 Everything that the loop over points reads again and again is in local variables: a compiler that cannot know
 that a store does not change an array would load it again each time.  So that loop is one long function.
 
-What is computed once a pose (its rotation's derivatives, its sums' contraction, the next step) would be some
-hundred small operations an evaluation in Python, and their code is what has left the processor's caches by
-the time of the next scan.
+Work done once a pose (the rotation's derivatives, the sum of the points' parts, the next step) is compiled,
+too.  In Python it would be some hundred small operations, whose code has left the processor's caches by the
+time of the next scan.
 """
 
 from __future__ import annotations

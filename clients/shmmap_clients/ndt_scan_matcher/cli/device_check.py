@@ -99,7 +99,7 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """One comparison: what, in words; the largest difference of each kind; what was not within its bound."""
+    """One comparison: its name, the largest difference of each kind, and the bounds that were exceeded."""
 
     what: str
     equal: bool

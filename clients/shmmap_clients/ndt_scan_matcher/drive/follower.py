@@ -41,12 +41,12 @@ Relocalize = Callable[[NDArray[np.floating], NDArray[np.float64]], Result | None
 
 
 class Tracking:
-    """The state after each result.
+    """Judges after each result whether the vehicle is tracked, uncertain or lost.
 
     Parameters
     ----------
     lost_after
-        Number of results in a row that are not trusted after which it is lost; one without a map suffices.
+        Number of untrusted results in a row that make it lost; a single one without a map does so, too.
     lost
         Whether it is lost at the beginning.
     """

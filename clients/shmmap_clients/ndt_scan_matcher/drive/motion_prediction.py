@@ -118,7 +118,7 @@ class ConstantVelocity:
 class Odometry(ConstantVelocity):
     """The next motion is what the odometry says; beyond its last entry, constant velocity.
 
-    Where the odometry's times go back, another run of it begins: what lies between two runs is not known.
+    Where the odometry's times go back, a new run begins; the motion between two runs is not known.
 
     Parameters
     ----------

@@ -208,7 +208,7 @@ _COLUMN: Final = {
     "prefetch_miss": "miss",
     **dict.fromkeys(("live_started", "live_ended", "live_problem", "live_damaged"), "live"),
 }
-"""Kinds that have another name in the narrow column."""
+"""Shorter names of kinds of events, for the narrow column."""
 
 _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "epoch": _epoch,

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenCL devices of this machine: which there are, what they can do, which one is taken, how to wait for it.
 
-The loader of drivers reads files in /etc/OpenCL/vendors, each of which names a driver's library.  Containers
-with NVIDIA's driver often have the library without the file: then a folder with one is made for this process,
-with copies of those that are there.
+OpenCL finds drivers by files in /etc/OpenCL/vendors: each of them names a driver's library.  Containers with
+NVIDIA's driver often have the library, but not its file.  Then this process uses a folder of its own, with
+copies of all these files and one for NVIDIA's library.
 """
 
 from __future__ import annotations
@@ -339,5 +339,5 @@ def _ended(event: Any) -> bool:
 
 
 def _never_free(event: Any) -> None:
-    """Keep an event: to free one of a hung device is to wait for it, even when the process ends."""
+    """Keep an event for good: freeing it would wait for a hung device, even when the process ends."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))
