@@ -27,14 +27,7 @@ from shmmap.origin.remote.store import is_url
 from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
 from shmmap.quantities import counted
 
-__all__ = [
-    "check_group",
-    "check_map_access",
-    "check_socket",
-    "drop_ins",
-    "group_name",
-    "groups_of",
-]
+__all__ = ["check_group", "check_map_access", "check_socket", "drop_ins", "group_name", "groups_of"]
 
 ANSWER_S: Final = 2.0
 LOOKED_AT: Final = 256
