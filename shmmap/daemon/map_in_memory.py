@@ -11,7 +11,7 @@ import dataclasses
 import os
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -183,21 +183,7 @@ class MapInMemory:
     ) -> None:
         self.directory = directory
         epoch = secrets.randbits(63) | 1
-        self.identity = DaemonIdentity(
-            pid=os.getpid(),
-            start_time_ticks=start_time_ticks(os.getpid()),
-            pid_namespace=pid_namespace(),
-            epoch=epoch,
-            instance=config.instance,
-            endpoint=socket_path,
-            map_path=config.map_path,
-            map_version=catalogue.map_version,
-            shm_dir=directory.path,
-            id_prefix=catalogue.id_prefix,
-            library_version=__version__,
-            started_unix_ns=time.time_ns(),
-            frame_id=catalogue.frame_id,
-        )
+        self.identity = _identity(config, catalogue, directory.path, socket_path, epoch)
         group_limit = memory_limit_bytes()
         budget = choose_budget(  # may refuse: before anything has a name
             config.budget_bytes,
@@ -212,7 +198,7 @@ class MapInMemory:
             limit_bytes=group_limit,
         )
         ledger = Ledger(budget)
-        try:
+        with _first_write(directory):
             self.statistics = StatisticsWriter(
                 directory,
                 config.instance,
@@ -222,14 +208,6 @@ class MapInMemory:
                 starting=True,
                 reserve=ledger.add_overhead,
             )
-        except OSError as error:
-            said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
-            if is_full(error):
-                raise CannotStart(said, hint="free some, or enlarge it") from error
-            limit = limit_behind(error)
-            if limit is not None:
-                raise limit from error
-            raise ConfigError(said, key="shm_dir") from error
         with contextlib.ExitStack() as undo:
             undo.callback(self.statistics.close)  # its name must not stay when something else fails
             self.statistics.set("pin_source", list(PinSource).index(pins.source))
@@ -294,3 +272,38 @@ class MapInMemory:
         self.cache.close(keep=keep)
         self.statistics.close()
         self.watched.close()
+
+
+def _identity(
+    config: DaemonConfig, catalogue: CatalogueView, shm_dir: str, socket_path: str, epoch: int
+) -> DaemonIdentity:
+    return DaemonIdentity(
+        pid=os.getpid(),
+        start_time_ticks=start_time_ticks(os.getpid()),
+        pid_namespace=pid_namespace(),
+        epoch=epoch,
+        instance=config.instance,
+        endpoint=socket_path,
+        map_path=config.map_path,
+        map_version=catalogue.map_version,
+        shm_dir=shm_dir,
+        id_prefix=catalogue.id_prefix,
+        library_version=__version__,
+        started_unix_ns=time.time_ns(),
+        frame_id=catalogue.frame_id,
+    )
+
+
+@contextlib.contextmanager
+def _first_write(directory: ShmDirectory) -> Iterator[None]:
+    """Say in errors of the first write to a directory what is wrong with it."""
+    try:
+        yield
+    except OSError as error:
+        said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
+        if is_full(error):
+            raise CannotStart(said, hint="free some, or enlarge it") from error
+        limit = limit_behind(error)
+        if limit is not None:
+            raise limit from error
+        raise ConfigError(said, key="shm_dir") from error

@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
 
-__all__ = [
-    "CAUSES",
-    "FileReader",
-    "SourceFile",
-    "open_regular",
-    "refusal",
-]
+__all__ = ["CAUSES", "FileReader", "SourceFile", "open_regular", "refusal"]
 
 _Self = TypeVar("_Self", bound="FileReader")
 

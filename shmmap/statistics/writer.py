@@ -207,15 +207,7 @@ class StatisticsWriter:
         self._is_logged = False
         self._fd = directory.create()
         try:
-            # with the first rows, so that a small daemon never grows after it took its budget
-            start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
-            os.posix_fallocate(self._fd, 0, start)
-            os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * CELL_ROW_BYTES)
-            self._allocated = _GROWTH_ROWS
-            os.pwrite(self._fd, pack_header(self._layout), 0)
-            self.update_identity(identity)
-            self.map_changed()
-            self.beat()
+            self._write_first(identity)
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
             os.fchmod(self._fd, mode)
@@ -224,6 +216,20 @@ class StatisticsWriter:
         except BaseException:
             os.close(self._fd)
             raise
+
+    def _write_first(self, identity: DaemonIdentity) -> None:
+        """Fill the new file, with room for the first rows.
+
+        So a small daemon never grows after it took its budget.
+        """
+        start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
+        os.posix_fallocate(self._fd, 0, start)
+        os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * CELL_ROW_BYTES)
+        self._allocated = _GROWTH_ROWS
+        os.pwrite(self._fd, pack_header(self._layout), 0)
+        self.update_identity(identity)
+        self.map_changed()
+        self.beat()
 
     def set(self, name: str, value: int) -> None:
         """Set a gauge."""

@@ -56,7 +56,7 @@ class Column(NamedTuple):
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with unprintable characters replaced by Python escapes, such as ``\\x1b``.
+    r"""Return ``text`` with unprintable characters replaced by Python escapes, such as ``\x1b``.
 
     These are control and format characters, line breaks, and bytes of a file name that are no text.
     """

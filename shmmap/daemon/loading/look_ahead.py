@@ -30,15 +30,7 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Area
 
-__all__ = [
-    "PASS_S",
-    "URGENT_S",
-    "ClientPath",
-    "LookAhead",
-    "OriginHealth",
-    "Prefetch",
-    "Wish",
-]
+__all__ = ["PASS_S", "URGENT_S", "ClientPath", "LookAhead", "OriginHealth", "Prefetch", "Wish"]
 
 
 LOADS: Final = 64
