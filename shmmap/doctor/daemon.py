@@ -213,7 +213,7 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
 def check_pins(diagnosis: Diagnosis) -> Finding:
-    """Can the kernel tell which processes map a segment?"""
+    """Can the kernel report which processes map a segment?"""
     name = "leases"
     try:
         directory = ShmDirectory(diagnosis.shm_dir)
@@ -238,7 +238,7 @@ def check_pins(diagnosis: Diagnosis) -> Finding:
             f"they work, but not all of what goes with them: {lacking}",
             "clients may stay unnamed, or memory be freed late: use a newer kernel",
         )
-    return ok(name, "leases and locks work: the kernel tells which processes map a segment")
+    return ok(name, "leases and locks work: the kernel reports which processes map a segment")
 
 
 def check_descriptors(diagnosis: Diagnosis) -> Finding:

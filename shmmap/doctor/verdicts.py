@@ -47,7 +47,7 @@ class Finding:
     advice: str = ""
     """Empty where nothing has to be done."""
     skipped: bool = False
-    """It could not be looked at, and nothing is wrong with that; ``state`` is ``ok`` then."""
+    """Whether it could not be checked, and nothing is wrong with that; ``state`` is ``ok`` then."""
 
 
 def skip(name: str, fact: str) -> Finding:
@@ -193,7 +193,7 @@ def signature_times(counters: Mapping[str, int]) -> tuple[float, float]:
 
 
 def signature_expiry(counters: Mapping[str, int], now_s: float) -> str:
-    """That the signature has expired; empty if it has not.  The clock may be behind the signing time."""
+    """Describe an expired signature; empty before that.  The clock may be behind the signing time."""
     signed_s, until_s = signature_times(counters)
     if not until_s or until_s > max(now_s, signed_s):
         return ""

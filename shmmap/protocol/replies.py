@@ -94,7 +94,7 @@ class PendingCell(msgspec.Struct, array_like=True, frozen=True):
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix.
+    """A cell that could not be loaded; ``id`` as the client asked for it, else without the prefix.
 
     ``box`` says where it lies, ``min_x, min_y, max_x, max_y`` in metres; None where that is not known.
     """

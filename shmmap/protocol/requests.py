@@ -123,7 +123,7 @@ class Stats(msgspec.Struct, array_like=True, tag="stats"):
 
 
 class Show(msgspec.Struct, array_like=True, tag="show"):
-    """Everything about one cell: versions, segments, who holds them, last failure."""
+    """Everything about one cell: versions, segments, their holders, last failure."""
 
     request: int
     id: str

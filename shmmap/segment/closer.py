@@ -48,7 +48,7 @@ class Closer:
         return self._waiting >= MAX_WAITING
 
     def close(self, fd: int, nbytes: int) -> None:
-        """Have a descriptor closed whose segment takes ``nbytes``."""
+        """Close a descriptor, whose segment takes ``nbytes``, in the thread."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
             before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from shmmap import CellInfo, Client
 from shmmap_clients.ros_bridge.cdr import CdrWriter, Content
 
-__all__ = ["MOST_REQUESTERS", "Catalogue", "Requesters"]
+__all__ = ["MAX_REQUESTERS", "Catalogue", "Requesters"]
 
-MOST_REQUESTERS: Final = 256
+MAX_REQUESTERS: Final = 256
 """Clients that are remembered; beyond that, the one with the oldest request is forgotten."""
 
 
@@ -87,7 +87,7 @@ class Requesters:
         How many clients are remembered.
     """
 
-    def __init__(self, most: int = MOST_REQUESTERS) -> None:
+    def __init__(self, most: int = MAX_REQUESTERS) -> None:
         self._most = most
         self._versions: OrderedDict[str, dict[str, int]] = OrderedDict()
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from shmmap import AutowareSquare, Cell, CellSet, Client
 from shmmap_clients.ros_bridge.catalogue import Catalogue, Requesters
-from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
+from shmmap_clients.ros_bridge.cdr import MAX_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.messages import GetDifferentialRequest, GetPartialRequest
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
 from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge, no_followup
@@ -42,7 +42,7 @@ _TURN_S: Final = 1.0
 _SLICE_CELLS: Final = 10_000
 _SLICE_BYTES: Final = 1 << 20
 """Of one request to the daemon: it refuses those for more than 20 000 cells, or of more than 4 MiB."""
-_MOST_CELLS: Final = 100_000
+_MAX_CELLS: Final = 100_000
 """Of one answer, repetitions included."""
 _NAMED: Final = 3
 _REUSED_BYTES: Final = 16 << 20
@@ -225,8 +225,8 @@ class MapAnswers:
         return [one for one in ids if one in known]
 
     def _selected(self, ids: Sequence[str]) -> Sequence[Cell]:
-        if len(ids) > _MOST_CELLS:
-            raise TooLarge(f"{len(ids):,} cells in one request", hint=f"ask for at most {_MOST_CELLS:,}")
+        if len(ids) > _MAX_CELLS:
+            raise TooLarge(f"{len(ids):,} cells in one request", hint=f"ask for at most {_MAX_CELLS:,}")
         found: list[Cell] = []
         for some in _slices(ids):
             found += self._all(lambda wait, some=some: self._client.selected(some, wait=wait, strict=None))  # type: ignore[misc]
@@ -284,9 +284,9 @@ class MapAnswers:
             writer.text(cell.id)
             write_cloud(writer, columns, cell.origin, layout)
             writer.float32(*cell.box)
-            if writer.size > MOST_BYTES:  # repetitions of a large cell: thousands more would take long
+            if writer.size > MAX_BYTES:  # repetitions of a large cell: thousands more would take long
                 raise TooLarge(
-                    f"an answer of more than {MOST_BYTES} bytes", hint="ask for fewer cells at once"
+                    f"an answer of more than {MAX_BYTES} bytes", hint="ask for fewer cells at once"
                 )
 
 

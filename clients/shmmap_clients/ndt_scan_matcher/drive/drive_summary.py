@@ -93,7 +93,7 @@ class RunningErrors:
 
     @property
     def errors(self) -> TrajectoryErrors | None:
-        """Of the poses so far; None where there is none."""
+        """Errors of the poses so far; None where there is none."""
         if not self._ate_m.count:
             return None
         rte = {metres: running.spread.mean for metres, running in self._rte.items() if running.count}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap clients``: who is connected, and how much memory each uses."""
+"""``shmmap clients``: connected clients, and how much memory each uses."""
 
 from __future__ import annotations
 

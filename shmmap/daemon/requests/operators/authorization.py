@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may change what the daemon serves: reload, evict, pin, shut down.
+"""Permission to change what the daemon serves: reload, evict, pin, shut down.
 
 Judged by what the kernel says of the peer (`Peer`), never of anything a client says.  Root and the
 daemon's own user always may; so may members of the configured administrators' group.
@@ -22,7 +22,7 @@ MEMORY_S: Final = 10.0
 
 
 class Authorization:
-    """Decides who may administer the daemon.
+    """Decides which users may administer the daemon.
 
     Parameters
     ----------
