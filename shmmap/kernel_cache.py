@@ -172,7 +172,7 @@ def _opened(directory: Path) -> Iterator[int]:
 
 def _read(directory: Path, name: str) -> bytes:
     with _opened(directory) as parent:
-        # nothing to wait for, if it is a pipe; no way out, if it is a link
+        # a pipe is not waited for; a link is not followed
         fd = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
     try:
         status = os.fstat(fd)

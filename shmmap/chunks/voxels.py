@@ -93,7 +93,7 @@ class ChunkKey(NamedTuple):
         return self.x << CHUNK_SHIFT, self.y << CHUNK_SHIFT, self.z << CHUNK_SHIFT
 
     def box(self, resolution: float) -> tuple[float, float, float, float, float, float]:
-        """Its (min_x, min_y, min_z, max_x, max_y, max_z), metres."""
+        """Return the bounds (min_x, min_y, min_z, max_x, max_y, max_z), metres."""
         low = [part * CHUNK_SIDE * resolution for part in self]
         high = [(part + 1) * CHUNK_SIDE * resolution for part in self]
         return low[0], low[1], low[2], high[0], high[1], high[2]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["connect", "endpoint", "has_lost_socket", "instance", "locate", "shm_dir", "snapshot"]
 
 ASKED_S: Final = 2.0
-"""How long a verb waits that wants to know who has a socket."""
+"""How long a verb waits to find out which process has a socket."""
 ANSWER_S: Final = 5.0
 """How long a verb waits for a daemon that is there, to connect and for each answer."""
 
@@ -192,7 +192,7 @@ def _instances(directory: str) -> list[str]:
 
 
 def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
-    """Connect to the daemon, and give up sooner than programs do: who types a verb waits for it.
+    """Connect to the daemon, and give up sooner than programs do: a person waits for the verb.
 
     Parameters
     ----------

@@ -200,7 +200,7 @@ def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, nam
 
 
 def keep_interrupts() -> None:
-    """Have ends that Python ignores (`KeyboardInterrupt`, `SystemExit`) signalled again, in this process.
+    """Signal again, in this process, the ends that Python ignores (`KeyboardInterrupt`, `SystemExit`).
 
     In a weak reference's callback or a finalizer Python prints "Exception ignored in", and goes on: of those
     sent while modules are imported, one in ten (https://github.com/python/cpython/issues/95959).

@@ -38,7 +38,7 @@ class CellSet(Sequence[Cell]):
     cells : tuple of Cell
         Attached cells; of a differential request only the new and changed ones.
     failed : tuple of CellError
-        Cells that cannot be had; the others are good all the same.
+        Cells that cannot be loaded; the others are good all the same.
     pending : tuple of PendingLayer
         Cells still being loaded when the wait was over: ask again.
     removed : tuple of str

@@ -101,7 +101,7 @@ class Session:
         return self._connection.lost_since if self._connection is not None else None
 
     def notify_when_lost(self, queue: SimpleQueue[Any]) -> None:
-        """From now on put a None into a queue when the connection breaks."""
+        """Put a None into a queue from now on when the connection breaks."""
         self._waiting.append(queue)
 
     def stop_notifying(self, queue: SimpleQueue[Any]) -> None:

@@ -229,9 +229,9 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
 
 
 def _fetched_from(origin: PublishedOrigin) -> FetchedFrom:
-    from shmmap.daemon.loading.published_reader import AT_ONCE
+    from shmmap.daemon.loading.published_reader import CONCURRENT_FETCHES
 
-    return FetchedFrom(origin.served.words(), AT_ONCE)
+    return FetchedFrom(origin.served.words(), CONCURRENT_FETCHES)
 
 
 def _end_threads(origin: PublishedOrigin) -> None:

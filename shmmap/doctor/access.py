@@ -280,7 +280,9 @@ def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
         sorted(f"domain {one['domain']}: {counted(one['clients'], 'client')}" for one in bridges)
     )
     unanswered = Counter(
-        (str(one.get("service")), str(one.get("vendor", ""))) for each in bridges for one in each["strangers"]
+        (str(one.get("service")), str(one.get("vendor", "")))
+        for each in bridges
+        for one in each["incompatible"]
     )
     if not unanswered:
         return ok(name, places)
@@ -291,7 +293,7 @@ def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
     more = "; …" if len(unanswered) > _NAMED else ""
     return warn(
         name,
-        f"{places}; not nodes of rmw_cyclonedds_cpp, so that they wait for ever: {named}{more}",
+        f"{places}; not nodes of rmw_cyclonedds_cpp, so that they never get an answer: {named}{more}",
         _BRIDGE_ADVICE,
     )
 
@@ -319,6 +321,10 @@ def _read_status(diagnosis: Diagnosis, path: str) -> dict[str, Any] | None:
             status = json.loads(os.pread(fd, _MAX_BYTES, 0))
         finally:
             os.close(fd)
-        strangers = [one for one in status["strangers"] if isinstance(one, dict)]
-        return {"domain": int(status["domain"]), "clients": int(status["clients"]), "strangers": strangers}
+        incompatible = [one for one in status["incompatible"] if isinstance(one, dict)]
+        return {
+            "domain": int(status["domain"]),
+            "clients": int(status["clients"]),
+            "incompatible": incompatible,
+        }
     return None

@@ -238,7 +238,7 @@ def check_pins(diagnosis: Diagnosis) -> Finding:
             f"they work, but not all of what goes with them: {lacking}",
             "clients may stay unnamed, or memory be freed late: use a newer kernel",
         )
-    return ok(name, "leases and locks work: the kernel tells which processes map a segment")
+    return ok(name, "leases and locks work: the kernel reports which processes map a segment")
 
 
 def check_descriptors(diagnosis: Diagnosis) -> Finding:

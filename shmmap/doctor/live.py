@@ -78,7 +78,7 @@ def check_live_maps(diagnosis: Diagnosis) -> Finding:
         return warn(
             name,
             f"damaged files, missing chunks: {damaged:,}{named}",
-            "damaged files were put aside; stop the daemon, then `shmmap live fsck` says what is left",
+            "damaged files are in quarantine; stop the daemon, then `shmmap live fsck` says what is left",
         )
     if restarts := diagnosis.counters.get("live_restarts", 0):
         return warn(
@@ -235,7 +235,7 @@ def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:
     try:
         status = os.stat(diagnosis.machine.path(marks), follow_symlinks=False)
     except FileNotFoundError:
-        return f"{marks} is gone: nobody can map"
+        return f"{marks} is gone: no process can map"
     except OSError as error:
         return f"{marks}: {error.strerror}"
     group = diagnosis.config.live_group

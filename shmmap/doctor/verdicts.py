@@ -47,7 +47,7 @@ class Finding:
     advice: str = ""
     """Empty where nothing has to be done."""
     skipped: bool = False
-    """It could not be looked at, and nothing is wrong with that; ``state`` is ``ok`` then."""
+    """Whether it could not be checked, and nothing is wrong with that; ``state`` is ``ok`` then."""
 
 
 def skip(name: str, fact: str) -> Finding:

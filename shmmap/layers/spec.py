@@ -280,7 +280,7 @@ def _checked(kind: LayerKind, given: dict[str, Value], of: LayerSpec | None) -> 
     return LayerSpec(kind, ordered, of)
 
 
-@lru_cache(maxsize=1024)  # a request's specs are a few texts, read again and again
+@lru_cache(maxsize=1024)  # requests have few specs, and repeat them
 def canonical_layer(spec: str) -> str:
     """Return the canonical form of a layer spec; errors are those of `parse_layer`."""
     return str(parse_layer(spec))

@@ -26,7 +26,7 @@ __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 MAX_NEIGHBOURS: Final = 64
 """Most files that a layer with a halo reads beside its own."""
 MAX_REMEMBERED: Final = 1 << 18
-"""Versions, about 100 bytes each; requests for ever new layers must not fill the daemon's memory."""
+"""Versions, about 100 bytes each; requests for always new layers must not fill the daemon's memory."""
 
 
 _SLACK_M: Final = 1e-3
@@ -38,7 +38,7 @@ class ReadyLayer(Protocol):
 
     @property
     def version(self) -> int:
-        """Its version."""
+        """The version."""
 
 
 class Cells(Protocol):

@@ -20,14 +20,14 @@ _BLOCK_CELLS: Final = 1 << 15
 
 
 class CellIds(Protocol):
-    """Cells whose ids can be had by index."""
+    """Cells whose ids are found by index."""
 
     def ids(self, indices: Indices) -> list[str]:
         """Ids of several cells, in the order given."""
 
 
 class Tables(CellIds, Protocol):
-    """What is compared of two catalogues; each as `Catalogue` has it."""
+    """What is compared of two catalogues; each as in `Catalogue`."""
 
     @property
     def id_prefix(self) -> str:

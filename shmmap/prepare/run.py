@@ -89,7 +89,7 @@ def prepare_map(
     workers: int,
     progress: PrepareProgress,
 ) -> Prepared:
-    """Have layers of every cell of a map in the disk cache.
+    """Bring layers of every cell of a map into the disk cache.
 
     Parameters
     ----------

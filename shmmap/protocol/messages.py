@@ -168,7 +168,7 @@ class Stats(msgspec.Struct, array_like=True, tag="stats"):
 
 
 class Show(msgspec.Struct, array_like=True, tag="show"):
-    """Everything about one cell: versions, segments, who holds them, last failure."""
+    """Everything about one cell: versions, segments, their holders, last failure."""
 
     request: int
     id: str
@@ -296,7 +296,7 @@ class PendingCell(msgspec.Struct, array_like=True, frozen=True):
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix.
+    """A cell that could not be loaded; ``id`` as the client asked for it, else without the prefix.
 
     ``box`` says where it lies, ``min_x, min_y, max_x, max_y`` in metres; None where that is not known.
     """

@@ -33,7 +33,7 @@ from shmmap.origin.remote.store import Store
 __all__ = ["FetchedMap", "fetch_map"]
 
 _CELLS: Final = "pointcloud_map.pcd"
-_FETCHED_AT_ONCE: Final = 16
+_CONCURRENT_FETCHES: Final = 16
 _SAME_M: Final = 1e-6
 
 
@@ -153,7 +153,7 @@ class _Fetch:
         names: list[str] = []
         progress.stage("fetch", self._root.cells)
         os.makedirs(self._cells_dir, exist_ok=True)
-        with ThreadPoolExecutor(_FETCHED_AT_ONCE, "fetch") as pool:
+        with ThreadPoolExecutor(_CONCURRENT_FETCHES, "fetch") as pool:
             for shard in read_shards(self._pages, self._root):
                 boxes.append(shard.boxes)
                 names += (name.decode() for name in shard.names)

@@ -185,7 +185,7 @@ def no_memory_left(nbytes: int | None = None) -> LimitReached:
     limits = ", ".join(_memory_limits()) or "no limit is set"
     what = "more private memory is" if nbytes is None else f"{nbytes} bytes of private memory are"
     return LimitReached(
-        f"{what} not to be had ({limits})", hint="raise the limit: ulimit -d and -v, or free memory"
+        f"{what} cannot be allocated ({limits})", hint="raise the limit: ulimit -d and -v, or free memory"
     )
 
 

@@ -108,7 +108,7 @@ class _RowTable(Generic[_Row]):
         self._rows: list[_Row | None] = []
 
     def show(self, rows: Sequence[_Row]) -> None:
-        """Have these rows in the table, the first of them if there is no room for all."""
+        """Bring these rows into the table, the first of them if there is no room for all."""
         count = min(len(rows), self._room_for(min(len(rows), self._most)))
         self._rows += [None] * (count - len(self._rows))
         self.used = 0
@@ -136,7 +136,7 @@ class StatisticsWriter:
     directory, instance
         Where the segment goes, in place of what a dead predecessor left.
     identity
-        Who writes.
+        The daemon that writes.
     mode, gid
         Access of the segment; ``gid`` -1 leaves the group alone.
     starting
@@ -258,7 +258,7 @@ class StatisticsWriter:
             self.values[name] = duration_ns
 
     def map_changed(self) -> None:
-        """Have clients see at once that the map has other cells, or a cell another version, than before.
+        """Show clients at once that the map has other cells, or a cell another version, than before.
 
         Call it before any reply or event shows the change.
         """
@@ -409,7 +409,7 @@ class StatisticsWriter:
         return True
 
     def _allocate(self, start: int, nbytes: int) -> bool:
-        """Have memory where nothing is yet, if the budget and the file system allow."""
+        """Allocate memory where there is none yet, if the budget and the file system allow."""
         if not self._reserve(nbytes):
             return False
         try:

@@ -133,7 +133,7 @@ class DaemonProcess:
             directory.mkdir()
         self.environment = {
             **without_settings(),
-            # compiled kernels are everybody's: they cost seconds, and depend on their source alone
+            # compiled kernels are shared by all: they cost seconds, and depend on their source alone
             "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR") or _kernels_dir(),
             "TMPDIR": str(self._temporary_dir),
             "XDG_CACHE_HOME": str(self.cache_dir),

@@ -226,14 +226,14 @@ def test_incompatible_peers_are_logged_once_and_named_by_doctor(
     with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, env=bridge_environment()) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "matched\n"
-        bridge.wait_status(strangers=[{"service": NAMES["partial"], "vendor": "Fast DDS"}])
+        bridge.wait_status(incompatible=[{"service": NAMES["partial"], "vendor": "Fast DDS"}])
         found = finding()
         assert found["state"] == "warn"
         assert f"1 client of {NAMES['partial']}, of Fast DDS" in found["fact"]
         assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp" in found["advice"]
         assert len(asked(peer, "partial", area=(0, 0, 5)).cells) == 4
         other.communicate()
-    bridge.wait_status(strangers=[])
+    bridge.wait_status(incompatible=[])
     assert bridge.log.count("is no node of rmw_cyclonedds_cpp") == 1
     assert finding()["state"] == "ok"
     bridge.kill()

@@ -168,7 +168,7 @@ void print_statistics(const std::string& instance, const std::string& shm_dir) {
 }
 
 void print(const shmmap::Happening& happening) {
-  if (const auto* missed = std::get_if<shmmap::Missed>(&happening)) {
+  if (const auto* missed = std::get_if<shmmap::MissedEvents>(&happening)) {
     std::cout << "missed\t" << missed->epoch << "\t" << missed->first << "\t" << missed->last << "\n";
     return;
   }

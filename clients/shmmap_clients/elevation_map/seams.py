@@ -66,7 +66,7 @@ class Columns:
 
     @classmethod
     def joined(cls, parts: Sequence[Columns]) -> Columns:
-        """One after the other; there must be one."""
+        """Return these columns, one after the other; there must be one."""
         return cls(
             np.concatenate([part.i for part in parts]),
             np.concatenate([part.j for part in parts]),

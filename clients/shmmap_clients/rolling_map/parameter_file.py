@@ -22,7 +22,7 @@ Value: TypeAlias = bool | float | str | None
 
 _ROS: Final = "ros__parameters"
 _DEEPEST: Final = 16
-_MOST_BYTES: Final = 1 << 20  # a parameter file has a few hundred
+_MAX_BYTES: Final = 1 << 20  # a parameter file has a few hundred
 _TRUE: Final = frozenset({"true", "yes", "on", "y"})
 _FALSE: Final = frozenset({"false", "no", "off", "n"})
 
@@ -58,12 +58,12 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Entry]:
     name = os.fspath(path)
     try:
         with Path(name).open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
+            data = file.read(_MAX_BYTES + 1)
     except FileNotFoundError:
         raise MapMissing(f"there is no file {name}") from None
     except OSError as error:
         raise ConfigError(f"{name}: {error.strerror}", origin=name) from error
-    if len(data) > _MOST_BYTES:
+    if len(data) > _MAX_BYTES:
         raise ConfigError(f"{name}: larger than a parameter file ever is", origin=name)
     try:
         text = data.decode("utf-8")

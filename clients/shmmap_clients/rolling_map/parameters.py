@@ -227,7 +227,7 @@ class Parameters(msgspec.Struct, frozen=True):
         )
 
     def check_map(self, live: LiveMap) -> None:
-        """Refuse a live map that is not as the file has it; what the file leaves out may be anything.
+        """Refuse a live map that differs from the file; what the file leaves out may be anything.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class Parameters(msgspec.Struct, frozen=True):
                     f"{origin}: {key} is {value}, but the live map {live.name} has {has[key]}",
                     key=key,
                     origin=origin,
-                    hint="`shmmap-rolling config` says how the daemon makes a map as the file has it",
+                    hint="`shmmap-rolling config` says how the daemon makes a map as in the file",
                 )
 
 

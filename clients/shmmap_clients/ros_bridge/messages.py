@@ -289,7 +289,7 @@ class GetSelectedRequest(
 class GetSelectedResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Response_"
 ):
-    """Those cells, in the order asked for."""
+    """The cells, in the order asked for."""
 
     client: uint64
     number: int64
@@ -342,7 +342,7 @@ class GetOccupiedRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupie
 @dataclass
 @sample
 class GetOccupiedResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Response_"):
-    """Those voxels; the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
+    """The voxels; the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
 
     client: uint64
     number: int64
@@ -367,7 +367,7 @@ class GetFreeRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_
 @dataclass
 @sample
 class GetFreeResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Response_"):
-    """Those voxels, as in `GetOccupiedResponse`."""
+    """The voxels, as in `GetOccupiedResponse`."""
 
     client: uint64
     number: int64

@@ -212,7 +212,7 @@ class ListParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::List
 @dataclass
 @sample
 class ListParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Response_"):
-    """Their names and prefixes."""
+    """The names and prefixes."""
 
     client: uint64
     number: int64

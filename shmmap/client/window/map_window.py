@@ -229,7 +229,7 @@ class MapWindow:
     def wait_until_current(self, timeout: float) -> bool:
         """Wait until the window answers the latest pose and nothing is being loaded.
 
-        Cells that cannot be had (see `WindowUpdate.failed`) do not hold it up, except those that wait for
+        Cells that cannot be loaded (see `WindowUpdate.failed`) do not hold it up, except those that wait for
         memory, or for an origin that cannot be reached.
 
         Returns

@@ -238,7 +238,7 @@ class EvictionOrder:
         return [entry.resident for entry in front]
 
     @property
-    def settled(self) -> bool:
+    def all_scored(self) -> bool:
         """Whether all have been scored."""
         return not self.new
 

@@ -231,7 +231,7 @@ class CellEvents:
     # --- after clients have been answered -----------------------------------------------------------
 
     def emit(self, report: Callable[..., None], *what: Any) -> None:
-        """Have something reported once no client waits for the loop, in order; see `flush`."""
+        """Report something, in order, once no client waits for the loop; see `flush`."""
         self._pending.append((report, what))
 
     @property

@@ -5,7 +5,7 @@ The area that a client asks for is moved along its path, a step at a time: cells
 are needed when the client is there.  The path is the route that the client sent; without one, and beyond its
 end, straight ahead and, a little later, to both sides of that, because it is unknown where the client turns;
 the longer it has come straight ahead, the farther.  What it will ask for along a kilometre is not kept: the
-path is looked over again and again (a *pass*), and what is not in memory is wished for.  So a wish is never
+path is looked over repeatedly (a *pass*), and what is not in memory is wished for.  So a wish is never
 out of date, whatever moves, changes or is evicted meanwhile.
 
 `Prefetcher` asks for a wish when no demand waits for a loader (`Prefetch.next`), and reports how loads ended.

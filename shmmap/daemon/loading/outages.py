@@ -41,7 +41,7 @@ class OriginWatch:
     Parameters
     ----------
     try_again
-        Fetches what of the list of cells could not be had.
+        Fetches what is missing of the list of cells.
     reload
         Called when there is another version of the map.
     """

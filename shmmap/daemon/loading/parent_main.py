@@ -36,7 +36,7 @@ __all__ = ["main"]
 
 MAX_SETTINGS_BYTES: Final = 1 << 14
 _OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
-_MOST_NICE: Final = 19
+_MAX_NICE: Final = 19
 
 
 def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
@@ -54,7 +54,7 @@ def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
 
 def _compile() -> int:
     """Compile the kernels of layers, unless another daemon is at it; returns the exit code."""
-    os.nice(_MOST_NICE)
+    os.nice(_MAX_NICE)
     from shmmap.layers.build import compile_kernels
 
     with contextlib.suppress(MemoryError):

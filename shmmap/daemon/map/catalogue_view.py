@@ -47,7 +47,7 @@ class Ready(NamedTuple):
 
 
 class PageNews(NamedTuple):
-    """What became of pages that were wanted: ``come`` are here, ``out_of_reach`` cannot be had at present."""
+    """News of wanted pages: ``come`` are here, ``out_of_reach`` cannot be fetched at present."""
 
     come: Sequence[int]
     out_of_reach: Sequence[int]
@@ -90,13 +90,13 @@ class Pages(Protocol):
         """Whether the page's cells are known."""
 
     def is_out_of_reach(self, page: int) -> bool:
-        """Whether it could not be had when it was last tried: no request waits for it.
+        """Whether it could not be fetched when it was last tried: no request waits for it.
 
         It is tried again by itself, after a while; when it comes, that is news like any other.
         """
 
     def want(self, pages: Iterable[int], priority: float) -> None:
-        """Have pages fetched, those with the lowest ``priority`` first, as loads have it.
+        """Fetch pages, those with the lowest ``priority`` first, as loads have it.
 
         That is metres from a client that asks, `shmmap.daemon.loading.loads.PREFETCH` and seconds for what
         one will ask for.  A page that is wanted already only moves forward; one that is here counts as just
@@ -131,7 +131,7 @@ class CatalogueView(Protocol):
 
     @property
     def pages(self) -> Pages | None:
-        """Its pages; None where all cells are known from the beginning."""
+        """The map's pages; None where all cells are known from the beginning."""
 
     @property
     def complete(self) -> bool:

@@ -36,7 +36,7 @@ from shmmap.protocol.messages import FailedCell, Holder, PendingCell
 __all__ = ["CellRequests"]
 
 MAX_WAIT_S: Final = 3600.0
-MAX_AT_ONCE: Final = 4096
+MAX_COMPARED: Final = 4096
 """Cells of an area that are compared with what a client holds in one turn, if all are in memory."""
 MAX_LOOKED_AT: Final = 20_000
 """Cells of requests that are looked through before a page of the map is given up."""
@@ -166,7 +166,7 @@ class CellRequests:
         cells, covered = catalogue.query(area, limits.MAX_CELLS)
         looks_around = catalogue.pages is not None and versions.halo_m(layers) > 0.0
         is_one = len(layers) == 1 and area.z is None
-        if is_one and covered and not looks_around and len(cells) <= MAX_AT_ONCE:
+        if is_one and covered and not looks_around and len(cells) <= MAX_COMPARED:
             warm = warm_difference(self._cache, message, cells, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
                 _note_area(session, area, layers)
@@ -264,7 +264,7 @@ class CellRequests:
                 return (yield from do())
 
     def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
-        """Have loaded what is cold of what was found; whether the request waits for that, or for more."""
+        """Load what is cold of what was found; whether the request waits for that, or for more."""
         now_s = self._now_s()
         may_wait = bool(wait_s) and self._waiting.has_room(wanted)
         yield from self._have_loaded(wanted, note=may_wait)
@@ -323,7 +323,7 @@ class CellRequests:
                 self._waiting.need(wanted, self._cache.key(index, layer))
 
     def _wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Let a request wait for its pages, without those that have settled since it was found."""
+        """Let a request wait for its pages, without those that are finished since it was found."""
         found, pages = wanted.found, self._cache.pages
         if pages is not None and found.pages:
             come = {page for page in found.pages if pages.is_here(page)}
@@ -508,8 +508,8 @@ class CellRequests:
 
     # --- what happens meanwhile -----------------------------------------------------------------
 
-    def pages_settled(self, news: PageNews) -> None:
-        """Follow pages of the map that have come, or cannot be had at present."""
+    def pages_finished(self, news: PageNews) -> None:
+        """Follow pages of the map that have come, or cannot be fetched at present."""
         for page in news.come:
             self._waiting.page_finished(page)
         for page in news.out_of_reach:

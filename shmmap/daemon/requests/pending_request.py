@@ -331,7 +331,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def page_finished(self, page: int, reason: str = "") -> None:
-        """Note for the requests that wait for a page that it has come, or why it cannot be had."""
+        """Note for the requests that wait for a page that it has come, or why it cannot be fetched."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:
@@ -374,7 +374,7 @@ class WaitingList:
             self.do_later(steps())
 
     def do_later(self, steps: Iterator[None]) -> None:
-        """Have steps done in `tidy` that no client waits for."""
+        """Leave steps that no client waits for to `tidy`."""
         self._leftovers.append(steps)
 
     def tidy(self) -> Iterator[PendingRequest]:

@@ -58,7 +58,7 @@ SAMPLE_S: Final = 1.0
 
 
 class RecentCounts:
-    """The values of some counters, remembered once a second: how much they grew of late.
+    """The values of some counters, remembered once a second: how much they grew recently.
 
     Parameters
     ----------

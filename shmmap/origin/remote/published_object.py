@@ -496,7 +496,7 @@ def _spread() -> tuple[NDArray[np.uint64], ...]:
 
 
 class LayerSource(NamedTuple):
-    """The object of a layer, as `ObjectName` has it, and the version of what has built it."""
+    """The object of a layer, as in `ObjectName`, and the version of what has built it."""
 
     sha256: bytes
     size: int

@@ -131,7 +131,7 @@ def test_repeats_and_poses_in_a_batch_have_the_same_bits(
     # so few rows that a batch takes several launches
     there = ready("opencl", map_of(points, 2.0), scan, options=options)
     assert isinstance(there, OpenclBackend)
-    there._most_rows = 40
+    there._max_rows = 40
     how = Scoring("radius", "autoware")
     poses = NEAR + np.random.default_rng(4).normal(0.0, 0.3, (17, 6)) * [1, 1, 0.2, 0.05, 0.05, 0.3]
     batch = there.evaluate(poses, how)

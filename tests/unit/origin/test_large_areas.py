@@ -25,7 +25,7 @@ def small_parts() -> Iterator[None]:
     """Few cells are very many here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spatial_index, "_LINEAR_CELLS", 0)
-        patch.setattr(spatial_index, "_AT_ONCE", AT_ONCE)
+        patch.setattr(spatial_index, "_CELLS_PER_BATCH", AT_ONCE)
         patch.setattr(spatial_index, "_FEW_ROWS", 2)
         yield
 

@@ -120,7 +120,7 @@ class Backend(Protocol):
     def fault(self) -> DeviceError | None:
         """Why another backend than the one that was asked for computes; None if it does not."""
 
-    most_map_bytes: int
+    max_map_bytes: int
     """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
 
     @property

@@ -3,7 +3,7 @@
 
 Importing this module compiles the kernels, or loads them from numba's cache (tenths of a second).
 
-Everything that the loop over points reads again and again is in local variables: a compiler that cannot know
+Everything that the loop over points reads repeatedly is in local variables: a compiler that cannot know
 that a store does not change an array would load it again each time.  So that loop is one long function.
 
 Work done once a pose (the rotation's derivatives, the sum of the points' parts, the next step) is compiled,

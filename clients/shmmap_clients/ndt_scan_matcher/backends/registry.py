@@ -80,7 +80,7 @@ class FallbackBackend:
         self._map: VoxelMap | None = None
         self._points: NDArray[np.floating] | None = None
         self._lock = threading.Lock()
-        self.most_map_bytes = min(first.most_map_bytes, second.most_map_bytes)
+        self.max_map_bytes = min(first.max_map_bytes, second.max_map_bytes)
         self.fault: DeviceError | None = None
 
     @property
@@ -95,7 +95,7 @@ class FallbackBackend:
 
     @property
     def uploads(self) -> UploadStatistics:
-        """Of the one on a device."""
+        """Uploads of the backend on a device."""
         return self._first.uploads
 
     def close(self) -> None:

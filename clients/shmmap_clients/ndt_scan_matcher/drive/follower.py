@@ -3,7 +3,7 @@
 
 A vehicle is followed or lost::
 
-    uncertain --trusted--> tracking --not trusted--> uncertain --not trusted, again and again--> lost
+    uncertain --trusted--> tracking --not trusted--> uncertain --not trusted, repeatedly--> lost
     tracking, uncertain --no map--> lost
     lost --trusted, or relocalized--> tracking
 
@@ -113,7 +113,7 @@ class Frame:
 
     @property
     def latency_s(self) -> float:
-        """From having the scan to having the pose."""
+        """Time from having the scan to having the pose."""
         return self.thin_s + self.map_s + self.align_s + self.relocalize_s
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap map``: the map from above, what of it is in memory, and who is where."""
+"""``shmmap map``: the map from above, what of it is in memory, and where clients are."""
 
 from __future__ import annotations
 

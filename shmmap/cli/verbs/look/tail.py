@@ -171,8 +171,8 @@ def _pressure(f: dict[str, Any]) -> str:
 
 
 def _prefetch_miss(f: dict[str, Any]) -> str:
-    who = f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}"
-    return f"{who} had to wait for {counted(f['cells'], 'cell')}, such as {f['id']} {f['layer']}"
+    client = f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}"
+    return f"{client} had to wait for {counted(f['cells'], 'cell')}, such as {f['id']} {f['layer']}"
 
 
 def _reload(f: dict[str, Any]) -> str:

@@ -58,7 +58,7 @@ _NAP_S: Final = 20e-6
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device says of itself.
+    """What a device says about itself.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class DeviceInfo:
         ``"GPU"``, ``"accelerator"``, ``"CPU"`` or ``"other"``.
     fp64
         Whether it has double precision.
-    memory_bytes, most_bytes
+    memory_bytes, max_bytes
         Its memory, and the most that one buffer may have.
     unified
         Whether that is the processor's memory, too.
@@ -86,7 +86,7 @@ class DeviceInfo:
     kind: str
     fp64: bool
     memory_bytes: int
-    most_bytes: int
+    max_bytes: int
     unified: bool
     svm_system: bool
     unusable: str
@@ -240,7 +240,7 @@ def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
         kind=kind,
         fp64="cl_khr_fp64" in handle.extensions.split() or bool(asked("double_fp_config", 0)),
         memory_bytes=int(handle.global_mem_size),
-        most_bytes=int(handle.max_mem_alloc_size),
+        max_bytes=int(handle.max_mem_alloc_size),
         unified=bool(asked("host_unified_memory", False)),
         svm_system=bool(svm & cl.device_svm_capabilities.FINE_GRAIN_SYSTEM) and handle.address_bits == 64,
         unusable=unusable,
@@ -283,7 +283,7 @@ def _make_drivers_known() -> None:
 class Waiting:
     """Waits for events of one device.
 
-    It sleeps for most of the time that the last wait took, then looks again and again: a wait costs the
+    It sleeps for most of the time that the last wait took, then polls: a wait costs the
     processor little, and ends microseconds after the event.
 
     Parameters

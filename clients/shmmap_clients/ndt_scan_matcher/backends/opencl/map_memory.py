@@ -279,7 +279,7 @@ class MapBuffers:
             )
             queue.flush()
             self._waiting.until(mapped)
-            memory = there.data  # numpy would take three times as long for so many small pieces
+            memory = there.data  # numpy would take three times as long for that many small pieces
             for offset, array in zip(offsets, arrays, strict=True):
                 if array.size:
                     at = offset - first

@@ -174,7 +174,7 @@ def test_a_damaged_file_ends_it(directory: Path, kind: Format) -> None:
     path.rename(f"{path}.damaged.1")
     made = exported(directory, kind, "both")
     assert made is not None
-    assert made.aside == [f"{path.name}.damaged.1"]
+    assert made.quarantined == [f"{path.name}.damaged.1"]
 
 
 @pytest.mark.parametrize("kind", FORMATS)
