@@ -119,8 +119,6 @@ HEAVY = {
     "pandas",
     "matplotlib",
 }
-
-
 _PACKAGES = "import numpy, zmq, posix_ipc, msgspec"
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 

@@ -7,6 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.patient import Machine, Patient
@@ -61,3 +63,9 @@ class Ward:
         (self.root / "dev/shm").mkdir(parents=True, exist_ok=True)
         config = DaemonConfig(**settings)  # type: ignore[arg-type]
         return Patient(Machine(self.root), config, file, config.endpoint, seen or snapshot("absent"), uid=uid)
+
+
+@pytest.fixture
+def ward(tmp_path: Path) -> Ward:
+    """Return a machine without files."""
+    return Ward(tmp_path / "machine")
