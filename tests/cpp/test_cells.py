@@ -10,7 +10,6 @@ import os
 import shutil
 import subprocess
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +39,6 @@ LAYERS = (
 QUICK_LAYERS = tuple(layer for layer in LAYERS if not layer.startswith(("denoise", "normals")))
 MUTATIONS = int(os.environ.get("SHMMAP_TEST_MUTATIONS", "50000"))
 """Mutated messages of each kind; a million takes some minutes."""
-
-
-@pytest.fixture
-def program(cpp_program: Path) -> Iterator[CppProgram]:
-    """Return a process that has not connected; nothing in it may leak or go wrong."""
-    one = CppProgram(cpp_program)
-    yield one
-    assert one.close() == 0
 
 
 def columns(cells: shmmap.CellSet) -> list[list[str]]:

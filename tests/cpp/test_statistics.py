@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,14 +20,6 @@ from tests.support.divided_map import DividedMap
 
 LAYERS = ("points", "ndt(leaf=2.0)")
 STATES = ("resident", "stale", "zombie")
-
-
-@pytest.fixture
-def program(cpp_program: Path) -> Iterator[CppProgram]:
-    """Return a process that asks no daemon; nothing in it may leak or go wrong."""
-    one = CppProgram(cpp_program)
-    yield one
-    assert one.close() == 0
 
 
 def rows(answer: list[list[str]], kind: str) -> list[list[str]]:

@@ -117,8 +117,6 @@ HEAVY = {
     "pandas",
     "matplotlib",
 }
-
-
 _PACKAGES = "import numpy, zmq, posix_ipc, msgspec"
 _CLIENT = "import shmmap; shmmap.connect; shmmap.MapWindow"
 

@@ -24,14 +24,9 @@ from shmmap.protocol.rows import ClientRow, LiveMapRow
 from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
-from tests.support.doctor_ward import USER, Ward, snapshot
+from tests.unit.doctor.conftest import USER, Ward, snapshot
 
 S = 1_000_000_000
-
-
-@pytest.fixture
-def ward(tmp_path: Path) -> Ward:
-    return Ward(tmp_path / "machine")
 
 
 def test_the_worst_of_several() -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
 from shmmap.doctor.store_probe import StoreAnswer
 from shmmap.statistics.counters import REFUSALS
-from tests.support.doctor_ward import Ward, snapshot
+from tests.unit.doctor.conftest import Ward, snapshot
 
 URL = "s3://maps/town"
 ANSWERS: dict[str, Any] = {
@@ -22,11 +21,6 @@ ANSWERS: dict[str, Any] = {
     "version": 7,
     "credentials": "somewhere",
 }
-
-
-@pytest.fixture
-def ward(tmp_path: Path) -> Ward:
-    return Ward(tmp_path / "machine")
 
 
 def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) -> dict[str, tuple[str, str]]:

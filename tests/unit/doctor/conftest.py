@@ -7,6 +7,8 @@ import dataclasses
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
 import shmmap
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.diagnosis import Diagnosis, Machine
@@ -63,3 +65,9 @@ class Ward:
         return Diagnosis(
             Machine(self.root), config, file, config.endpoint, seen or snapshot("absent"), uid=uid
         )
+
+
+@pytest.fixture
+def ward(tmp_path: Path) -> Ward:
+    """Return a machine without files."""
+    return Ward(tmp_path / "machine")
