@@ -6,6 +6,7 @@ from __future__ import annotations
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import pytest
 
 from shmmap.errors import ShmmapError
 from shmmap.testing.fixtures import judged_daemons
-from tests.support.command_line import Verbs
+from tests.support.command_line import Shmmap, Verbs
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.live_reference import LIVE_TOML, LiveDaemon
@@ -99,6 +100,25 @@ def daemon(private_tmpfs: Callable[[str], str]) -> Iterator[DaemonFactory]:
     What they may leave behind: `shmmap.testing.daemon_process.isolated_daemons`.
     """
     yield from judged_daemons(DaemonProcess)
+
+
+@pytest.fixture(scope="module")
+def standing_map(tmp_path_factory: pytest.TempPathFactory) -> DividedMap:
+    """The same map as `divided_map`, for tests of one module that do not change it."""
+    return make_map(tmp_path_factory.mktemp("standing") / "map")
+
+
+@pytest.fixture(scope="module")
+def standing(standing_map: DividedMap) -> Iterator[DaemonProcess]:
+    """One daemon of that map for the tests of a module that only read; judged at the module's end."""
+    with contextmanager(judged_daemons)(DaemonProcess) as make:
+        yield make(standing_map.root)
+
+
+@pytest.fixture
+def reading(standing: DaemonProcess, tmp_path: Path) -> Shmmap:
+    """The command line of that daemon."""
+    return Shmmap(standing, tmp_path)
 
 
 @pytest.fixture

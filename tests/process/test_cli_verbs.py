@@ -33,35 +33,35 @@ def shmmap(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> Sh
     return Shmmap(daemon(divided_map.root), tmp_path)
 
 
-def test_query_has_exactly_the_fields_of_the_contract(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    found = shmmap.json("query", "--circle", "-5,3,25")
+def test_query_has_exactly_the_fields_of_the_contract(reading: Shmmap, standing_map: DividedMap) -> None:
+    found = reading.json("query", "--circle", "-5,3,25")
     assert list(found) == ["epoch", "map_version", "frame_id", "cells", "removed", "pending", "failed"]
     assert HEX.fullmatch(found["epoch"])
     assert HEX.fullmatch(found["map_version"])
     assert (found["frame_id"], found["removed"], found["pending"], found["failed"]) == ("map", [], [], [])
-    names = divided_map.in_circle(-5, 3, 25)
-    assert [cell["id"] for cell in found["cells"]] == [divided_map.id(name) for name in names]
+    names = standing_map.in_circle(-5, 3, 25)
+    assert [cell["id"] for cell in found["cells"]] == [standing_map.id(name) for name in names]
     for name, cell in zip(names, found["cells"], strict=True):
         assert sorted(cell) == sorted(
             ["id", "version", "layer", "segment", "offset", "bytes", "points", "stale", "box"]
         )
         assert HEX.fullmatch(cell["version"])
         assert (cell["layer"], cell["offset"], cell["stale"]) == ("points", 0, False)
-        assert cell["box"] == list(divided_map.box(name))
-        assert cell["points"] == len(divided_map.points(name)["x"])
-        segment = Path(shmmap.daemon.shm_dir, cell["segment"].lstrip("/"))
+        assert cell["box"] == list(standing_map.box(name))
+        assert cell["points"] == len(standing_map.points(name)["x"])
+        segment = Path(reading.daemon.shm_dir, cell["segment"].lstrip("/"))
         assert cell["bytes"] <= segment.stat().st_size
 
 
-def test_areas_and_ids(shmmap: Shmmap, divided_map: DividedMap) -> None:
+def test_areas_and_ids(reading: Shmmap, standing_map: DividedMap) -> None:
     def names(*words: str, code: int = 0) -> list[str]:
-        return [Path(cell["id"]).name for cell in shmmap.json("query", *words, code=code)["cells"]]
+        return [Path(cell["id"]).name for cell in reading.json("query", *words, code=code)["cells"]]
 
-    assert names("--circle=-5,3,25") == divided_map.in_circle(-5, 3, 25)
-    assert names("--square", "-5,3,25") == divided_map.in_square(-5, 3, 25)
+    assert names("--circle=-5,3,25") == standing_map.in_circle(-5, 3, 25)
+    assert names("--square", "-5,3,25") == standing_map.in_square(-5, 3, 25)
     assert names("--box", "-1,-1,1,1") == ["-20_-20.pcd", "-20_0.pcd", "0_-20.pcd", "0_0.pcd"]
     assert names("--box", "-1,-1,1,1", "--z", "100,200", code=1) == []
-    assert names("--id", "0_0.pcd", divided_map.id("20_0.pcd"), "0_0.pcd") == [
+    assert names("--id", "0_0.pcd", standing_map.id("20_0.pcd"), "0_0.pcd") == [
         "0_0.pcd",
         "20_0.pcd",
         "0_0.pcd",
@@ -69,24 +69,25 @@ def test_areas_and_ids(shmmap: Shmmap, divided_map: DividedMap) -> None:
     assert names("--id", "nowhere.pcd", "0_0.pcd", code=1) == ["0_0.pcd"]
 
 
-def test_query_differential(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    first = shmmap.json("query", "--circle", "0,0,5")["cells"]
+def test_query_differential(reading: Shmmap, standing_map: DividedMap) -> None:
+    first = reading.json("query", "--circle", "0,0,5")["cells"]
     held = [f"{cell['id']}@{cell['version']}" for cell in first]
-    moved = shmmap.json("query", "--circle", "20,0,5", "--held", *held, "/unknown/cell.pcd")
-    before, after = divided_map.in_circle(0, 0, 5), divided_map.in_circle(20, 0, 5)
+    moved = reading.json("query", "--circle", "20,0,5", "--held", *held, "/unknown/cell.pcd")
+    before, after = standing_map.in_circle(0, 0, 5), standing_map.in_circle(20, 0, 5)
     assert [Path(cell["id"]).name for cell in moved["cells"]] == [n for n in after if n not in before]
     gone = [cell["id"] for cell in first if Path(cell["id"]).name not in after]
     assert moved["removed"] == [*gone, "/unknown/cell.pcd"]
     # another version is not the one held; no version means the current one
     other = f"{int(first[0]['version'], 16) ^ 1:x}"
-    again = shmmap.json("query", "--circle", "0,0,5", "--held", f"{first[0]['id']}@{other}", *held[1:])
+    again = reading.json("query", "--circle", "0,0,5", "--held", f"{first[0]['id']}@{other}", *held[1:])
     assert [cell["id"] for cell in again["cells"]] == [first[0]["id"]]
-    assert shmmap.json("query", "--circle", "0,0,5", "--held", *(cell["id"] for cell in first))["cells"] == []
+    names = [cell["id"] for cell in first]
+    assert reading.json("query", "--circle", "0,0,5", "--held", *names)["cells"] == []
 
 
-def test_query_usage(shmmap: Shmmap) -> None:
+def test_query_usage(reading: Shmmap) -> None:
     for words in ("--id a --held b", "--circle 0,0,5 --held a@xyz", "--id a --z 0,1"):
-        done = shmmap.run("query", *words.split())
+        done = reading.run("query", *words.split())
         assert (done.returncode, done.stdout) == (2, ""), words
         assert done.stderr.startswith("shmmap: ")
 
@@ -215,30 +216,30 @@ def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
     assert shmmap.json("evict", "--all")["still_mapped"] == 0
 
 
-def test_export_merged_pcd(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    names = divided_map.in_circle(0, 0, 5)
+def test_export_merged_pcd(reading: Shmmap, standing_map: DividedMap) -> None:
+    names = standing_map.in_circle(0, 0, 5)
     for encoding in ("ascii", "binary", "binary_compressed"):
         path = f"{encoding}.pcd"
-        exported = shmmap.json("export", "--circle", "0,0,5", "-o", path, "--encoding", encoding)
+        exported = reading.json("export", "--circle", "0,0,5", "-o", path, "--encoding", encoding)
         (file,) = exported["files"]
         assert (file["path"], file["points"]) == (path, 500 * len(names))
-        described = shmmap.json("inspect", path)
+        described = reading.json("inspect", path)
         assert (described["encoding"], described["points"], described["dropped"]) == (encoding, 2000, 0)
-    merged = read_pcd(shmmap.cwd / "binary.pcd")  # what the oracle reads
+    merged = read_pcd(reading.cwd / "binary.pcd")  # what the oracle reads
     for field in ("x", "y", "z", "intensity"):
-        wanted = np.concatenate([divided_map.points(name)[field] for name in names])
+        wanted = np.concatenate([standing_map.points(name)[field] for name in names])
         assert merged[field].tobytes() == wanted.tobytes()
 
 
-def test_export_npz_and_single_cells(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    shmmap("export", "--id", "0_0.pcd", "-o", "cell.npz")
-    with np.load(shmmap.cwd / "cell.npz") as archive:
-        source = divided_map.points("0_0.pcd")
+def test_export_npz_and_single_cells(reading: Shmmap, standing_map: DividedMap) -> None:
+    reading("export", "--id", "0_0.pcd", "-o", "cell.npz")
+    with np.load(reading.cwd / "cell.npz") as archive:
+        source = standing_map.points("0_0.pcd")
         assert sorted(archive.files) == ["intensity", "xyz"]
         assert archive["xyz"].tobytes() == np.column_stack([source[axis] for axis in "xyz"]).tobytes()
-    shmmap("export", "--id", "0_0.pcd", "20_0.pcd", "--output-dir", "cells")
-    assert sorted(path.name for path in (shmmap.cwd / "cells").iterdir()) == ["0_0.pcd", "20_0.pcd"]
-    copy, original = read_pcd(shmmap.cwd / "cells" / "20_0.pcd"), divided_map.points("20_0.pcd")
+    reading("export", "--id", "0_0.pcd", "20_0.pcd", "--output-dir", "cells")
+    assert sorted(path.name for path in (reading.cwd / "cells").iterdir()) == ["0_0.pcd", "20_0.pcd"]
+    copy, original = read_pcd(reading.cwd / "cells" / "20_0.pcd"), standing_map.points("20_0.pcd")
     assert all(copy[name].tobytes() == original[name].tobytes() for name in original)
 
 
@@ -264,23 +265,23 @@ def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     assert len(read_pcd(target)["x"]) == 500
 
 
-def test_a_misspelt_cell_is_answered_with_the_names_that_exist(shmmap: Shmmap) -> None:
+def test_who_misspells_a_cell_is_exported_which_there_are(reading: Shmmap) -> None:
     for words in (["show"], ["query", "--id"], ["pin"], ["unpin"], ["evict"]):
-        done = shmmap.run(*words, "/elsewhere/20_0.pdc")
+        done = reading.run(*words, "/elsewhere/20_0.pdc")
         assert done.returncode == 1, words
         assert re.search(r"hint: did you mean -?20_0\.pcd\?\n$", done.stderr), done.stderr
-        done = shmmap.run(*words, "nothing like it")
+        done = reading.run(*words, "nothing like it")
         assert done.returncode == 1, words
         assert "hint: `shmmap query --circle X,Y,R` prints the ids" in done.stderr
 
 
-def test_endpoint_alone_is_enough(shmmap: Shmmap) -> None:
-    shmmap.environment.pop("SHMMAP_INSTANCE")
-    shmmap.environment.pop("SHMMAP_RUNTIME_DIR")
-    for endpoint in (shmmap.daemon.endpoint, f"ipc://{shmmap.daemon.endpoint}"):
-        assert shmmap.json("query", "--circle", "0,0,5", "--endpoint", endpoint)["cells"]
-        assert shmmap.json("health", "--endpoint", endpoint)["state"] == "healthy"
-    done = shmmap.run("query", "--circle", "0,0,5", "--endpoint", "tcp://127.0.0.1:1")
+def test_endpoint_alone_is_enough(reading: Shmmap) -> None:
+    reading.environment.pop("SHMMAP_INSTANCE")
+    reading.environment.pop("SHMMAP_RUNTIME_DIR")
+    for endpoint in (reading.daemon.endpoint, f"ipc://{reading.daemon.endpoint}"):
+        assert reading.json("query", "--circle", "0,0,5", "--endpoint", endpoint)["cells"]
+        assert reading.json("health", "--endpoint", endpoint)["state"] == "healthy"
+    done = reading.run("query", "--circle", "0,0,5", "--endpoint", "tcp://127.0.0.1:1")
     assert done.returncode == 2
 
 
@@ -317,7 +318,7 @@ def test_exit_codes_without_a_daemon(words: list[str], code: int, tmp_path: Path
     assert any(line.startswith("shmmap: ") for line in done.stderr.splitlines())
 
 
-def test_help_status_and_errors_need_only_the_standard_library(shmmap: Shmmap) -> None:
+def test_help_status_and_errors_need_only_the_standard_library(reading: Shmmap) -> None:
     """A client-only install has no rich, yaml or Open3D, and a broken one perhaps not even numpy.
 
     Rows of cells need msgspec.
@@ -338,7 +339,7 @@ def test_help_status_and_errors_need_only_the_standard_library(shmmap: Shmmap) -
     ):
         done = subprocess.run(
             [sys.executable, "-c", program, *words],
-            env=shmmap.environment,
+            env=reading.environment,
             capture_output=True,
             text=True,
             check=False,

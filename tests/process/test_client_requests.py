@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -28,7 +28,6 @@ from shmmap.errors import (
     LoadFailed,
     NoAnswer,
     NoSocket,
-    ProtocolMismatch,
     SegmentError,
     SocketPermission,
     StaleSocket,
@@ -93,17 +92,17 @@ def assert_bits(cell: Any, made: DividedMap) -> None:
     assert cell.points == len(xyz)
 
 
-def test_the_first_program(daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = daemon(divided_map.root)
-    monkeypatch.setenv("SHMMAP_ENDPOINT", one.endpoint)
+def test_the_first_program(
+    standing: DaemonProcess, standing_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHMMAP_ENDPOINT", standing.endpoint)
     cells = shmmap.connect().around(3.0, 4.0, radius=50)
-    assert sum(len(cell.xyz) for cell in cells) == 500 * len(divided_map.in_circle(3.0, 4.0, 50))
+    assert sum(len(cell.xyz) for cell in cells) == 500 * len(standing_map.in_circle(3.0, 4.0, 50))
 
 
-def test_everything_says_what_it_is(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client:
-        assert repr(client) == f"<Client of {one.endpoint}, map {divided_map.root}>"
+def test_everything_says_what_it_is(standing: DaemonProcess, standing_map: DividedMap) -> None:
+    with shmmap.connect(standing.endpoint) as client:
+        assert repr(client) == f"<Client of {standing.endpoint}, map {standing_map.root}>"
         listing = client.metadata()
         assert repr(listing) == f"<MapListing of {len(listing)} cells, 0 removed>"
         with shmmap.MapWindow(client, 5.0) as window:
@@ -135,16 +134,16 @@ def test_a_client_goes_by_its_script(daemon: Factory, divided_map: DividedMap, t
 
 
 @BOTH
-def test_areas(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
-    with connect(daemon(divided_map.root).endpoint, name="areas") as client:
+def test_areas(standing: DaemonProcess, standing_map: DividedMap, connect: Connect) -> None:
+    with connect(standing.endpoint, name="areas") as client:
         circle = client.area(shmmap.Circle(5.0, -7.0, 33.0))
         assert circle.complete
-        assert names(circle) == divided_map.in_circle(5.0, -7.0, 33.0)
+        assert names(circle) == standing_map.in_circle(5.0, -7.0, 33.0)
         for cell in circle:
-            assert_bits(cell, divided_map)
+            assert_bits(cell, standing_map)
             cell.verify()
         square = client.area(shmmap.AutowareSquare(5.0, -7.0, 33.0))
-        assert names(square) == divided_map.in_square(5.0, -7.0, 33.0)
+        assert names(square) == standing_map.in_square(5.0, -7.0, 33.0)
         assert names(client.area(shmmap.Box(1.0, 1.0, 2.0, 2.0))) == ["0_0.pcd"]
         assert client.around(0, 0, 50, z=(100.0, 200.0)).cells == (), "no point is as high"
         assert circle.epoch == client.epoch
@@ -152,8 +151,8 @@ def test_areas(daemon: Factory, divided_map: DividedMap, connect: Connect) -> No
 
 
 @BOTH
-def test_cells_are_mapped_once(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
-    with connect(daemon(divided_map.root).endpoint) as client:
+def test_cells_are_mapped_once(standing: DaemonProcess, connect: Connect) -> None:
+    with connect(standing.endpoint) as client:
         first = client.around(0, 0, 30)
         again = client.around(0, 0, 30)
         assert first.cells == again.cells
@@ -161,12 +160,12 @@ def test_cells_are_mapped_once(daemon: Factory, divided_map: DividedMap, connect
 
 
 @BOTH
-def test_differential(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
-    with connect(daemon(divided_map.root).endpoint) as client:
+def test_differential(standing: DaemonProcess, standing_map: DividedMap, connect: Connect) -> None:
+    with connect(standing.endpoint) as client:
         held = {cell.id: cell for cell in client.around(-30, -30, 30)}
         for x in range(-30, 40, 7):
             before = set(held)
-            inside = {divided_map.id(name) for name in divided_map.in_circle(x, x / 2, 30)}
+            inside = {standing_map.id(name) for name in standing_map.in_circle(x, x / 2, 30)}
             answer = client.differential(shmmap.Circle(x, x / 2, 30), held.values())
             assert {cell.id for cell in answer} == inside - before
             assert answer.removed == tuple(cell_id for cell_id in held if cell_id not in inside)
@@ -177,11 +176,13 @@ def test_differential(daemon: Factory, divided_map: DividedMap, connect: Connect
 
 
 @BOTH
-def test_differential_with_ids_by_hand(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
+def test_differential_with_ids_by_hand(
+    standing: DaemonProcess, standing_map: DividedMap, connect: Connect
+) -> None:
     area = shmmap.Circle(10, 10, 5)
-    with connect(daemon(divided_map.root).endpoint) as client:
+    with connect(standing.endpoint) as client:
         (cell,) = client.area(area)
-        gone = divided_map.id("-60_-60.pcd")
+        gone = standing_map.id("-60_-60.pcd")
         answer = client.differential(area, ["nowhere", cell.id, gone])
         assert (answer.cells, answer.removed) == ((), ("nowhere", gone))
         assert client.differential(area, [(cell.id, cell.version)]).cells == ()
@@ -191,10 +192,10 @@ def test_differential_with_ids_by_hand(daemon: Factory, divided_map: DividedMap,
 
 @BOTH
 def test_selected_keeps_order_and_duplicates(
-    daemon: Factory, divided_map: DividedMap, connect: Connect
+    standing: DaemonProcess, standing_map: DividedMap, connect: Connect
 ) -> None:
-    with connect(daemon(divided_map.root).endpoint) as client:
-        wanted = ["20_20.pcd", divided_map.id("0_0.pcd"), "none.pcd", "20_20.pcd", "-20_0.pcd"]
+    with connect(standing.endpoint) as client:
+        wanted = ["20_20.pcd", standing_map.id("0_0.pcd"), "none.pcd", "20_20.pcd", "-20_0.pcd"]
         answer = client.selected(wanted)
         assert names(answer) == ["20_20.pcd", "0_0.pcd", "20_20.pcd", "-20_0.pcd"]
         assert answer[0] is answer[2]
@@ -349,15 +350,14 @@ def test_a_handle_that_went_stale_is_asked_for_again(
 
 @BOTH
 @pytest.mark.root
-@pytest.mark.parametrize("kind", ["file", "pipe", "directory"])
 def test_a_name_that_another_file_took_meanwhile(
-    daemon: Factory, divided_map: DividedMap, late: Late, kind: str
+    daemon: Factory, divided_map: DividedMap, late: Late
 ) -> None:
     """In /dev/shm every account may make files: only what belongs to the daemon's user is its segment."""
     one = daemon(divided_map.root)
     taken: list[Path] = []
 
-    def take() -> None:
+    def take(kind: str) -> None:
         place = Path(one.shm_dir, one.segments()[0])
         forged = place.read_bytes()
         other.evict()
@@ -371,16 +371,17 @@ def test_a_name_that_another_file_took_meanwhile(
         place.chmod(0o755)
         os.chown(place, 12345, 12345)
 
-    with ExitStack() as ends:
-        other = ends.enter_context(shmmap.connect(one.endpoint))
-        other.selected(["0_0.pcd", "20_20.pcd"])
-        client = ends.enter_context(late(one.endpoint, take, 1))
-        answer = client.selected(["0_0.pcd", "20_20.pcd"])
-        assert taken
-        assert answer.complete
-        for cell in answer:
-            assert_bits(cell, divided_map)
-        taken[0].rmdir() if kind == "directory" else taken[0].unlink()
+    with shmmap.connect(one.endpoint) as other:
+        for count, kind in enumerate(("file", "pipe", "directory"), 1):
+            other.selected(["0_0.pcd", "20_20.pcd"])
+            with late(one.endpoint, partial(take, kind), 1) as client:
+                answer = client.selected(["0_0.pcd", "20_20.pcd"])
+                assert len(taken) == count
+                assert answer.complete
+                for cell in answer:
+                    assert_bits(cell, divided_map)
+                del answer, cell
+            taken[-1].rmdir() if kind == "directory" else taken[-1].unlink()
 
 
 @BOTH
@@ -397,16 +398,17 @@ def test_handles_that_stay_stale_end_as_pending(daemon: Factory, divided_map: Di
 
 @BOTH
 def test_segments_that_are_elsewhere_are_no_passing_problem(
-    daemon: Factory,
-    divided_map: DividedMap,
+    standing: DaemonProcess,
     connect: Connect,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As in a container that has the socket, and not the directory of the segments."""
-    one = daemon(divided_map.root)
     monkeypatch.setenv("SHMMAP_SHM_DIR", str(tmp_path))
-    with connect(one.endpoint) as client, pytest.raises(SegmentError, match=r"are not in .*SHMMAP_SHM_DIR"):
+    with (
+        connect(standing.endpoint) as client,
+        pytest.raises(SegmentError, match=r"are not in .*SHMMAP_SHM_DIR"),
+    ):
         client.around(0, 0, 5, wait=30.0)
 
 
@@ -435,8 +437,8 @@ def test_of_several_sockets_the_telling_one_is_named(
 
 
 @BOTH
-def test_waits_that_make_no_sense(daemon: Factory, divided_map: DividedMap, connect: Connect) -> None:
-    with connect(daemon(divided_map.root).endpoint) as client:
+def test_waits_that_make_no_sense(standing: DaemonProcess, connect: Connect) -> None:
+    with connect(standing.endpoint) as client:
         for wait in (-1.0, -6.0, np.nan):
             with pytest.raises(BadRequest, match="wait"):
                 client.around(0, 0, 5, wait=wait)
@@ -451,7 +453,7 @@ def test_a_daemon_that_ends_between_its_answer_and_the_attaching(
 ) -> None:
     """It took its segments away: that is no reason to look for them in another directory."""
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint, timeout=1.0) as client:
+    with shmmap.connect(one.endpoint, timeout=5.0) as client:  # in which the daemon has to have ended
         assert client.around(0, 0, 5).complete
         stops = iter([one.stop])
         monkeypatch.setattr("shmmap.client.session.step", lambda _: next(stops, lambda: 0)())
@@ -530,21 +532,9 @@ def test_what_a_killed_daemon_leaves_is_a_stale_socket(
         connect(one.endpoint)
 
 
-def test_another_major_version_is_refused(
-    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one = daemon(divided_map.root)
-    monkeypatch.setattr("shmmap.client.connection.PROTOCOL_VERSION", (1, 6))
-    with pytest.raises(ProtocolMismatch, match=r"client speaks protocol 1\.6, daemon 2\.0") as refused:
-        shmmap.connect(one.endpoint)
-    assert (refused.value.exit_code, refused.value.hint) == (76, "update the client, and restart it")
-
-
-def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(
-    daemon: Factory, divided_map: DividedMap
-) -> None:
-    """Each try would end the connection; the error names the limit, and the client goes on."""
-    with shmmap.connect(daemon(divided_map.root).endpoint) as client:
+def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(standing: DaemonProcess) -> None:
+    """It would end the connection; the error names the limit, and the client goes on."""
+    with shmmap.connect(standing.endpoint) as client:
         session = client.welcome.session
         for ids in (["x" * (5 << 20)], [f"{number:0100}.pcd" for number in range(45_000)]):
             for ask in (client.selected, client.evict):
@@ -561,12 +551,12 @@ def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(
 # --- the client's own life ----------------------------------------------------------------------
 
 
-def test_views_outlive_the_client(daemon: Factory, divided_map: DividedMap) -> None:
-    client = shmmap.connect(daemon(divided_map.root).endpoint)
+def test_views_outlive_the_client(standing: DaemonProcess, standing_map: DividedMap) -> None:
+    client = shmmap.connect(standing.endpoint)
     (cell,) = client.selected(["0_0.pcd"])
     client.close()
     client.close()
-    assert_bits(cell, divided_map)
+    assert_bits(cell, standing_map)
     with pytest.raises(BadRequest, match="closed"):
         client.stats()
 
@@ -605,18 +595,17 @@ def test_a_client_that_left_without_a_goodbye(daemon: Factory, divided_map: Divi
             pass
 
 
-def test_an_unclosed_client_leaves_no_descriptor(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
+def test_an_unclosed_client_leaves_no_descriptor(standing: DaemonProcess) -> None:
     before = set(open_files())
     for _ in range(3):
-        cells = shmmap.connect(one.endpoint).around(0, 0, 10)
+        cells = shmmap.connect(standing.endpoint).around(0, 0, 10)
         assert cells.complete
     del cells
     assert set(open_files()) == before
 
 
-def test_one_client_in_many_threads(daemon: Factory, divided_map: DividedMap) -> None:
-    with shmmap.connect(daemon(divided_map.root).endpoint, timeout=30) as client:
+def test_one_client_in_many_threads(standing: DaemonProcess, standing_map: DividedMap) -> None:
+    with shmmap.connect(standing.endpoint, timeout=30) as client:
         start = threading.Barrier(6)
 
         def ask(number: int) -> bool:
@@ -624,7 +613,7 @@ def test_one_client_in_many_threads(daemon: Factory, divided_map: DividedMap) ->
             good = True
             for i in range(20):
                 x = (number * 7 + i * 3) % 40 - 20.0
-                good &= names(client.around(x, -x, 20)) == divided_map.in_circle(x, -x, 20)
+                good &= names(client.around(x, -x, 20)) == standing_map.in_circle(x, -x, 20)
                 good &= client.stats().epoch == client.epoch
             return good
 
@@ -689,16 +678,15 @@ def test_fork(daemon: Factory, divided_map: DividedMap) -> None:
 PACKAGE = str(Path(shmmap.__file__).parent)
 
 
-def test_a_warm_differential_enters_few_files(daemon: Factory, divided_map: DividedMap) -> None:
+def test_a_warm_differential_enters_few_files(standing: DaemonProcess) -> None:
     """From the call to its return, so that a reader can follow it; with new cells and without."""
-    one = daemon(divided_map.root)
     entered: set[str] = set()
 
     def note(frame: FrameType, event: str, _argument: object) -> None:
         if event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
             entered.add(frame.f_code.co_filename)
 
-    with shmmap.connect(one.endpoint) as client:
+    with shmmap.connect(standing.endpoint) as client:
         everywhere = shmmap.Box(-1e3, -1e3, 1e3, 1e3)
         cells = client.area(everywhere, wait=60.0).cells
         for held in (cells[:8], cells):

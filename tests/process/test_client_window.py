@@ -62,20 +62,19 @@ def assert_window(window: shmmap.MapWindow, made: DividedMap, x: float, y: float
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_step_is_the_set_difference(
-    daemon: Factory, divided_map: DividedMap, kind: str, make: MakeWindow
+    standing: DaemonProcess, standing_map: DividedMap, kind: str, make: MakeWindow
 ) -> None:
-    one = daemon(divided_map.root)
     before: set[str] = set()
-    with make(one.endpoint, 35, update_distance=0) as window:
+    with make(standing.endpoint, 35, update_distance=0) as window:
         for x, y in ROUTE:
             update = window.move_to(x, y, vx=7.0, wait=LONG_S)
-            inside = set(divided_map.in_circle(x, y, 35))
+            inside = set(standing_map.in_circle(x, y, 35))
             assert set(by_name(update.added)) == inside - before
             assert set(by_name(update.kept)) == inside & before
             assert {Path(cell_id).name for cell_id in update.removed} == before - inside
             assert (update.changed, update.pending, update.failed) == ((), (), ())
             assert window.complete
-            assert_window(window, divided_map, x, y, 35)
+            assert_window(window, standing_map, x, y, 35)
             before = inside
         unmoved = window.move_to(*ROUTE[-1], wait=LONG_S)
         assert not unmoved.any
@@ -153,14 +152,13 @@ def test_small_moves_ask_nothing(daemon: Factory, divided_map: DividedMap, make:
 
 
 @pytest.mark.parametrize("kind", WITHOUT_A_THREAD)
-def test_the_square_and_heights(daemon: Factory, divided_map: DividedMap, make: MakeWindow) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client:
+def test_the_square_and_heights(standing: DaemonProcess, standing_map: DividedMap, make: MakeWindow) -> None:
+    with shmmap.connect(standing.endpoint) as client:
         client.around(0, 0, 200)  # heights are known from the first load on
-    with make(one.endpoint, 25, shape="square") as window:
+    with make(standing.endpoint, 25, shape="square") as window:
         window.move_to(1, 2)
-        assert sorted(by_name(window.cells)) == divided_map.in_square(1, 2, 25)
-    with make(one.endpoint, 25, z=(50, 60)) as window:
+        assert sorted(by_name(window.cells)) == standing_map.in_square(1, 2, 25)
+    with make(standing.endpoint, 25, z=(50, 60)) as window:
         window.move_to(1, 2)
         assert window.cells == ()
 
@@ -406,10 +404,9 @@ def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
 # --- threads and system calls -----------------------------------------------------------------------
 
 
-def test_an_unclosed_window_ends_with_the_program(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
+def test_an_unclosed_window_ends_with_the_program(standing: DaemonProcess, standing_map: DividedMap) -> None:
     before = len(running)
-    window = shmmap.MapWindow(one.endpoint, 30)
+    window = shmmap.MapWindow(standing.endpoint, 30)
     window.move_to(0, 0, wait=LONG_S)
     view = window.cells[0].xyz
     assert len(running) == before + 2, "the window's, and its connection's"
@@ -418,7 +415,7 @@ def test_an_unclosed_window_ends_with_the_program(daemon: Factory, divided_map: 
     assert np.isfinite(view).all()
     program = f"""
 import shmmap
-window = shmmap.MapWindow({one.endpoint!r}, 30)
+window = shmmap.MapWindow({standing.endpoint!r}, 30)
 print(len(window.move_to(0, 0, wait={LONG_S}).added))
 cells = window.cells
 """
@@ -426,12 +423,11 @@ cells = window.cells
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert int(done.stdout) == len(divided_map.in_circle(0, 0, 30))
+    assert int(done.stdout) == len(standing_map.in_circle(0, 0, 30))
 
 
-def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: DividedMap) -> None:
+def test_a_window_collected_in_its_own_thread(standing: DaemonProcess) -> None:
     """Garbage is collected in whatever thread: the window's own one ends all the same, and keeps nothing."""
-    one = daemon(divided_map.root)
     dropped, collected = threading.Event(), threading.Event()
 
     class Collects:
@@ -443,7 +439,7 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
             collected.set()
             return [False] * len(departed)
 
-    with shmmap.connect(one.endpoint) as client:
+    with shmmap.connect(standing.endpoint) as client:
         window = shmmap.MapWindow(client, 30, retention=Collects())
         window.move_to(0, 0, wait=LONG_S)
         view, others = window.cells[0].xyz, len(window.cells) - 1
@@ -468,18 +464,15 @@ def test_a_window_collected_in_its_own_thread(daemon: Factory, divided_map: Divi
         assert client.release() == 1, "what ends now is unmapped at once, and released"
 
 
-def test_a_window_whose_thread_ended(
-    daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_window_whose_thread_ended(standing: DaemonProcess, monkeypatch: pytest.MonkeyPatch) -> None:
     """A policy of the user's that fails: the window says so, and what is dropped is unmapped."""
-    one = daemon(divided_map.root)
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
 
     class Fails:
         def keep(self, departed: Sequence[RetentionCandidate]) -> list[bool]:
             raise ZeroDivisionError(len(departed))
 
-    with shmmap.connect(one.endpoint) as client:
+    with shmmap.connect(standing.endpoint) as client:
         window = shmmap.MapWindow(client, 30, retention=Fails())
         window.move_to(0, 0, wait=LONG_S)
         assert isinstance(window._follower, WindowFollower)
@@ -495,10 +488,9 @@ def test_a_window_whose_thread_ended(
 
 
 @pytest.mark.parametrize("background", [True, False])
-def test_poses_as_planners_have_them(daemon: Factory, divided_map: DividedMap, background: bool) -> None:
+def test_poses_as_planners_have_them(standing: DaemonProcess, background: bool) -> None:
     """A route may be an array; what makes no sense is refused in the caller's thread."""
-    one = daemon(divided_map.root)
-    with shmmap.MapWindow(one.endpoint, 30, update_distance=0, background=background) as window:
+    with shmmap.MapWindow(standing.endpoint, 30, update_distance=0, background=background) as window:
         route = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
         assert window.move_to(0, 0, vx=np.float32(1.0), route=route, wait=LONG_S).complete
         for odd in (
@@ -513,9 +505,8 @@ def test_poses_as_planners_have_them(daemon: Factory, divided_map: DividedMap, b
         assert window.error is None
 
 
-def test_a_closed_window(daemon: Factory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client:
+def test_a_closed_window(standing: DaemonProcess) -> None:
+    with shmmap.connect(standing.endpoint) as client:
         window = shmmap.MapWindow(client, 30)
         window.move_to(0, 0, wait=LONG_S)
         cell = window.cells[0]
@@ -528,23 +519,19 @@ def test_a_closed_window(daemon: Factory, divided_map: DividedMap) -> None:
         assert client.around(0, 0, 30).complete, "the client is the caller's"
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
+def test_impossible_parameters_are_refused(standing: DaemonProcess) -> None:
+    before = threading.active_count()
+    impossible: list[dict[str, Any]] = [
         {"radius": -1.0},
         {"shape": "hexagon"},
         {"update_distance": -1.0},
         {"refresh_interval": 0.0},
+        {"timeout": 0.0},
         {"z": (2.0, 1.0)},
-    ],
-)
-def test_impossible_parameters_are_refused(
-    daemon: Factory, divided_map: DividedMap, options: dict[str, float]
-) -> None:
-    one = daemon(divided_map.root)
-    before = threading.active_count()
-    with pytest.raises(BadRequest):
-        shmmap.MapWindow(one.endpoint, **options)  # type: ignore[arg-type]
+    ]
+    for options in impossible:
+        with pytest.raises(BadRequest):
+            shmmap.MapWindow(standing.endpoint, **options)
     assert threading.active_count() == before
 
 
@@ -582,7 +569,9 @@ def test_a_swap_makes_no_system_call_that_maps_on_the_control_thread(daemon: Fac
     made = make_map(tmp_path / "map", columns=50, rows=16, points=20)
     one = daemon(made.root)
     with shmmap.connect(one.endpoint) as client:
-        assert client.area(shmmap.Box(-500, -160, 500, 160), wait=LONG_S).complete
+        waiting = Deadline()
+        while waiting(not client.area(shmmap.Box(-500, -160, 500, 160), wait=LONG_S).complete):
+            pass
     calls = tmp_path / "calls.txt"
     done = subprocess.run(
         [

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -19,24 +18,20 @@ import shmmap
 from shmmap.errors import BadRequest
 from tests.benchmarks.exits import SCENES, Ends, end_often
 from tests.support.daemon_process import DaemonProcess
-from tests.support.divided_map import make_map
+from tests.support.divided_map import DividedMap
 
-Factory = Callable[..., DaemonProcess]
 EXITS = 4
 
 
-@pytest.fixture
-def one(daemon: Factory, tmp_path: Path) -> DaemonProcess:
-    served: DaemonProcess = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
-    return served
-
-
 @pytest.mark.parametrize("scene", SCENES)
-def test_a_program_ends_quietly(one: DaemonProcess, scene: str) -> None:
-    assert end_often(one.endpoint, *SCENES[scene], EXITS) == Ends(0, 0, 0, "")
+def test_a_program_ends_quietly(standing: DaemonProcess, scene: str) -> None:
+    assert end_often(standing.endpoint, *SCENES[scene], EXITS) == Ends(0, 0, 0, "")
 
 
-def test_no_client_waits_for_the_answer_of_a_stopped_daemon(one: DaemonProcess) -> None:
+def test_no_client_waits_for_the_answer_of_a_daemon_that_stands_still(
+    daemon: Callable[..., DaemonProcess], divided_map: DividedMap
+) -> None:
+    one = daemon(divided_map.root)
     setup = (
         "import os, signal; client = shmmap.connect(endpoint, timeout=600)\n"
         "os.kill(client.welcome.pid, signal.SIGSTOP)"
@@ -47,7 +42,7 @@ def test_no_client_waits_for_the_answer_of_a_stopped_daemon(one: DaemonProcess) 
         one.send(signal.SIGCONT)
 
 
-def test_threads_that_python_waits_for_ask_to_their_end(one: DaemonProcess) -> None:
+def test_threads_that_python_waits_for_ask_to_their_end(standing: DaemonProcess) -> None:
     code = (
         "import sys, threading, shmmap\n"
         "client = shmmap.connect(sys.argv[1])\n"
@@ -57,11 +52,13 @@ def test_threads_that_python_waits_for_ask_to_their_end(one: DaemonProcess) -> N
         "        print(all(one.around(0, 0, 50).complete for one in (client, own) for _ in range(100)))\n"
         "threading.Thread(target=work).start()\n"
     )
-    done = subprocess.run([sys.executable, "-c", code, one.endpoint], capture_output=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code, standing.endpoint], capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, b"True\n", b"")
 
 
-def test_a_function_for_the_end_may_ask_and_gets_a_clear_error_of_a_closed_client(one: DaemonProcess) -> None:
+def test_a_function_for_the_end_may_ask_and_gets_a_clear_error_of_a_closed_client(
+    standing: DaemonProcess,
+) -> None:
     code = (
         "import atexit, sys, shmmap\n"
         "@atexit.register\n"
@@ -74,7 +71,7 @@ def test_a_function_for_the_end_may_ask_and_gets_a_clear_error_of_a_closed_clien
         "        print(error)\n"
         "client = shmmap.connect(sys.argv[1])\n"
     )
-    done = subprocess.run([sys.executable, "-c", code, one.endpoint], capture_output=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code, standing.endpoint], capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (
         0,
         b"True\nthis client is closed (connect again)\n",
@@ -82,8 +79,8 @@ def test_a_function_for_the_end_may_ask_and_gets_a_clear_error_of_a_closed_clien
     )
 
 
-def test_closing_a_stream_that_another_thread_waits_on(one: DaemonProcess) -> None:
-    stream = shmmap.events.EventStream(one.endpoint)
+def test_closing_a_stream_that_another_thread_waits_on(standing: DaemonProcess) -> None:
+    stream = shmmap.events.EventStream(standing.endpoint)
     failures: list[BaseException] = []
 
     def wait() -> None:

@@ -63,11 +63,6 @@ def plain(daemon: DaemonFactory) -> Iterator[Plain]:
         one.close()
 
 
-@pytest.fixture
-def served(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
-    return daemon(divided_map.root)
-
-
 def refusal(one: PlainClient, tag: str, *elements: Any) -> str:
     with pytest.raises(Refused) as refused:
         one.ask(tag, *elements)
@@ -102,11 +97,11 @@ def test_a_path_too_long_for_a_socket() -> None:
         candidates("/" + "x" * int(most), {})
 
 
-def test_the_next_path_where_no_daemon_listens(served: DaemonProcess, plain: Plain, tmp_path: Path) -> None:
+def test_the_next_path_where_no_daemon_listens(standing: DaemonProcess, plain: Plain, tmp_path: Path) -> None:
     ended = tmp_path / "ended.sock"
     code = "import socket, sys; socket.socket(socket.AF_UNIX).bind(sys.argv[1])"
     subprocess.run([sys.executable, "-c", code, str(ended)], check=True)
-    one = PlainClient([str(tmp_path / "never.sock"), str(ended), served.endpoint])
+    one = PlainClient([str(tmp_path / "never.sock"), str(ended), standing.endpoint])
     assert one.hello()[0] == "welcome"
     one.close()
 
@@ -125,9 +120,9 @@ def test_the_bytes_of_the_page() -> None:
     assert documented_bytes("pong") == b"\x04\x05\x04PONG"
 
 
-def test_everything_can_be_sent_at_once(served: DaemonProcess, plain: Plain) -> None:
+def test_everything_can_be_sent_at_once(standing: DaemonProcess, plain: Plain) -> None:
     """Greeting, ready and requests, without waiting for anything; also byte by byte."""
-    one = plain(served, hello=False)  # it has sent greeting and ready, and has not waited for a ready
+    one = plain(standing, hello=False)  # it has sent greeting and ready, and has not waited for a ready
     numbers = [one.send("hello", 2, 0), one.send("metadata"), one.send("stats")]
     assert [one.reply_to(n)[0] for n in numbers] == ["welcome", "metadata_page", "stats_reply"]
     (ready,) = one.commands
@@ -141,14 +136,14 @@ def test_everything_can_be_sent_at_once(served: DaemonProcess, plain: Plain) -> 
     assert one.reply_to(99)[0] == "metadata_page", "a short one may have a long length"
 
 
-def test_long_requests_and_replies(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_long_requests_and_replies(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     held = [[f"/nowhere/{number}.pcd", number] for number in range(300)]
     assert one.ask("differential", HERE, ["points"], held)[5] == [cell for cell, _ in held]
 
 
-def test_ping(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_ping(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     one.connection.sendall(documented_bytes("ping"))
     context = bytes(range(16))
     one.send_frame(b"\x04PING\x00\x0a" + context, 4)
@@ -165,23 +160,23 @@ def test_ping(served: DaemonProcess, plain: Plain) -> None:
         pytest.param(b"\x04\x06\x05READY", id="a ready without a type"),
     ],
 )
-def test_a_peer_that_breaks_the_rules_is_disconnected(served: DaemonProcess, wrong: bytes) -> None:
+def test_a_peer_that_breaks_the_rules_is_disconnected(standing: DaemonProcess, wrong: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as one:
         one.settimeout(30.0)
-        one.connect(served.endpoint)
+        one.connect(standing.endpoint)
         one.sendall(documented_bytes("greeting") + wrong)
         with one.makefile("rb") as listener:
             assert listener.read()[:64] == documented_bytes("greeting")
 
 
-def test_a_command_that_is_not_known_is_ignored(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_a_command_that_is_not_known_is_ignored(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     one.send_frame(b"\x05LATER\x01\x02\x03", 4)
     assert one.ask("metadata")[0] == "metadata_page"
 
 
-def test_several_frames_are_refused(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_several_frames_are_refused(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     one.send_frame(b"", 1)
     one.send_frame(pack(["metadata", 7]))
     with pytest.raises(Refused) as refused:
@@ -217,8 +212,8 @@ def test_events(served: DaemonProcess, plain: Plain) -> None:
 
 
 @pytest.mark.parametrize("minor", [0, 99])
-def test_every_minor_version_is_answered(served: DaemonProcess, plain: Plain, minor: int) -> None:
-    one = plain(served, hello=False)
+def test_every_minor_version_is_answered(standing: DaemonProcess, plain: Plain, minor: int) -> None:
+    one = plain(standing, hello=False)
     assert one.hello(minor=minor)[2:4] == [2, 0]
     cells = one.ask("area", HERE, ["points"], 30.0)
     assert [handle[0] for handle in cells[4]] == FOUR
@@ -226,8 +221,8 @@ def test_every_minor_version_is_answered(served: DaemonProcess, plain: Plain, mi
     assert len(cells) == 12
 
 
-def test_what_the_daemon_does_not_know(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_what_the_daemon_does_not_know(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     assert refusal(one, "of_a_later_version", 1, 2) == "bad_request"
     assert one.ask("area", HERE, ["points"], 30.0, None, "new", {"a": 1})[0] == "cells"
     assert refusal(one, "hello", 3, 0) == "protocol_mismatch"
@@ -240,8 +235,8 @@ def test_what_the_daemon_does_not_know(served: DaemonProcess, plain: Plain) -> N
 # --- what is asked for ----------------------------------------------------------------------------
 
 
-def test_half_a_z_range(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_half_a_z_range(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     for half in ([1.0], [1.0, None], [None, 1.0]):
         for area in (["circle", 0, 0, 5, *half], ["square", 0, 0, 5, *half], ["box", 0, 0, 5, 5, *half]):
             for request in ("area", "differential", "metadata"):
@@ -250,8 +245,8 @@ def test_half_a_z_range(served: DaemonProcess, plain: Plain) -> None:
         assert one.ask("metadata", ["circle", 0, 0, 5, *z])[4]
 
 
-def test_wait_has_limits(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_wait_has_limits(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     low, high = map(float, said(r"f64 seconds, (\d+) … (\d+), that the reply may wait"))
     for wait in (low, high, int(high), None):
         assert one.ask("area", ["circle", 1e6, 0, 1], ["points"], wait)[0] == "cells"
@@ -259,8 +254,8 @@ def test_wait_has_limits(served: DaemonProcess, plain: Plain) -> None:
         assert refusal(one, "area", HERE, ["points"], wait) == "bad_request"
 
 
-def test_layers_in_canonical_form(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_layers_in_canonical_form(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     *others, canonical = said(
         r"`(ndt.*?)`, `(ndt.*?)` and `(ndt.*?)` are one layer, the last is its canonical form"
     )
@@ -282,8 +277,8 @@ def test_layers_in_canonical_form(served: DaemonProcess, plain: Plain) -> None:
     assert one.ask("differential", HERE, ["voxel( 1 )"])[9] == ["voxel(leaf=1.0)"], "cold: pending"
 
 
-def test_how_many_layers(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_how_many_layers(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     (most,) = said(r"an array of layer specs, at least one and at most (\d+);")
     assert one.ask("area", HERE, ["points"] * int(most))[9] == ["points"] * int(most)
     assert refusal(one, "area", HERE, ["points"] * (int(most) + 1)) == "bad_request"
@@ -303,11 +298,11 @@ def test_how_many_layers(served: DaemonProcess, plain: Plain) -> None:
 
 
 def test_removed_repeats_ids_as_the_client_wrote_them(
-    served: DaemonProcess, plain: Plain, divided_map: DividedMap
+    standing: DaemonProcess, plain: Plain, standing_map: DividedMap
 ) -> None:
-    one = plain(served)
-    far = divided_map.id("40_40.pcd")
-    held = [[far], ["40_40.pcd"], ["no such cell"], [divided_map.id("0_0.pcd")], [far]]
+    one = plain(standing)
+    far = standing_map.id("40_40.pcd")
+    held = [[far], ["40_40.pcd"], ["no such cell"], [standing_map.id("0_0.pcd")], [far]]
     assert one.ask("differential", HERE, ["points"], held)[5] == [far, "40_40.pcd", "no such cell"]
     failed = one.ask("selected", ["no such cell", "/nor/this"])[8]
     assert [(cell[0], cell[2]) for cell in failed] == [
@@ -315,8 +310,8 @@ def test_removed_repeats_ids_as_the_client_wrote_them(
     ]
 
 
-def test_limits_of_metadata(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_limits_of_metadata(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     first = one.ask("metadata", None, None, 0, 1)
     assert len(first[4]) == 1
     for start, limit in ((-5, 0), (0, -1), (-1, 1)):
@@ -333,14 +328,14 @@ def test_a_name_is_cut(served: DaemonProcess, plain: Plain) -> None:
     assert [row[4] for row in one.ask("stats")[5]] == ["ü" * int(most)]
 
 
-def test_every_connection_needs_a_hello(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
-    other = plain(served, hello=False)
+def test_every_connection_needs_a_hello(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
+    other = plain(standing, hello=False)
     assert refusal(other, "metadata") == "no_session"
     session = one.session
     assert one.hello()[7] == session, "a second hello on one connection"
     one.close()
-    again = plain(served, hello=False)
+    again = plain(standing, hello=False)
     assert refusal(again, "metadata") == "no_session"
     again.hello(session=session)
     assert again.session == session
@@ -370,8 +365,8 @@ def test_a_session_is_taken_over(served: DaemonProcess, plain: Plain) -> None:
     mapping.close()
 
 
-def test_a_session_is_a_wish(served: DaemonProcess, plain: Plain) -> None:
-    one = plain(served)
+def test_a_session_is_a_wish(standing: DaemonProcess, plain: Plain) -> None:
+    one = plain(standing)
     (power,) = said(r"\(another session's; 2\^(\d+) and more\)")
     for wish, granted in (
         (12345, True),
@@ -379,7 +374,7 @@ def test_a_session_is_a_wish(served: DaemonProcess, plain: Plain) -> None:
         (2 ** int(power), False),
         (2**64 - 1, False),
     ):
-        other = plain(served, hello=False)
+        other = plain(standing, hello=False)
         other.hello(session=wish)
         assert (other.session == wish) is granted
         assert 0 < other.session < 2 ** int(power)
@@ -388,7 +383,7 @@ def test_a_session_is_a_wish(served: DaemonProcess, plain: Plain) -> None:
         "one = PlainClient(sys.argv[1]); one.hello(session=int(sys.argv[2])); print(one.session)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, served.endpoint, str(one.session)],
+        [sys.executable, "-c", code, standing.endpoint, str(one.session)],
         capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2],
     )  # fmt: skip
     assert int(done.stdout) != one.session, "another process's is not taken over"
@@ -423,8 +418,8 @@ def test_a_session_goes_on_after_a_restart(
     mapping.close()
 
 
-def test_bye_arrives_before_the_connection_ends(served: DaemonProcess, plain: Plain) -> None:
-    one, watcher = plain(served), plain(served)
+def test_bye_arrives_before_the_connection_ends(standing: DaemonProcess, plain: Plain) -> None:
+    one, watcher = plain(standing), plain(standing)
     session = one.session
     one.send("bye")
     one.close()
@@ -444,14 +439,14 @@ def test_release_is_of_every_layer_that_carried_the_version(served: DaemonProces
 # --- handles and segments -------------------------------------------------------------------------
 
 
-def test_what_a_handle_says(served: DaemonProcess, plain: Plain, divided_map: DividedMap) -> None:
-    one = plain(served)
+def test_what_a_handle_says(standing: DaemonProcess, plain: Plain, standing_map: DividedMap) -> None:
+    one = plain(standing)
     handles = one.ask("area", HERE, ["points", "voxel(1)"], 30.0)[4]
     assert len(handles) == 8
     for handle in handles:
         cell, version, layer, _, _, nbytes, rows = handle[:7]
         segment, mapping = one.attach(handle)
-        assert segment.fields["cell_id"] == one.id_prefix + cell == divided_map.id(cell)
+        assert segment.fields["cell_id"] == one.id_prefix + cell == standing_map.id(cell)
         assert (segment.fields["layer"], segment.fields["rows"]) == (layer, rows)
         assert (segment.epoch, segment.version) == (one.epoch, version)
         assert nbytes % 4096 == 0
@@ -460,7 +455,7 @@ def test_what_a_handle_says(served: DaemonProcess, plain: Plain, divided_map: Di
         for name, column in segment.columns.items():
             assert xxhash.xxh3_64_intdigest(np.ascontiguousarray(column).data) == segment.checksums[name]
         if layer == "points":
-            source = divided_map.points(cell)
+            source = standing_map.points(cell)
             assert rows == len(source["x"])
             assert segment.columns["xyz"][:, 0].tobytes() == source["x"].tobytes()
         mapping.close()

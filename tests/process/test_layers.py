@@ -14,7 +14,7 @@ import shmmap
 from shmmap.layers.build import build_layer
 from shmmap.layers.contract import LayerTable
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT
+from tests.support.daemon_process import ROOT, DaemonProcess
 from tests.support.divided_map import DividedMap, random_points
 from tests.support.layer_oracles import install
 from tests.support.raw_client import DaemonError, RawCells, RawClient, RawHandle, circle, pack_versions
@@ -93,10 +93,8 @@ def test_a_layer_made_of_points_in_memory_is_the_same(
         assert_is(client, handle, divided_map, build_layer("voxel(leaf=1.0)", cloud(divided_map, name)))
 
 
-def test_what_is_no_layer_is_refused(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_what_is_no_layer_is_refused(standing: DaemonProcess, connect: Connect) -> None:
+    client = connect(standing)
     for spec in ("ndt", "nonsense(1)", "ndt(leaf=-1)", "ndt(leaf=2", "a" * 300, ""):
         with pytest.raises(DaemonError) as caught:
             ask(client, [spec])
@@ -104,10 +102,8 @@ def test_what_is_no_layer_is_refused(
     assert len(ask(client, ["points"]).cells) == 4
 
 
-def test_a_differential_request_holds_layers_apart(
-    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
-) -> None:
-    client = connect(daemon(divided_map.root))
+def test_a_differential_request_holds_layers_apart(standing: DaemonProcess, connect: Connect) -> None:
+    client = connect(standing)
     first = ask(client, [NDT])
     held = [[handle.id, handle.version, [NDT]] for handle in first.cells]
     area = circle(0.0, 0.0, 5.0)
@@ -118,9 +114,8 @@ def test_a_differential_request_holds_layers_apart(
     assert (reply.cells, reply.removed) == ([], [])
 
 
-def test_a_window_of_two_layers(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint) as client:
+def test_a_window_of_two_layers(standing: DaemonProcess) -> None:
+    with shmmap.connect(standing.endpoint) as client:
         found = client.around(0.0, 0.0, 5.0, layers=["points", "ndt(2)"], wait=60.0)
         layers = {cell.layer for cell in found}
         assert layers == {"points", "ndt(leaf=2.0)"}
@@ -130,11 +125,8 @@ def test_a_window_of_two_layers(daemon: DaemonFactory, divided_map: DividedMap) 
         del found, cell
 
 
-def test_a_window_follows_layers_however_they_are_written(
-    daemon: DaemonFactory, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
-    with shmmap.MapWindow(one.endpoint, 30, layers="voxel( 1 )", update_distance=0) as window:
+def test_a_window_follows_layers_however_they_are_written(standing: DaemonProcess) -> None:
+    with shmmap.MapWindow(standing.endpoint, 30, layers="voxel( 1 )", update_distance=0) as window:
         for x in (0.0, 15.0):
             window.move_to(x, 0.0)
             window.wait_until_current(60)
@@ -145,12 +137,9 @@ def test_a_window_follows_layers_however_they_are_written(
             del near
 
 
-def test_points_around_finds_each_layer_of_a_window_as_it_was_asked_for(
-    daemon: DaemonFactory, divided_map: DividedMap
-) -> None:
-    one = daemon(divided_map.root)
+def test_points_around_finds_each_layer_of_a_window_as_it_was_asked_for(standing: DaemonProcess) -> None:
     asked = ["voxel( 1 )", "points"]
-    with shmmap.MapWindow(one.endpoint, 30, layers=asked) as window:
+    with shmmap.MapWindow(standing.endpoint, 30, layers=asked) as window:
         assert window.points_around(0.0, 0.0, 5.0).count() == 0
         window.move_to(0.0, 0.0, wait=60)
         voxels = window.points_around(0.0, 0.0, 5.0).count()

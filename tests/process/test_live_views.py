@@ -57,7 +57,7 @@ def after(one: DaemonProcess, wanted: Callable[[LiveMapRow], bool]) -> LiveMapRo
     waiting = Deadline()
     with StatisticsReader(one.instance, one.shm_dir) as reader:
         while waiting(not (rows := reader.snapshot(cells=False).live) or not wanted(rows[0])):
-            os.sched_yield()
+            pass
     return rows[0]
 
 

@@ -24,7 +24,7 @@ def shmmap(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> Sh
     return Shmmap(daemon(divided_map.root), tmp_path)
 
 
-def test_an_area_beside_the_map(shmmap: Shmmap) -> None:
+def test_an_area_beside_the_map(reading: Shmmap) -> None:
     for words in (
         ("query", *FAR),
         ("query", *FAR, "--json"),
@@ -36,15 +36,15 @@ def test_an_area_beside_the_map(shmmap: Shmmap) -> None:
         ("export", *FAR, "--crop", "--json", "-o", "out.pcd"),
         ("map", *FAR),
     ):
-        done = shmmap.run(*words)
+        done = reading.run(*words)
         assert done.returncode == 1, words
         assert done.stderr == f"shmmap: no cell within 5 m of (9000, -70); {MAP}\n", words
         if "--json" in words:
             json.loads(done.stdout)
         elif words[0] in ("query", "map") and "--held" not in words:
             assert done.stdout == "", "nothing is drawn or counted where there is nothing"
-        assert shmmap.run(*words, "--allow-empty").returncode == 0, words
-    assert not (shmmap.cwd / "out.pcd").exists()
+        assert reading.run(*words, "--allow-empty").returncode == 0, words
+    assert not (reading.cwd / "out.pcd").exists()
     for area, said in (
         (("--square", "900,0,5"), "in the square of half-side 5 m about (900, 0)"),
         (
@@ -52,7 +52,7 @@ def test_an_area_beside_the_map(shmmap: Shmmap) -> None:
             "in x 900 .. 901 m, y 0 .. 2 m, z 1 .. 2 m",
         ),
     ):
-        assert f"no cell {said}; {MAP}" in shmmap.run("query", *area).stderr
+        assert f"no cell {said}; {MAP}" in reading.run("query", *area).stderr
 
 
 def test_what_is_empty_and_yet_an_answer(shmmap: Shmmap) -> None:
@@ -73,17 +73,17 @@ def test_what_is_empty_and_yet_an_answer(shmmap: Shmmap) -> None:
     assert len(shmmap.json("ls", "--box", "1,1,2,2")["cells"]) == 1
 
 
-def test_an_empty_layer_and_an_empty_output(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    done = shmmap.run("query", "--id", "0_0.pcd", "--layer", "crop(z_min=500,z_max=600)", "--wait", "60")
+def test_an_empty_layer_and_an_empty_output(reading: Shmmap, standing_map: DividedMap) -> None:
+    done = reading.run("query", "--id", "0_0.pcd", "--layer", "crop(z_min=500,z_max=600)", "--wait", "60")
     assert done.returncode == 1, done.stderr
     assert "no points in 1 cell" in done.stderr
-    assert shmmap.run(
+    assert reading.run(
         "query", "--id", "0_0.pcd", "--layer", "points", "crop(z_min=500,z_max=600)", "--allow-empty"
     ).returncode == 0  # fmt: skip
-    corner = divided_map.points("0_0.pcd")
+    corner = standing_map.points("0_0.pcd")
     assert not ((corner["x"] == 3.0) & (corner["y"] == 4.0)).any()
-    done = shmmap.run("export", "--circle", "3,4,0", "--crop", "-o", "out.pcd")
-    assert (done.returncode, list(shmmap.cwd.glob("*.pcd"))) == (1, [])
+    done = reading.run("export", "--circle", "3,4,0", "--crop", "-o", "out.pcd")
+    assert (done.returncode, list(reading.cwd.glob("*.pcd"))) == (1, [])
     assert "no point within 0 m of (3, 4) in 1 cell: nothing is written" in done.stderr
 
 
@@ -101,31 +101,31 @@ def test_areas_for_pins_and_evictions(shmmap: Shmmap, divided_map: DividedMap) -
     assert (answer["kept"], answer["freed"]) == (0, len(near))
 
 
-def test_lists_given_twice_add_up(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    found = shmmap.json("query", "--id", "0_0.pcd", "--id", "20_0.pcd", "20_20.pcd")
+def test_lists_given_twice_add_up(reading: Shmmap, standing_map: DividedMap) -> None:
+    found = reading.json("query", "--id", "0_0.pcd", "--id", "20_0.pcd", "20_20.pcd")
     assert len(found["cells"]) == 3
     held = [cell["id"] for cell in found["cells"]]
     area = ("--box", "1,1,39,39")
     words = [word for cell in held for word in ("--held", cell)]
-    assert [Path(cell["id"]).name for cell in shmmap.json("query", *area, *words)["cells"]] == ["0_20.pcd"]
+    assert [Path(cell["id"]).name for cell in reading.json("query", *area, *words)["cells"]] == ["0_20.pcd"]
     layers = ("--layer", "points", "--layer", "voxel(leaf=1.0)", "--wait", "60")
-    cells = shmmap.json("query", "--id", "0_0.pcd", *layers)["cells"]
+    cells = reading.json("query", "--id", "0_0.pcd", *layers)["cells"]
     assert len({cell["layer"] for cell in cells}) == 2
 
 
-def test_a_crop_has_the_points_inside_and_their_fields(shmmap: Shmmap, divided_map: DividedMap) -> None:
-    shmmap("export", "--circle", "20,20,7", "--z", "2,5", "--crop", "-o", "out.pcd")
-    cropped = read_pcd(shmmap.cwd / "out.pcd")
+def test_a_crop_has_the_points_inside_and_their_fields(reading: Shmmap, standing_map: DividedMap) -> None:
+    reading("export", "--circle", "20,20,7", "--z", "2,5", "--crop", "-o", "out.pcd")
+    cropped = read_pcd(reading.cwd / "out.pcd")
     wanted: dict[str, list[float]] = {name: [] for name in cropped}
-    for name in divided_map.in_circle(20, 20, 7):
-        points = divided_map.points(name)
+    for name in standing_map.in_circle(20, 20, 7):
+        points = standing_map.points(name)
         inside = (points["x"].astype(float) - 20) ** 2 + (points["y"].astype(float) - 20) ** 2 <= 49
         inside &= (points["z"] >= 2) & (points["z"] <= 5)
         for field, values in points.items():
             wanted[field] += values[inside].tolist()
     assert 0 < len(wanted["x"]) < 500
     assert {field: values.tolist() for field, values in cropped.items()} == wanted
-    assert shmmap.run("export", "--id", "0_0.pcd", "--crop", "-o", "other.pcd").returncode == 2
+    assert reading.run("export", "--id", "0_0.pcd", "--crop", "-o", "other.pcd").returncode == 2
 
 
 def test_a_moved_map_says_so_where_nothing_is_found(daemon: DaemonFactory, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import re
 import shlex
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -318,7 +317,7 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             near = client.around(-15.0, -15.0, 2.0, wait=60.0)
             assert near.complete
             while waiting(not list(one.state_dir.rglob("*.taken"))):
-                time.sleep(0.02)
+                pass
             web.refuse()
             while waiting(verbs.run(*is_healthy).returncode != 1):
                 pass
@@ -340,13 +339,13 @@ def test_the_link_is_down(daemon: DaemonFactory, tmp_path: Path) -> None:
             again = client.around(-15.0, -15.0, 2.0, wait=60.0)
             assert {cell.version for cell in again} == {cell.version for cell in near}
             while waiting(one.log.count("the map's origin is out of reach") < 2):  # in each run once
-                time.sleep(0.02)
+                pass
             web.listen()
             while waiting(not client.area(everywhere, wait=5.0).complete):
-                time.sleep(0.02)
+                pass
         for line in SERVING.blocks["log"]:
             while waiting(not is_shown(line, one.log)):
-                time.sleep(0.02)
+                pass
         while waiting(verbs.run(*is_healthy).returncode != 0):
             pass
 

@@ -40,15 +40,15 @@ def errors_are_said() -> Iterator[None]:
 
 
 @pytest.fixture
-def client(served: DaemonProcess) -> Iterator[shmmap.Client]:
-    with shmmap.connect(served.endpoint) as made:
+def client(standing: DaemonProcess) -> Iterator[shmmap.Client]:
+    with shmmap.connect(standing.endpoint) as made:
         yield made
 
 
 @pytest.mark.parametrize("name", ASKS)
-def test_beside_the_map(served: DaemonProcess, client: shmmap.Client, tmp_path: Path, name: str) -> None:
+def test_beside_the_map(standing: DaemonProcess, client: shmmap.Client, tmp_path: Path, name: str) -> None:
     ask = ASKS[name](client)
-    said = Shmmap(served, tmp_path).run("query", "--circle", "9000,-70,5").stderr
+    said = Shmmap(standing, tmp_path).run("query", "--circle", "9000,-70,5").stderr
     with pytest.warns(ShmmapWarning) as caught:
         assert len(ask(9000, -70, 5)) == 0
     assert [f"shmmap: {one.message}\n" for one in caught] == [said]
@@ -86,25 +86,26 @@ def test_failed_cells(daemon: Factory, divided_map: DividedMap, tmp_path: Path) 
             assert window.move_to(1.0, 1.0).failed, "a window says it in its update"
 
 
-def test_pending_cells(served: DaemonProcess, client: shmmap.Client) -> None:
+def test_pending_cells(served: DaemonProcess) -> None:
     """One that is loaded, three that no loader loads in time."""
-    assert client.selected("0_0.pcd", wait=60).complete
-    served.stop_loaders()
-    with pytest.warns(ShmmapWarning) as caught:
-        cells = client.around(1, 1, 5, wait=0.2)
-    lines = str(caught[0].message).splitlines()
-    assert lines[0] == "1 of 4 cells are there:"
-    assert sorted(lines[1:]) == sorted(f"pending: {one.id} (points)" for one in cells.pending)
-    assert len(lines) == 4
-    with pytest.raises(LoadTimeout, match=r"still being loaded, and 2 more \(ask again, or wait longer"):
-        client.around(1, 1, 5, wait=0.2, strict=True)
-    assert len(client.around(1, 1, 5, wait=None).pending) == 3, "no request waited for them"
-    with pytest.warns(ShmmapWarning, match="and 25 more"):
-        client.around(0, 0, 100, wait=0.01)
+    with shmmap.connect(served.endpoint) as client:
+        assert client.selected("0_0.pcd", wait=60).complete
+        served.stop_loaders()
+        with pytest.warns(ShmmapWarning) as caught:
+            cells = client.around(1, 1, 5, wait=0.2)
+        lines = str(caught[0].message).splitlines()
+        assert lines[0] == "1 of 4 cells are there:"
+        assert sorted(lines[1:]) == sorted(f"pending: {one.id} (points)" for one in cells.pending)
+        assert len(lines) == 4
+        with pytest.raises(LoadTimeout, match=r"still being loaded, and 2 more \(ask again, or wait longer"):
+            client.around(1, 1, 5, wait=0.2, strict=True)
+        assert len(client.around(1, 1, 5, wait=None).pending) == 3, "no request waited for them"
+        with pytest.warns(ShmmapWarning, match="and 25 more"):
+            client.around(0, 0, 100, wait=0.01)
 
 
-def test_unknown_cells(served: DaemonProcess, client: shmmap.Client, tmp_path: Path) -> None:
-    done = Shmmap(served, tmp_path).run("query", "--id", "0_0.pdc")
+def test_unknown_cells(standing: DaemonProcess, client: shmmap.Client, tmp_path: Path) -> None:
+    done = Shmmap(standing, tmp_path).run("query", "--id", "0_0.pdc")
     with pytest.warns(ShmmapWarning) as caught:
         client.selected(["0_0.pdc", "0_0.pcd"])
     first, failure, hint = str(caught[0].message).splitlines()
@@ -124,7 +125,7 @@ def test_an_empty_layer(daemon: Factory, tmp_path: Path) -> None:
             client.area(shmmap.Box(-1e4, -1e4, 1e4, 1e4), strict=True)
 
 
-def test_it_is_said_once_for_each_place_in_a_program(served: DaemonProcess) -> None:
+def test_it_is_said_once_for_each_place_in_a_program(standing: DaemonProcess) -> None:
     code = (
         "import sys, shmmap\n"
         "client = shmmap.connect(sys.argv[1])\n"
@@ -135,14 +136,14 @@ def test_it_is_said_once_for_each_place_in_a_program(served: DaemonProcess) -> N
         "        window.move_to(x, 0, wait=5)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, served.endpoint], capture_output=True, text=True, check=False, cwd=ROOT
+        [sys.executable, "-c", code, standing.endpoint], capture_output=True, text=True, check=False, cwd=ROOT
     )
     assert done.returncode == 0
     assert done.stderr.count("no cell within 5 m of (9000, 0)") == 1
     assert done.stderr.startswith("<string>:4: ShmmapWarning: ")
 
 
-def test_points_within_a_radius(client: shmmap.Client, divided_map: DividedMap) -> None:
+def test_points_within_a_radius(client: shmmap.Client, standing_map: DividedMap) -> None:
     near = client.points_around(3.0, 4.0, 25.0)
     whole = client.around(3.0, 4.0, 25.0)
     xyz = np.concatenate([cell.xyz for cell in whole])

@@ -57,7 +57,7 @@ def stop(pid: int) -> None:
     os.kill(pid, signal.SIGSTOP)
     waiting = Deadline()
     while waiting(_stat(pid)[0] != "T"):
-        os.sched_yield()
+        pass
 
 
 class DaemonProcess(daemon_process.DaemonProcess):
@@ -134,17 +134,25 @@ class DaemonProcess(daemon_process.DaemonProcess):
 
 
 LIMIT_S = 240.0
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.0005, 0.016
 
 
 class Deadline:
-    """``while waiting(not_yet): ask()``, with ``waiting = Deadline()`` before the loop."""
+    """``while waiting(not_yet): ask()``, with ``waiting = Deadline()`` before the loop.
+
+    Between two questions it pauses, 0.5 ms at first and then longer: what is waited for has the processor.
+    """
 
     def __init__(self) -> None:
         self._end_s = time.monotonic() + LIMIT_S
+        self._pause_s = FIRST_PAUSE_S
 
     def __call__(self, not_yet: bool) -> bool:
         """Return ``not_yet``; AssertionError once that has been so for too long."""
-        assert not not_yet or time.monotonic() < self._end_s, f"it did not happen within {LIMIT_S:.0f} s"
+        if not_yet:
+            assert time.monotonic() < self._end_s, f"it did not happen within {LIMIT_S:.0f} s"
+            time.sleep(self._pause_s)
+            self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
         return not_yet
 
 
@@ -157,9 +165,9 @@ TIMEOUT_S = 60.0
 def until(done: Callable[[], object], why: Callable[[], str]) -> None:
     """Wait until something is so; ``why`` says what is instead."""
     end_s = time.monotonic() + TIMEOUT_S
-    while not done():
+    waiting = Deadline()
+    while waiting(not done()):
         assert time.monotonic() < end_s, why()
-        time.sleep(0.02)
 
 
 def counters(one: DaemonProcess) -> dict[str, int]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,7 +30,7 @@ def until(done: Callable[..., object], *values: object) -> None:
     """Wait until something is so of these values."""
     waiting = Deadline()
     while waiting(not done(*values)):
-        time.sleep(0.02)
+        pass
 
 
 def until_health(one: DaemonProcess, code: int, says: str = "") -> str:
@@ -56,7 +55,7 @@ def all_cells(client: shmmap.Client) -> shmmap.CellSet:
     """Wait until a request for all cells is answered in full; returns them."""
     waiting = Deadline()
     while waiting(not (cells := client.area(ALL, wait=5.0)).complete):
-        time.sleep(0.02)
+        pass
     return cells
 
 
@@ -73,7 +72,6 @@ def until_asked(web: FaultyWeb, path: str, times: int, status: int = 0) -> list[
     asked: list[tuple[str, int]] = []
     waiting = Deadline()
     while waiting(sum(one == path and status in (0, code) for one, code in asked) < times):
-        time.sleep(0.02)
         asked += web.requests()
     return asked
 

@@ -23,6 +23,8 @@ from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon, finis
 
 SIDE = 14
 CELLS = SIDE * SIDE
+LONG_S = 3000.0
+"""Longer than a test waits for anything: no reply leaves early because the loads are slow."""
 short_turns = pytest.mark.usefixtures("short_turns")
 
 
@@ -47,7 +49,7 @@ def test_a_turn_ends_when_its_time_is_used(
         return max(b - a for a, b in itertools.pairwise((*times, next(looks))))
 
     for count in (1, 2):  # cold, warm
-        assert longest(one.cells.area(session, Area(count, EVERYWHERE, wait=30.0))) <= 8
+        assert longest(one.cells.area(session, Area(count, EVERYWHERE, wait=LONG_S))) <= 8
         assert len(one.cells_of(count).cells) == CELLS
     ids = tuple(cell.id for cell in one.cells_of(2).cells)
     assert longest(one.cells.selected(session, Selected(3, ids))) <= 8
@@ -76,7 +78,7 @@ def test_nothing_stays_of_one_whose_client_leaves_meanwhile(inner: Inner, made: 
     one.pool.limit = 0
     for count in range(1, 4 * CELLS, CELLS // 4):
         session = one.session()
-        work = one.cells.area(session, Area(count, EVERYWHERE, wait=30.0))
+        work = one.cells.area(session, Area(count, EVERYWHERE, wait=LONG_S))
         for _ in range(count):
             next(work)
         one.cells.on_disconnect(session)
@@ -90,7 +92,7 @@ def test_nothing_stays_of_one_whose_client_leaves_meanwhile(inner: Inner, made: 
 def test_the_request_of_a_session_that_ends_meanwhile_is_refused(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
-    work = one.cells.area(session, Area(1, EVERYWHERE, wait=30.0))
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=LONG_S))
     next(work)
     one.sessions.close(session)
     with pytest.raises(NoSession):
@@ -108,7 +110,7 @@ def test_the_map_changes_meanwhile(inner: Inner, tmp_path: Path, warm: bool) -> 
         one.everything(999)
     gone = sorted(made.corners)
     for count in range(1, 4 * CELLS, CELLS // 4):
-        work = one.cells.area(one.session(), Area(count, EVERYWHERE, wait=30.0))
+        work = one.cells.area(one.session(), Area(count, EVERYWHERE, wait=LONG_S))
         for _ in range(count):
             next(work, None)
         cells, answered = sorted(made.corners), any(reply.request == count for _, reply in one.replies)
@@ -126,7 +128,7 @@ def test_many_loads_end_while_it_is_gone_through(inner: Inner, made: DividedMap)
     """All of what it would wait for is there before it waits: it is answered all the same."""
     one = inner(str(made.root))
     session = one.session()
-    work = one.cells.area(session, Area(1, EVERYWHERE, wait=3000.0))
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=LONG_S))
     while len(one.loads) < CELLS:
         next(work)
     one.run_until(lambda: one.ledger.resident_count == CELLS)
@@ -200,7 +202,7 @@ def test_the_map_changes_while_differences_are_found(inner: Inner, tmp_path: Pat
 def test_very_much_is_released_in_several_turns(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
-    one.ask(session, Area(1, EVERYWHERE, wait=30.0))
+    one.ask(session, Area(1, EVERYWHERE, wait=LONG_S))
     versions = [cell.version for cell in one.cells_of(1).cells]
     assert len(session.held) == CELLS
     dispatch = Dispatch(*[None] * len(fields(Dispatch)))  # type: ignore[arg-type]
@@ -216,10 +218,10 @@ def test_very_much_is_released_in_several_turns(inner: Inner, made: DividedMap) 
 def test_what_came_for_another_client_meanwhile_is_not_loaded_again(inner: Inner, made: DividedMap) -> None:
     one = inner(str(made.root))
     session = one.session()
-    work = one.cells.area(session, Area(1, EVERYWHERE, wait=3000.0))
+    work = one.cells.area(session, Area(1, EVERYWHERE, wait=LONG_S))
     for _ in range(CELLS + 5):  # found, and the first loads asked for
         next(work)
-    one.ask(one.session(), Area(2, EVERYWHERE, wait=30.0))
+    one.ask(one.session(), Area(2, EVERYWHERE, wait=LONG_S))
     assert len(one.cells_of(2).cells) == CELLS
     finish(work)
     assert len(one.cells_of(1).cells) == CELLS
@@ -238,7 +240,7 @@ def test_a_session_that_ends_while_a_request_that_waited_is_answered(inner: Inne
 
     session.connection.refuse = refuse  # type: ignore[method-assign]
     one.hold_answers = True
-    one.ask(session, Area(1, EVERYWHERE, wait=30.0))
+    one.ask(session, Area(1, EVERYWHERE, wait=LONG_S))
     one.run_until(lambda: one.due)
     next(one.due[0])
     one.sessions.close(session)

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Client and daemon of different major versions: each names both versions, and what to update."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from tests.process.conftest import DaemonFactory
+from tests.support.command_line import Shmmap, Verbs
+from tests.support.divided_map import DividedMap
+from tests.support.message_pack import pack, unpack
+from tests.support.plain_client import PlainClient
+
+HELLO_OF_1_5 = bytes.fromhex("95 a568656c6c6f 07 01 05 a36f6c64")
+"""What a client of 1.5 that is called "old" begins with, as request 7."""
+
+
+def test_a_client_of_1_x_is_refused_and_stays_connected(
+    daemon: DaemonFactory, divided_map: DividedMap
+) -> None:
+    client = PlainClient(daemon(divided_map.root).endpoint)
+    client.send_frame(HELLO_OF_1_5)
+    said = "client speaks protocol 1.5, daemon 2.0"
+    assert client.message() == ["error", 7, "protocol_mismatch", said, "update the client, and restart it"]
+    assert client.hello()[0] == "welcome"
+    client.close()
+
+
+def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
+    """It answers a hello of 2.0 as 1.5 did: an error whose elements have not changed since."""
+    path, said = short_path / "old.sock", "client speaks protocol 2.0, daemon 1.5"
+    asked: list[Any] = []
+
+    def refuse() -> None:
+        client, hello = router.recv_multipart()
+        asked.extend(unpack(hello))
+        refusal = ["error", asked[1], "protocol_mismatch", said, "update the older of the two"]
+        router.send_multipart([client, pack(refusal)])
+
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        router.linger = 0
+        router.bind(f"ipc://{path}")
+        daemon = threading.Thread(target=refuse)
+        daemon.start()
+        printed = shmmap("query", "--circle", "0,0,5", "--endpoint", str(path), code=76)
+        daemon.join()
+    assert (asked[0], asked[2:4]) == ("hello", [2, 0])
+    assert said in printed
+    assert "update the older of the two" in printed
+
+
+def test_statistics_of_an_older_daemon_are_named(
+    daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
+) -> None:
+    """A reader does not take what 1.x left for rows of 2.0; a daemon that starts replaces it."""
+    one = daemon(divided_map.root, start=False)
+    shmmap = Shmmap(one, tmp_path)
+    header = struct.pack("<8sHHI12I", b"SHMSTAT\x01", 1, 5, 0x01020304, 128, 0, 160, *[4096] * 9)
+    path = Path(one.shm_dir, f"shmmap.{one.instance}.statistics")
+    path.write_bytes(header + bytes(100_000))
+    for verb in ("status", "ls", "health"):
+        done = shmmap.run(verb)
+        assert (done.returncode, done.stdout) == (65, "")
+        assert "statistics 1.5 of an older daemon: this program reads 2.x" in done.stderr
+        assert "update the daemon" in done.stderr
+    one.start()
+    assert shmmap.json("status")["state"] == "healthy"
