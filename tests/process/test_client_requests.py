@@ -413,7 +413,7 @@ def test_segments_that_are_elsewhere_are_no_passing_problem(
 
 
 @BOTH
-def test_of_several_sockets_the_telling_one_is_named(
+def test_of_several_sockets_the_one_with_a_reason_is_named(
     daemon: Factory,
     divided_map: DividedMap,
     connect: Connect,

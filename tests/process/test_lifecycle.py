@@ -180,7 +180,7 @@ def test_killed_and_started_again(daemon: DaemonFactory, connect: Connect, divid
         assert reader.checksums() == [expected]
 
 
-def test_what_the_statistics_tell(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_what_the_statistics_have(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     seen = read_statistics(one.instance, one.shm_dir)
     assert seen.state == "healthy"

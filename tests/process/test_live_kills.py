@@ -117,7 +117,7 @@ def keep(daemon: DaemonFactory, tmp_path: Path) -> Callable[[], DaemonProcess]:
     return make
 
 
-def test_whoever_is_killed_whenever(keep: Callable[[], DaemonProcess]) -> None:
+def test_any_process_is_killed_at_any_time(keep: Callable[[], DaemonProcess]) -> None:
     rng = random.Random(KILLS)
     one = keep()
     mapper = Mapper(one.endpoint, KILLS * SCANS_A_KILL)

@@ -112,7 +112,7 @@ def test_no_session_and_a_later_version(standing: DaemonProcess, connect: Connec
     assert len(client.area(circle(0, 0, 5)).cells) == 4
 
 
-def test_requests_in_flight_are_told_apart(
+def test_requests_in_flight_are_distinguished(
     standing: DaemonProcess, connect: Connect, standing_map: DividedMap
 ) -> None:
     """Many questions before the first answer; each answer says which it is for."""

@@ -93,7 +93,7 @@ def test_removed_sockets_come_back(daemon: DaemonFactory, divided_map: DividedMa
 def test_a_socket_whose_directory_cannot_be_made(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
 ) -> None:
-    """Told by `health`; it comes back as soon as that is possible."""
+    """`health` says so; it comes back as soon as that is possible."""
     one = daemon(divided_map.root)
     moved_away = one.runtime_dir + "-moved-away"
     os.rename(one.runtime_dir, moved_away)

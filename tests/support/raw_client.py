@@ -249,7 +249,7 @@ class RawClient:
         return self.cells_reply(self.ask("selected", ids, ["points"], wait))
 
     def release(self, versions: list[int] | None = None) -> None:
-        """Tell the daemon what was unmapped."""
+        """Report to the daemon what was unmapped."""
         self.ask("release", None if versions is None else pack_versions(versions))
 
     def path(self, handle: RawHandle) -> str:

@@ -68,13 +68,13 @@ class Walker:
 
     @contextlib.contextmanager
     def walking(self) -> Iterator[None]:
-        sys.setprofile(self._hear)
+        sys.setprofile(self._on_event)
         try:
             yield
         finally:
             sys.setprofile(None)
 
-    def _hear(self, frame: FrameType, event: str, _argument: Any) -> None:
+    def _on_event(self, frame: FrameType, event: str, _argument: Any) -> None:
         if event == "return" and frame.f_code.co_name == self._until:
             self._over = True
         if event != "call" or self._over or not frame.f_code.co_filename.startswith(PACKAGE):

@@ -65,7 +65,7 @@ def test_forgotten_layers_leave_no_tables(tmp_path: Path, inner: Inner) -> None:
 def test_any_number_of_layers_is_in_memory(
     tmp_path: Path, inner: Inner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Tables are for those with the most segments; the others are found without, and nobody is refused."""
+    """Tables are for those with the most segments; the others are found without, and none is refused."""
     monkeypatch.setattr(warm_index, "TABLES_BYTES", 0)
     monkeypatch.setattr(warm_index, "LEAST_TABLES", 2)
     made = make_map(tmp_path / "map", columns=4, rows=2, points=50)

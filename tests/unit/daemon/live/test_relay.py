@@ -240,7 +240,7 @@ def test_settings_refuse_the_start_where_there_is_nothing_else_to_serve(
         starting.relay.wait_until_serving(60.0, alone=True)
 
 
-def test_a_worker_that_says_nothing_keeps_nobody_waiting(starting: World) -> None:
+def test_a_worker_that_says_nothing_keeps_no_client_waiting(starting: World) -> None:
     """Points are served; each map is shown with the problem, and clients are asked to come again."""
     starting.relay.start()
     starting.relay.wait_until_serving(2.0, alone=False)

@@ -151,7 +151,7 @@ def test_an_unchanged_file_is_not_loaded_again(broken: InnerDaemon) -> None:
     assert not broken.loads.by_key
 
 
-def test_who_does_not_wait_is_told_at_once(broken: InnerDaemon, small_map: DividedMap) -> None:
+def test_a_request_that_does_not_wait_is_answered_at_once(broken: InnerDaemon, small_map: DividedMap) -> None:
     """And a loader is sent to look, so that the next one gets the mended file."""
     with broken.loaders_standing_still():
         broken.ask(broken.session(), Selected(2, (CELL,)))
@@ -166,7 +166,7 @@ def test_who_does_not_wait_is_told_at_once(broken: InnerDaemon, small_map: Divid
 
 
 def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: DividedMap) -> None:
-    """After 1, 2, 4, ... and at most 30 seconds, however often somebody asks; at once when it changed."""
+    """After 1, 2, 4, ... and at most 30 seconds, however often clients ask; at once when it changed."""
     path = small_map.pcd_dir / "0_0.pcd"
     whole = path.read_bytes()
     path.write_bytes(whole[:-3])
@@ -192,7 +192,7 @@ def test_a_bad_file_is_tried_again_later_and_later(inner: Inner, small_map: Divi
 def test_a_file_that_kills_its_loader_is_tried_again_later_and_later(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each try costs a loader: that somebody asks again is no reason for another one."""
+    """Each try costs a loader: that a client asks again is no reason for another one."""
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "crash:0_0.pcd")
     one = inner(small_map.root)
     one.stop_clock()

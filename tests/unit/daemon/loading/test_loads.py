@@ -132,7 +132,7 @@ def test_points_pass_layers_that_no_loader_can_take() -> None:
     assert queue.next() is layer
 
 
-def test_what_nobody_waits_for_comes_last() -> None:
+def test_what_no_request_waits_for_comes_last() -> None:
     queue = LoadQueue()
     check, asked = load(0), load()
     queue.push(check, float("inf"), None)

@@ -97,7 +97,7 @@ def test_a_window_follows_with_hysteresis(
     assert one.windows.center("a") == center
 
 
-def test_only_what_is_near_nobody_makes_room_for_what_is_near() -> None:
+def test_only_what_is_near_no_client_makes_room_for_what_is_near() -> None:
     one = Residency(Limits(27 * 10, radius=1, hysteresis=0.0, loads=100), new_bytes=10)
     one.move("a", (0.5, 0.5, 0.5))
     while (chunk := one.next_load(0.0)) is not None:
