@@ -366,7 +366,7 @@ def test_what_others_hold_does_not_count(
 
 
 def test_what_another_request_got_is_not_forgotten(warm: tuple[InnerDaemon, Cells]) -> None:
-    """Two windows of one client: each says what it holds, and the session has both's until it releases them."""
+    """Two windows of one client: each says what it holds; the session has both until it releases them."""
     inner, everything = warm
     session = inner.session()
     half = Differential(2, HALF)
