@@ -57,10 +57,10 @@ class WatchedDescriptors:
         self._epoll.close()
 
 
-TURN_S: Final = 0.001
+TURN_S: Final = 0.0005
 """Time after which the rest is left to the next turn.  A request for some hundred cells needs less."""
 
-BATCH: Final = 32
+BATCH: Final = 16
 """Things between two looks at the time, where each takes some microseconds."""
 
 Item = TypeVar("Item")

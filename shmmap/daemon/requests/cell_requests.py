@@ -163,7 +163,7 @@ class CellRequests:
         area = messages.area_from_message(message.area)
         layers = limits.layers_of(message.layers)
         catalogue, versions = self._cache.catalogue, self._cache.layers
-        cells, covered = catalogue.query(area, limits.MAX_CELLS)
+        cells, covered = catalogue.query(area, MAX_COMPARED)
         looks_around = catalogue.pages is not None and versions.halo_m(layers) > 0.0
         is_one = len(layers) == 1 and area.z is None
         if is_one and covered and not looks_around and len(cells) <= MAX_COMPARED:

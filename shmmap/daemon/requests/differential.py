@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from shmmap.daemon.cache.cell_cache import CellCache
 from shmmap.daemon.records import Resident
-from shmmap.daemon.requests.pending_request import PendingRequest
+from shmmap.daemon.requests.pending_request import LARGE, PendingRequest
 from shmmap.daemon.turns import batched
 from shmmap.layers.spec import canonical_layers
 from shmmap.protocol.codec import pack_versions, unpack_versions
@@ -105,6 +105,7 @@ def difference(
     cache, found = wanted.cache, wanted.found
     versions, of_version = cache.layers, cache.warm.of_version
     version_of = versions.version
+    yield from wanted.pause(now=len(indices) > LARGE)
     for cells in batched(indices):
         yield from wanted.pause()
         for unknown in versions.unknown(cells, layers):
