@@ -2,7 +2,7 @@
 """Leaves out of the ``ndt`` layer beside those that PCL's voxel grid builds from the same cells' points.
 
 Counts are equal.  Means and inverse covariances are as near as those of the layer itself are in
-``tests/unit/layers/test_ndt.py``.  PCL sums centroids in float32, one point after the other: with coordinates
+``tests/unit/layers/test_voxels.py``.  PCL sums centroids in float32, one point after the other: with coordinates
 of some 100 m and some 100 points in a voxel its sum is up to a millimetre off.
 """
 
