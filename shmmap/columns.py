@@ -33,9 +33,9 @@ class ColumnSpec:
 
 
 def column_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Names for columns beside ``xyz``: each one printable word, none twice, none that PCD takes for another.
+    """Return names for columns beside ``xyz``: printable words, each once, and none that PCD reserves.
 
-    White space and what cannot be printed become underscores, a name in use gets a number.
+    White space and unprintable characters become underscores; a name that is in use gets a number.
     """
     taken = {"xyz", "x", "y", "z", "_"}  # a field called _ is padding
     found: list[str] = []

@@ -86,17 +86,17 @@ def read_only(dtype: Any, dimensions: int) -> Any:
 def compiled(*signatures: Any, brief: bool = False, **settings: Any) -> Callable[[F], F]:
     """Compile a kernel for these signatures now; it runs without the interpreter lock.
 
-    One that is ``brief`` keeps it: to get it back among other threads takes longer than some microseconds.
+    A ``brief`` kernel keeps it: among other threads, getting the lock back takes longer than the kernel.
 
     Parameters
     ----------
     *signatures
-        Types of the arguments and of the result.  Without one it is compiled when it is first called
-        with arguments of new types.
+        Types of the arguments and of the result.  Without any, the kernel is compiled when it is first
+        called with arguments of new types.
     brief
-        It takes some microseconds.
+        Whether the kernel runs for a few microseconds only.
     **settings
-        More of `numba.njit`'s.
+        Further options of `numba.njit`.
     """
 
     def compile_now(function: F) -> F:

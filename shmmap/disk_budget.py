@@ -170,7 +170,7 @@ def _files(place: str) -> Iterator[os.DirEntry[str]]:
 
 
 def _order_of_removal(found: list[_Kept], limit_bytes: int) -> list[_Kept]:
-    """The least recently used first, then the index pages that are kept longest."""
+    """Sort the least recently used first, then the index pages that are kept longest."""
     found.sort(key=lambda kept: kept.used_s)
     index_bytes = 0
     last: set[int] = set()

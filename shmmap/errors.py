@@ -27,11 +27,11 @@
     ├── SegmentError           a segment cannot be used
     │   ├── StaleHandle        it is gone: ask again                              exit 1
     │   └── SegmentCorrupt     its bytes are wrong (magic, version, checksum)     exit 65
-    ├── CellError              one cell could not be had; others are unaffected   exit 1
+    ├── CellError              one cell was not loaded; others are unaffected     exit 1
     │   ├── UnknownCell        the map has no such cell
     │   ├── LoadFailed         its source cannot be read
     │   ├── LoadTimeout        loading took longer than its deadline
-    │   ├── OverBudget         it does not fit in memory; `holders` says who uses it
+    │   ├── OverBudget         it does not fit in memory, which `holders` fill
     │   ├── NoSpace            the shared-memory file system is full
     │   └── Offline            its origin cannot be reached at present           exit 75
     ├── PackageMissing         a Python package is not installed                  exit 69
@@ -224,7 +224,7 @@ class InstanceBusy(ShmmapError):
 
 
 class CannotStart(ShmmapError):
-    """The daemon cannot start now, but perhaps later: something is full, not there yet, or in the way."""
+    """The daemon cannot start now, but perhaps later: a required resource is unavailable."""
 
     code = "cannot_start"
     exit_code = 71  # EX_OSERR of sysexits.h
@@ -245,7 +245,7 @@ class NotPermitted(ShmmapError):
 
 
 class LimitReached(ShmmapError):
-    """This process may have no more of something: files, threads, memory; the message names the limit."""
+    """A limit of this process is reached: on files, threads or memory; the message names it."""
 
     code = "limit_reached"
     exit_code = 71  # EX_OSERR of sysexits.h
@@ -286,9 +286,9 @@ class SegmentCorrupt(SegmentError):
 
 
 class CellError(ShmmapError):
-    """One cell, ``cell_id``, ``layer``, could not be had; other cells and requests are unaffected.
+    """One cell, ``cell_id``, ``layer``, could not be loaded; other cells and requests are unaffected.
 
-    ``holders``, for `OverBudget`, says who uses the memory; ``str`` of each is a line to read.  ``box`` says
+    ``holders``, for `OverBudget`, are the users of the memory; ``str`` of each is a line to read.  ``box`` is
     where the cell lies, ``min_x, min_y, max_x, max_y`` in metres, map frame; None where that is not known.
     """
 
@@ -325,7 +325,7 @@ class LoadTimeout(CellError):
 
 
 class OverBudget(CellError):
-    """The cell does not fit in the budget or the session's quota; `holders` says who uses the memory."""
+    """The cell does not fit in the budget or the session's quota; `holders` fill the memory."""
 
     code = "over_budget"
 

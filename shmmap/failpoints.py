@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places where a test can break a process, to see what that leaves: ``SHMMAP_TEST_CRASH=STEP[:N[:FILE]]``.
+"""Places where a test can kill a process, or make it fail: ``SHMMAP_TEST_CRASH=STEP[:N[:FILE]]``.
 
-The process sends itself SIGKILL when it comes to STEP for the Nth time (the first, if N is not
-given).  With FILE only the process that makes this file dies: those that take its place live on,
-and the test sees that the step was reached.
+The process sends itself SIGKILL when it reaches STEP for the Nth time (by default the first).  With FILE,
+the process creates this file first, and does not die if the file exists: so only one process dies, its
+replacement lives, and the test sees that the step was reached.
 
-``SHMMAP_TEST_DEFECT=STEP:N:FILE`` has the step raise an exception N times instead, as soon as there is this
-file.  Without these variables a step is an empty function.
+With ``SHMMAP_TEST_DEFECT=STEP:N:FILE`` the step raises an exception N times instead, once this file exists.
+Without these variables a step is an empty function.
 """
 
 from __future__ import annotations
@@ -55,47 +55,19 @@ LIVE_STEPS: Final = (
     "live.flushed",
 )
 ORIGIN_STEPS: Final = (
-    "publish.send",
-    "publish.shard",
-    "publish.root",
-    "version.entry",
-    "version.switch",
-    "version.switched",
-    "sign.keys",
-    "sign.root",
-    "sign.metadata",
-    "sign.timestamp",
-    "sign.signed",
-    "sign.switch",
-    "sign.switched",
-    "sign.repaired",
-    "sign.nextkey",
-    "sign.nextroot",
-    "sign.renewed",
-    "sign.rotated",
-    "restore.entry",
-    "restore.looked",
-    "prune.entry",
-    "prune.listed",
-    "prune.object",
-    "prune.part",
-    "slice.shard",
-    "slice.part",
-    "slice.made",
-    "join.root",
-    "join.entry",
-    "join.looked",
-    "join.part",
-    "fetch.cell",
-    "fetch.whole",
-    "fetch.renamed",
-    "tier.made",
-    "tier.written",
-    "tier.named",
+    *("publish.send", "publish.shard", "publish.root"),
+    *("version.entry", "version.switch", "version.switched"),
+    *("sign.keys", "sign.root", "sign.metadata", "sign.timestamp", "sign.signed"),
+    *("sign.switch", "sign.switched", "sign.repaired"),
+    *("sign.nextkey", "sign.nextroot", "sign.renewed", "sign.rotated"),
+    *("restore.entry", "restore.looked"),
+    *("prune.entry", "prune.listed", "prune.object", "prune.part"),
+    *("slice.shard", "slice.part", "slice.made"),
+    *("join.root", "join.entry", "join.looked", "join.part"),
+    *("fetch.cell", "fetch.whole", "fetch.renamed"),
+    *("tier.made", "tier.written", "tier.named"),
     "trim.file",
-    "taken.head",
-    "taken.written",
-    "taken.named",
+    *("taken.head", "taken.written", "taken.named"),
 )
 CLIENT_STEPS: Final = ("client.answer", "client.open", "client.lock", "client.map")
 

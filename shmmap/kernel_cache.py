@@ -41,7 +41,7 @@ _unkept: list[str] = []
 
 
 def kernel_directory() -> Path | None:
-    """Directory of compiled kernels, made if missing; None, and said once, where none can be used."""
+    """Return the directory of compiled kernels, made if missing; None, logged once, if none can be used."""
     try:
         path = _place()
         with contextlib.suppress(FileExistsError):
@@ -54,7 +54,7 @@ def kernel_directory() -> Path | None:
 
 
 def compiled_mark() -> Path | None:
-    """The file that says that all kernels of layers are compiled, for this version, Python and numba.
+    """Return the file that marks all kernels of layers as compiled, for this version, Python and numba.
 
     None where they cannot be kept, or there is no numba.
     """
@@ -161,7 +161,7 @@ def _place() -> Path:
 
 @contextlib.contextmanager
 def _opened(directory: Path) -> Iterator[int]:
-    """The directory's descriptor; it is checked, and what is opened in it is in that directory."""
+    """Open a directory, check it, and yield its descriptor: what is opened in it is in that directory."""
     fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         _check_trust(os.fstat(fd), directory)
@@ -172,7 +172,7 @@ def _opened(directory: Path) -> Iterator[int]:
 
 def _read(directory: Path, name: str) -> bytes:
     with _opened(directory) as parent:
-        # nothing to wait for, if it is a pipe; no way out, if it is a link
+        # a pipe is not waited for; a link is not followed
         fd = os.open(name, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent)
     try:
         status = os.fstat(fd)

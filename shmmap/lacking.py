@@ -37,8 +37,8 @@ __all__ = [
 _NOT_COVERED: Final = "the daemon does not know yet all that the map has there"
 _OUT_OF_REACH: Final = "the list of cells there cannot be reached at present"
 _NAMED_CELLS: Final = 3
-_MOST_CELLS: Final = 20_000  # to look at each for one that looks alike takes a second at most
-_MOST_LINES: Final = 10  # of a warning
+_MAX_CELLS: Final = 20_000  # to look at each for one that looks alike takes a second at most
+_MAX_LINES: Final = 10  # of a warning
 
 _Bounds = tuple[float, float, float, float]
 
@@ -82,8 +82,8 @@ def judge(
         lines += [f"{message} ({hint})" if hint else message for message, hint in nothing]
     if not lines:
         return
-    if len(lines) > _MOST_LINES:
-        lines[_MOST_LINES:] = [f"... and {len(lines) - _MOST_LINES} more"]
+    if len(lines) > _MAX_LINES:
+        lines[_MAX_LINES:] = [f"... and {len(lines) - _MAX_LINES} more"]
     if found.failed or (found.pending and waited):
         lines.insert(0, f"{len({cell.id for cell in found}):,} of {_asked(found):,} cells are there:")
     warnings.warn("\n".join(lines), ShmmapWarning, stacklevel=_level_of_program())
@@ -185,7 +185,7 @@ def _named(error: CellError) -> str:
 
 
 def _holder_lines(errors: Iterable[CellError]) -> list[str]:
-    """Who uses memory, the most first; each cell's failure says it again."""
+    """Describe the users of memory, the largest first; each cell's failure says it again."""
     most: dict[int, Holder] = {}
     for error in errors:
         for holder in error.holders:
@@ -245,11 +245,11 @@ def no_cell_there(welcome: Welcome, area: Area) -> tuple[str, str]:
 
 def near_cells_hint(client: Client, unknown: Sequence[str]) -> str:
     """Return a hint for ids that the map does not have: those that look alike, or where ids are found."""
-    import difflib  # one millisecond, for those who misspell
+    import difflib  # one millisecond, after a misspelling only
 
     if not unknown:
         return ""
-    few = client.welcome.cells <= _MOST_CELLS
+    few = client.welcome.cells <= _MAX_CELLS
     names = [cell.id.rpartition("/")[2] for cell in client.metadata()] if few else []
     near: dict[str, None] = {}
     for one in unknown[:3]:

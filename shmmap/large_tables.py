@@ -28,7 +28,7 @@ _RAISE: Final = object()
 
 
 class ShardedDict(MutableMapping[K, V]):
-    """As a dict, but in no order."""
+    """A mapping like a dict, but in no order."""
 
     __slots__ = ("_shards",)
 

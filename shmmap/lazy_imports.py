@@ -50,14 +50,14 @@ def needed_packages(what: str, *, together: str = "") -> Iterator[None]:
     Parameters
     ----------
     what
-        Who needs it: a function, a program.
+        What needs it: a function, a program.
     together
         What to install where one is of little use without others.
 
     Raises
     ------
     PackageMissing
-        For the `ModuleNotFoundError` of anybody else's module.
+        For the `ModuleNotFoundError` of any other module.
 
     Examples
     --------

@@ -45,10 +45,10 @@ def pytest_configure(config: pytest.Config) -> None:
         path = (
             cache.mkdir("kernels") if cache is not None else Path(tempfile.mkdtemp(prefix="shmmap-kernels-"))
         )
-        path.chmod(0o700)  # whatever the umask is: who else could write there is not trusted
+        path.chmod(0o700)  # whatever the umask is: a directory that others can write is not trusted
         os.environ["NUMBA_CACHE_DIR"] = str(path)
         if (mark := compiled_mark()) is not None:
-            mark.touch()  # no daemon of a test compiles what nobody asks it for
+            mark.touch()  # no daemon of a test compiles kernels unasked
         if cache is None:
             config.add_cleanup(lambda: shutil.rmtree(path, ignore_errors=True))
 

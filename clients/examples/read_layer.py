@@ -21,7 +21,7 @@ def main() -> int:
     with shmmap.connect() as client:
         # wait: the first request computes the layer, and compiles its kernel on a new machine
         cells = client.around(x, y, radius, layers="voxel(leaf=0.5)", wait=60.0)
-        # What cannot be had is a value, cell by cell; the others are there.
+        # What cannot be loaded is a value, cell by cell; the others are there.
         for failure in cells.failed:
             print(failure, file=sys.stderr)
         for cell in cells:

@@ -78,7 +78,7 @@ class RunningSpread:
 
     @property
     def spread(self) -> Spread:
-        """Of the numbers so far."""
+        """Spread of the numbers so far."""
         if not self.count:
             return Spread(*(math.nan,) * 5)
         p50, p99 = np.percentile(self._sample.values, (50, 99))
@@ -86,7 +86,7 @@ class RunningSpread:
 
     @property
     def root_mean_square(self) -> float:
-        """Of the numbers so far; NaN where there are none."""
+        """Root mean square of the numbers so far; NaN where there are none."""
         return math.sqrt(self._mean**2 + self._squares / self.count) if self.count else math.nan
 
     @property

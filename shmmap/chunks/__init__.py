@@ -8,6 +8,6 @@ Pure: nothing here knows a daemon, a socket or a directory.  ``CHUNKS.md`` is th
 - `marking`: a scan becomes the lists of voxels that it hits and passes through
 - `marks`: these lists as bytes, from the mapper to the daemon's worker
 - `layout`: a chunk in shared memory
-- `applying`: marks change a chunk, or nothing does
+- `applying`: marks change a chunk, whole or not at all
 - `chunk_file`: a chunk on disk
 """

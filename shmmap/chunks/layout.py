@@ -40,7 +40,7 @@ __all__ = [
 
 CHUNKS_VERSION: Final = (2, 0)
 MAJORS_READ: Final = (1, 2)
-"""The same bytes; those of version 1 were not cut when they were given up, so that readers could map them."""
+"""Versions with the same bytes; a daemon of version 1 did not truncate chunks that left memory."""
 HEADER_BYTES: Final = 4096
 BRICK_BYTES: Final = 2 * BRICK_VOXELS
 MAX_BYTES: Final = HEADER_BYTES + BRICKS * BRICK_BYTES

@@ -170,7 +170,7 @@ def _numbers(what: str, values: ArrayLike) -> NDArray[np.floating]:
 
 
 def _rigid(pose: ArrayLike) -> NDArray[np.float64]:
-    """A pose as (3, 4), checked."""
+    """Check a pose and return it as (3, 4)."""
     whole = _numbers("pose", pose).astype(np.float64)
     if whole.shape not in ((3, 4), (4, 4)):
         raise BadRequest(f"pose: need the shape (3, 4) or (4, 4), not {whole.shape}")

@@ -6,8 +6,8 @@ Voxels are counted from the corner of a window of chunks around the sensor.  The
 chunks that is.  ``table`` says which slot of the bit sets each chunk of the window has, -1 for none yet.
 Both bit sets, (slots * 4096,), have a bit for each voxel of each slot, by its place in the chunk.
 
-What is done for each point or voxel stands in the loop: numba counts the references to arrays that an inlined
-function is given, each time, and that takes ten times as long as all else.
+The work on each point or voxel is written out in the loop.  In an inlined function, numba would count the
+references to the arrays at each call, which takes ten times as long as all else.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def window_codes(side: int) -> NDArray[np.uint64]:
 def _place_points(
     points: Any, begin: Any, size: Any, pose: Any, limits: Any, corner: Any, near: Any, place: Any
 ) -> None:
-    """Say of some points whether they count, and in which voxels their rays end; nothing branches."""
+    """Find which of some points count, and the voxels in which their rays end, without branches."""
     inverse, low_z, high_z = limits[0], limits[3], limits[4]
     nearest, furthest = limits[1] * limits[1], limits[2] * limits[2]
     from_x, from_y, from_z = pose[0, 3], pose[1, 3], pose[2, 3]

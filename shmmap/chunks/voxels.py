@@ -93,13 +93,13 @@ class ChunkKey(NamedTuple):
         return self.x << CHUNK_SHIFT, self.y << CHUNK_SHIFT, self.z << CHUNK_SHIFT
 
     def box(self, resolution: float) -> tuple[float, float, float, float, float, float]:
-        """Its (min_x, min_y, min_z, max_x, max_y, max_z), metres."""
+        """Return the bounds (min_x, min_y, min_z, max_x, max_y, max_z), metres."""
         low = [part * CHUNK_SIDE * resolution for part in self]
         high = [(part + 1) * CHUNK_SIDE * resolution for part in self]
         return low[0], low[1], low[2], high[0], high[1], high[2]
 
     def distance(self, other: ChunkKey) -> int:
-        """Chunks between two, counted along the longest axis: 1 for each of a chunk's 26 neighbours."""
+        """Return the distance to another chunk along the longest axis: 1 for each of the 26 neighbours."""
         return max(abs(a - b) for a, b in zip(self, other, strict=True))
 
 
@@ -144,7 +144,7 @@ def in_chunk(indices: Indices) -> tuple[Indices, Indices]:
 
 
 def voxels_of(key: ChunkKey, places: NDArray[np.integer]) -> Indices:
-    """Indices of voxels, (N, 3), by their places in a chunk: the inverse of `in_chunk`."""
+    """Return the indices of voxels, (N, 3), at places in a chunk: the inverse of `in_chunk`."""
     brick, within = np.divmod(np.asarray(places, dtype=np.int64), BRICK_VOXELS)
     low = np.stack(
         [

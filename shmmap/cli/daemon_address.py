@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["connect", "endpoint", "has_lost_socket", "instance", "locate", "shm_dir", "snapshot"]
 
 ASKED_S: Final = 2.0
-"""How long a verb waits that wants to know who has a socket."""
+"""How long a verb waits to find out which process has a socket."""
 ANSWER_S: Final = 5.0
 """How long a verb waits for a daemon that is there, to connect and for each answer."""
 
@@ -52,7 +52,7 @@ def instance(args: argparse.Namespace) -> str:
 
 
 def _endpoint_setting(args: argparse.Namespace) -> str:
-    """The endpoint as given; ``SHMMAP_ENDPOINT`` does not count beside a flag that names another daemon."""
+    """Return the endpoint as given; a flag that names another daemon overrides ``SHMMAP_ENDPOINT``."""
     return args.endpoint or ("" if args.instance or args.runtime_dir else _setting(args, "endpoint"))
 
 
@@ -92,7 +92,7 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
 
 
 def _named_socket(args: argparse.Namespace) -> str:
-    """The socket that the options mean; empty where none of them says so."""
+    """Return the socket that the options name; empty where they name none."""
     found = endpoint(args)
     return found if found is not None else ""
 
@@ -104,7 +104,7 @@ def _is_at(name: str, directory: str, socket: str) -> bool:
 
 
 def _endpoint_of(name: str, directory: str) -> str:
-    """The socket of the daemon with these statistics; empty where there are none, or none for this user.
+    """Read a daemon's socket from its statistics; empty where there are none, or none for this user.
 
     That of one in another container, whose paths mean others here, is the one that the name stands for.
     """
@@ -192,7 +192,7 @@ def _instances(directory: str) -> list[str]:
 
 
 def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
-    """Connect to the daemon, and give up sooner than programs do: who types a verb waits for it.
+    """Connect to the daemon, and give up sooner than programs do: a person waits for the verb.
 
     Parameters
     ----------

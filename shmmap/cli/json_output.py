@@ -240,7 +240,7 @@ def json_schema(output: str) -> dict[str, Any]:
 
 
 def more_of(kind: type, **others: type) -> type[msgspec.Struct]:
-    """Return a struct with the fields of a dataclass, struct or named tuple, and others behind them."""
+    """Return a new struct type: the fields of a dataclass, struct or named tuple, then the given ones."""
     fields = {name: hint for name, hint in get_type_hints(kind).items() if name in _names(kind)}
     return msgspec.defstruct(kind.__name__, list({**fields, **others}.items()))
 

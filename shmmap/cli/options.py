@@ -80,7 +80,7 @@ class _Prose(str):
 
 
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Fills prose and texts of one line, and folds the long lines of others."""
+    """Fills prose and single lines to the width; of other texts it folds the long lines only."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = argparse.HelpFormatter._fill_text

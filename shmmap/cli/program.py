@@ -37,9 +37,9 @@ _EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
 
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _LATER_S: Final = 0.005
-"""By then the callback that an interrupt came in is over, as a rule."""
+"""After this time a callback that a signal has interrupted has usually ended."""
 _AGAIN_S: Final = 0.02
-"""By then it is, where it was not."""
+"""Time until the next try, if the callback had not ended yet."""
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 
@@ -54,7 +54,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse, and let each verb refuse what it does not know itself: so the hint names its help."""
+        """Parse; each verb refuses the words that it does not know, so that the hint names its help."""
         self._words = list(sys.argv[1:] if args is None else args)
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
@@ -79,6 +79,7 @@ class Parser(argparse.ArgumentParser):
         self.error(f"{message}; did you mean {near[0]}?" if near else message)
 
     def error(self, message: str) -> NoReturn:
+        """Complain about the command line and exit; name a misspelt option first."""
         words, self._words = self._words, []
         options = (word for word in words if word.startswith("--") and len(word) > len("--"))
         unknown = [word for word in options if word.split("=")[0] not in self._option_string_actions]
@@ -190,17 +191,16 @@ def add_allow_empty(parser: argparse.ArgumentParser) -> None:
 
 
 def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, name: str = "shmmap") -> int:
-    """Say once that there is nothing of what was asked for; returns the exit code.
+    """Report once that nothing was found, and return the exit code: 1, or 0 with ``--allow-empty``.
 
-    A program that continues with nothing would take it for an answer: so that is 1, unless ``--allow-empty``
-    was given.
+    It is 1 because a script would otherwise take an empty output for a result.
     """
     complain(name, message, hint)
     return 0 if args.allow_empty else 1
 
 
 def keep_interrupts() -> None:
-    """Have ends that Python ignores (`KeyboardInterrupt`, `SystemExit`) signalled again, in this process.
+    """Signal again, in this process, the ends that Python ignores (`KeyboardInterrupt`, `SystemExit`).
 
     In a weak reference's callback or a finalizer Python prints "Exception ignored in", and goes on: of those
     sent while modules are imported, one in ten (https://github.com/python/cpython/issues/95959).

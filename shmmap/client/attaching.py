@@ -147,7 +147,7 @@ class Attacher:
     # --- where memory goes when its last view is gone -----------------------------------------------
 
     def unmap_in(self, queue: SimpleQueue[Owned | None]) -> None:
-        """From now on hand memory to a queue, whose thread unmaps it, instead of unmapping it on the spot."""
+        """Hand memory from now on to a queue, whose thread unmaps it, instead of unmapping it on the spot."""
         self._sinks.append(queue)
 
     def stop_unmapping_in(self, queue: SimpleQueue[Owned | None]) -> None:

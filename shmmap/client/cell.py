@@ -103,11 +103,11 @@ class Cell:
         self._views: dict[str, NDArray[Any]] = {}
 
     def __len__(self) -> int:
-        """How many points, or rows of a computed layer."""
+        """Return the number of points, or of rows in a computed layer."""
         return self.points
 
     def __bool__(self) -> bool:
-        """True: a cell without points is a cell, too."""
+        """Return True: a cell without points is a cell, too."""
         return True
 
     def __repr__(self) -> str:

@@ -38,7 +38,7 @@ class CellSet(Sequence[Cell]):
     cells : tuple of Cell
         Attached cells; of a differential request only the new and changed ones.
     failed : tuple of CellError
-        Cells that cannot be had; the others are good all the same.
+        Cells that cannot be loaded; the others are good all the same.
     pending : tuple of PendingLayer
         Cells still being loaded when the wait was over: ask again.
     removed : tuple of str
@@ -54,7 +54,7 @@ class CellSet(Sequence[Cell]):
         comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may
         exist: ask again.
     reason : str
-        Why what is missing is not on its way: ``"offline"``, where the list of cells cannot be reached at
+        Why what is missing is not being loaded: ``"offline"``, where the list of cells cannot be reached at
         present; empty where it is being fetched, where all is covered, and from a daemon older than protocol
         1.6.
     """
@@ -208,8 +208,8 @@ def cell_error(failure: FailedCell, cell_id: str) -> CellError:
 class HeldCells:
     """Held cells in wire form.
 
-    Attached cells are sent as 8 bytes of version each (``packed``), unless the daemon may not know what a
-    version means any more (``by_name``); others by name.
+    An attached cell is sent as its version, 8 bytes (``packed``).  Other cells are sent by name.  All of
+    them are (``by_name``) if the daemon may have forgotten which cell a version belongs to.
 
     Attributes
     ----------

@@ -118,7 +118,7 @@ class Client:
 
     @property
     def welcome(self) -> Welcome:
-        """What the daemon said of itself and its map when the session began."""
+        """What the daemon said about itself and its map when the session began."""
         return self._session.welcome
 
     @property
@@ -198,8 +198,8 @@ class Client:
     ) -> CellSet:
         """Cells that touch an area, in id order.
 
-        An answer that lacks something, cells that failed or are still being loaded after ``wait``, or where
-        the map has no cell, is said as a `ShmmapWarning`.
+        A `ShmmapWarning` says what the answer lacks: cells that failed, cells that are still being loaded
+        after ``wait``, or any cell at all.
 
         Parameters
         ----------
@@ -437,7 +437,7 @@ class Client:
         return self._session.ask(lambda n: messages.Show(n, cell), messages.ShownCell)
 
     def reload(self) -> messages.Reloaded:
-        """Have the daemon read the map's directory again.
+        """Make the daemon read the map's directory again.
 
         That may take a minute more than other requests, and another one for every million cells: all files
         are looked at.
@@ -451,7 +451,7 @@ class Client:
         return self._session.ask(messages.Reload, messages.Reloaded, quiet_s=most_s)
 
     def evict(self, ids: str | Iterable[str] | None = None) -> messages.Evicted:
-        """Have the daemon drop cells, all by default; those in use are freed when they are released.
+        """Make the daemon drop cells, all by default; those in use are freed when they are released.
 
         Raises
         ------
@@ -464,7 +464,7 @@ class Client:
     def pin(
         self, ids: str | Iterable[str] = (), layers: str | Sequence[str] = ("points",)
     ) -> messages.Pinned:
-        """Have the daemon keep cells in memory, until `unpin` or its end; without ids, list its pins.
+        """Make the daemon keep cells in memory, until `unpin` or its end; without ids, list its pins.
 
         Raises
         ------
@@ -477,7 +477,7 @@ class Client:
         return self._session.ask(lambda n: messages.Pin(n, wanted, specs), messages.Pinned)
 
     def unpin(self, ids: str | Iterable[str] | None = None) -> messages.Pinned:
-        """Have the daemon keep cells, all by default, no longer; returns what stays pinned.
+        """Stop the daemon from keeping cells, all by default; returns what stays pinned.
 
         Raises
         ------

@@ -77,7 +77,7 @@ class Connection:
     Attributes
     ----------
     welcome : Welcome
-        What the daemon said of itself when the session began.
+        What the daemon said about itself when the session began.
     path : str
         Where it listens.
 

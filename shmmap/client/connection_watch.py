@@ -74,11 +74,11 @@ class Running(Protocol):
         """The object that stops it."""
 
     def request_stop(self) -> None:
-        """Have it end, soon."""
+        """Ask it to end, soon."""
 
 
 running: Final[set[Running]] = set()
-"""Each thread enters and leaves by itself."""
+"""What runs in threads at present; each thread adds and removes its own."""
 
 
 def enter(one: Running) -> None:
@@ -187,7 +187,7 @@ class ConnectionWatch:
                 self._connected.get(timeout=max(timeout_s, 0.0))
 
     def stop(self) -> None:
-        """Have the thread close the socket and end, and wait for it, unless this is that thread itself."""
+        """Make the thread close the socket and end, and wait for it, unless this is that thread itself."""
         self.request_stop()
         while not self._elsewhere and _thread.get_ident() != self._thread and not self._ended:
             with contextlib.suppress(Empty):
@@ -199,7 +199,7 @@ class ConnectionWatch:
         return os.getpid() != self._pid
 
     def request_stop(self) -> None:
-        """Have the thread close the socket and end."""
+        """Make the thread close the socket and end."""
         self._stopping = True  # where there is no socket yet, the thread looks at this when it has made it
         while self._socket is not None and not self._ended and not self._elsewhere:
             try:

@@ -85,7 +85,7 @@ class EventStream:
     ----------
     epoch : int
         The daemon's present run.
-    heard_s : float
+    last_message_s : float
         When a message last came from the daemon, `time.monotonic`; it sends one every second.
 
     Raises
@@ -121,7 +121,7 @@ class EventStream:
         self._closed = False
         self._ready: deque[Happening] = deque()
         self.epoch = self._connection.welcome.epoch
-        self.heard_s = time.monotonic()
+        self.last_message_s = time.monotonic()
         try:
             self._begin(since)
         except BaseException:
@@ -189,7 +189,7 @@ class EventStream:
                 self.epoch = self._ask(Recent(0, limit=0)).epoch
 
     def _take(self, data: bytes) -> None:
-        self.heard_s = time.monotonic()
+        self.last_message_s = time.monotonic()
         event = decode_event(data)
         if event is None:  # a kind that this version does not know: its number counts
             head = msgspec.msgpack.decode(data)
@@ -211,7 +211,7 @@ class EventStream:
             self._ready.append(event)
 
     def _miss(self, last: int) -> None:
-        """Report that what is missing up to this number is lost: its epoch has ended."""
+        """Report the missing events up to this number as lost: the daemon run that had them is over."""
         if last >= self._expected:
             self._ready.append(MissedEvents(self.epoch, self._expected, last))
             self._expected = last + 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map's list of cells, as the daemon has it."""
+"""The map's list of cells, from the daemon."""
 
 from __future__ import annotations
 
@@ -149,4 +149,4 @@ def list_cells(
         else:
             assert listing is not None  # noqa: S101  the loop ran at least once
             return listing
-    raise NoAnswer("the map changed again and again while it was being listed", hint="ask again later")
+    raise NoAnswer("the map kept changing while it was being listed", hint="ask again later")

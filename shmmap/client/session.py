@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all requests of one client share: the connection, the attached cells, a lock, and fork.
 
-A request for cells is over when its handles are attached: what went stale on the way is asked for again.
+A request for cells is over when its handles are attached: what went stale meanwhile is asked for again.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Session:
         return self._connection.lost_since if self._connection is not None else None
 
     def notify_when_lost(self, queue: SimpleQueue[Any]) -> None:
-        """From now on put a None into a queue when the connection breaks."""
+        """Put a None into a queue from now on when the connection breaks."""
         self._waiting.append(queue)
 
     def stop_notifying(self, queue: SimpleQueue[Any]) -> None:
@@ -432,7 +432,7 @@ def _check_not_within_a_turn(session: Session) -> None:
 
 
 _sessions: Final[list[weakref.ref[Session]]] = []
-"""Those alive; not a weak set, which runs functions in Python when one ends (`shmmap.client.attaching`)."""
+"""All there are; not a weak set, which runs functions in Python when one ends (`shmmap.client.attaching`)."""
 
 
 def _after_fork_in_child() -> None:

@@ -70,7 +70,7 @@ class Elsewhere(VersionInService, Protocol):
 
     @property
     def link(self) -> OriginLink:
-        """Its link: whether it is in reach, and has another version."""
+        """The origin's link: whether it is in reach, and has another version."""
 
     @property
     def keeper(self) -> ObjectKeeper | None:
@@ -80,7 +80,7 @@ class Elsewhere(VersionInService, Protocol):
         """Remember which version of the map is served now."""
 
     def try_again(self) -> None:
-        """Fetch again what of the list of cells could not be had."""
+        """Fetch again what is missing of the list of cells."""
 
 
 class Service:
@@ -375,11 +375,11 @@ class Service:
         return directories_of(self._config.map_path, self._config.metadata, id_prefix)
 
     def _take_another(self) -> None:
-        """Have another version of the map taken: there is one."""
+        """Take another version of the map: there is one."""
         self._reloader.ask(lambda _result: None)
 
     def _reload(self) -> None:
-        """Have the map read again for a signal or a change; the service manager waits for the end."""
+        """Read the map again for a signal or a change; the service manager waits for the end."""
         self._manager.reloading()
         self._reloader.ask(self._reloaded)
 

@@ -127,21 +127,10 @@ def run(config: DaemonConfig) -> int:
         directory = ShmDirectory(config.shm_dir)
         stack.callback(directory.close)
         pins = choose_pins(directory)
-        origin: ViewOrigin = NoMap()
         elsewhere = _published(config)
         if elsewhere is not None:
-            origin = elsewhere
             stack.callback(_end_threads, elsewhere)
-        elif config.map_path:
-            origin = find_origin(
-                config.map_path,
-                metadata=config.metadata,
-                strict=config.strict,
-                cache_dir=config.cache_dir,
-                unit=config.unit,
-                vertical_unit=config.vertical_unit,
-                notify=notify,
-            )
+        origin: ViewOrigin = elsewhere if elsewhere is not None else _origin_here(config)
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
         config = dataclasses.replace(  # loaders and clients run elsewhere
             config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
@@ -187,6 +176,21 @@ def run(config: DaemonConfig) -> int:
     return CannotWrite.exit_code if live.unsaved else 0
 
 
+def _origin_here(config: DaemonConfig) -> ViewOrigin:
+    """Find where cells come from on this machine."""
+    if not config.map_path:
+        return NoMap()
+    return find_origin(
+        config.map_path,
+        metadata=config.metadata,
+        strict=config.strict,
+        cache_dir=config.cache_dir,
+        unit=config.unit,
+        vertical_unit=config.vertical_unit,
+        notify=notify,
+    )
+
+
 def _published(config: DaemonConfig) -> PublishedOrigin | None:
     """Open a published map: a URL, or a directory with a file CURRENT; None where the map is files."""
     path = config.map_path
@@ -225,9 +229,9 @@ def _published(config: DaemonConfig) -> PublishedOrigin | None:
 
 
 def _fetched_from(origin: PublishedOrigin) -> FetchedFrom:
-    from shmmap.daemon.loading.published_reader import AT_ONCE
+    from shmmap.daemon.loading.published_reader import CONCURRENT_FETCHES
 
-    return FetchedFrom(origin.served.words(), AT_ONCE)
+    return FetchedFrom(origin.served.words(), CONCURRENT_FETCHES)
 
 
 def _end_threads(origin: PublishedOrigin) -> None:

@@ -11,7 +11,7 @@ import dataclasses
 import os
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -178,24 +178,12 @@ class MapInMemory:
         gid: int,
         early: Early | None = None,
         origin: FetchedFrom | None = None,
+        *,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.directory = directory
         epoch = secrets.randbits(63) | 1
-        self.identity = DaemonIdentity(
-            pid=os.getpid(),
-            start_time_ticks=start_time_ticks(os.getpid()),
-            pid_namespace=pid_namespace(),
-            epoch=epoch,
-            instance=config.instance,
-            endpoint=socket_path,
-            map_path=config.map_path,
-            map_version=catalogue.map_version,
-            shm_dir=directory.path,
-            id_prefix=catalogue.id_prefix,
-            library_version=__version__,
-            started_unix_ns=time.time_ns(),
-            frame_id=catalogue.frame_id,
-        )
+        self.identity = _identity(config, catalogue, directory.path, socket_path, epoch)
         group_limit = memory_limit_bytes()
         budget = choose_budget(  # may refuse: before anything has a name
             config.budget_bytes,
@@ -210,7 +198,7 @@ class MapInMemory:
             limit_bytes=group_limit,
         )
         ledger = Ledger(budget)
-        try:
+        with _first_write(directory):
             self.statistics = StatisticsWriter(
                 directory,
                 config.instance,
@@ -220,14 +208,6 @@ class MapInMemory:
                 starting=True,
                 reserve=ledger.add_overhead,
             )
-        except OSError as error:
-            said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
-            if is_full(error):
-                raise CannotStart(said, hint="free some, or enlarge it") from error
-            limit = limit_behind(error)
-            if limit is not None:
-                raise limit from error
-            raise ConfigError(said, key="shm_dir") from error
         with contextlib.ExitStack() as undo:
             undo.callback(self.statistics.close)  # its name must not stay when something else fails
             self.statistics.set("pin_source", list(PinSource).index(pins.source))
@@ -274,15 +254,15 @@ class MapInMemory:
                 self.map_switch,
                 pool,
                 self.waiting,
-                clock=time.monotonic,
+                clock=clock,
                 prefetch_share=config.prefetch_share,
                 outage_tolerance_s=config.outage_tolerance_s,
             )
             self.adoption = Adoption(self.cache, self.scheduler.loads, self.scheduler.misplaced)
-            self.adoption.take_over(time.monotonic())
+            self.adoption.take_over(clock())
             events = self.cache.events
             events.flush()
-            self.scheduler.room.watch(self.watched, time.monotonic)
+            self.scheduler.room.watch(self.watched, clock)
             undo.pop_all()
 
     def close(self, *, keep: bool) -> None:
@@ -292,3 +272,38 @@ class MapInMemory:
         self.cache.close(keep=keep)
         self.statistics.close()
         self.watched.close()
+
+
+def _identity(
+    config: DaemonConfig, catalogue: CatalogueView, shm_dir: str, socket_path: str, epoch: int
+) -> DaemonIdentity:
+    return DaemonIdentity(
+        pid=os.getpid(),
+        start_time_ticks=start_time_ticks(os.getpid()),
+        pid_namespace=pid_namespace(),
+        epoch=epoch,
+        instance=config.instance,
+        endpoint=socket_path,
+        map_path=config.map_path,
+        map_version=catalogue.map_version,
+        shm_dir=shm_dir,
+        id_prefix=catalogue.id_prefix,
+        library_version=__version__,
+        started_unix_ns=time.time_ns(),
+        frame_id=catalogue.frame_id,
+    )
+
+
+@contextlib.contextmanager
+def _first_write(directory: ShmDirectory) -> Iterator[None]:
+    """Say in errors of the first write to a directory what is wrong with it."""
+    try:
+        yield
+    except OSError as error:
+        said = f"shared-memory directory {directory.path}: nothing can be written there: {error.strerror}"
+        if is_full(error):
+            raise CannotStart(said, hint="free some, or enlarge it") from error
+        limit = limit_behind(error)
+        if limit is not None:
+            raise limit from error
+        raise ConfigError(said, key="shm_dir") from error

@@ -201,11 +201,11 @@ class ServingLoop:
             self._guarded(self.watched.kinds[fd], callback)
 
     def _guarded(self, kind: str, call: Callable[..., object], *arguments: object) -> None:
-        """Call what must not end the daemon if it fails, unless that happens again and again."""
+        """Call what must not end the daemon if it fails, unless that happens repeatedly."""
         begin_s = time.monotonic()
         try:
             call(*arguments)
-        except Exception:  # a defect: one client's trouble must not be everybody's
+        except Exception:  # a defect: one client's trouble must not be that of all
             if self.defects.record():
                 raise
         took_s = time.monotonic() - begin_s

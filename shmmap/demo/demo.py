@@ -36,7 +36,7 @@ from shmmap.demo.localization import (
     prepare,
     wait_prepared,
 )
-from shmmap.demo.progress import Progress
+from shmmap.demo.program import Progress
 from shmmap.processes.end_with_parent import with_us
 from shmmap.processes.interrupts import scratch_directory
 from shmmap.protocol.rows import CellRow
@@ -125,9 +125,15 @@ def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None 
             copies=max(settings.counts),
         )
         options = [
-            "--budget", str(budget_bytes), "--workers", "2", "--cache-dir", str(work / "cache"),
-            "--prefetch-share", _PREFETCH_SHARE,
-        ]  # fmt: skip
+            "--budget",
+            str(budget_bytes),
+            "--workers",
+            "2",
+            "--cache-dir",
+            str(work / "cache"),
+            "--prefetch-share",
+            _PREFETCH_SHARE,
+        ]
         missing = missing_package()
         makers = [] if missing else prepare(settings, work, stack)
         town = build_town(settings, map_dir, progress)

@@ -18,9 +18,7 @@ from typing import Final, Literal
 import msgspec
 
 from shmmap.demo.consumer import TASKS, Pose, Step, StepReport
-from shmmap.demo.process_usage import cpu_seconds, descendants, process_memory
-from shmmap.demo.program import Program
-from shmmap.demo.progress import Progress
+from shmmap.demo.program import Program, Progress, cpu_seconds, descendants, process_memory
 from shmmap.errors import NoAnswer
 from shmmap.quantities import format_bytes, format_duration
 from shmmap.statistics.reader import read_statistics

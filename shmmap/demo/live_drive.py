@@ -3,6 +3,11 @@
 
 The route is a round through the town, and a part of it once more: chunks are evicted, and come back.  In the
 end the map's files are compared with a map without bounds of the same scans.
+
+``python -m shmmap.demo.live_drive ENDPOINT NAME SCANS`` is the program that maps.  It first prints the number
+of the scan that the live map NAME needs next.  For each line of stdin, the number of a scan, it adds
+``SCANS/<number>.npz`` to the map and prints how many scans are in it.  It ends after stdin, when all are in
+the map.
 """
 
 from __future__ import annotations
@@ -10,30 +15,39 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import sys
 import time
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shmmap.demo.live_mapper import FILTER
-from shmmap.demo.program import Program
-from shmmap.demo.progress import Progress
-from shmmap.demo.unbounded_map import UnboundedMap
+from shmmap.chunks.occupancy import Occupancy, ScanFilter
+from shmmap.chunks.voxels import CHUNK_VOXELS, WORDS, ChunkKey
+from shmmap.daemon.live.disk.stored_map import StoredMap, opened_folder_to_read
+from shmmap.demo.program import Program, Progress
 from shmmap.errors import InternalError
 from shmmap.processes.end_with_parent import with_us
 from shmmap.processes.interrupts import scratch_directory
-from shmmap.simulation.lidar import Lidar
-from shmmap.simulation.lidar_drive import LidarDrive
+from shmmap.simulation.lidar import Lidar, LidarDrive
 from shmmap.simulation.town import Town
 from shmmap.testing.daemon_process import DaemonProcess
 
 if TYPE_CHECKING:
-    from shmmap.chunks.voxels import ChunkKey
     from shmmap.client.live.live_map import LiveMap
 
-__all__ = ["LiveDriveResult", "LiveDriveSettings", "run_live_drive"]
+__all__ = [
+    "FILTER",
+    "Comparison",
+    "LiveDriveResult",
+    "LiveDriveSettings",
+    "UnboundedMap",
+    "main",
+    "run_live_drive",
+]
 
 _MAP: Final = "town"
 _LIDAR: Final = Lidar(rings=32, highest_deg=12.0, azimuth_deg=0.6, farthest=25.0)
@@ -44,6 +58,8 @@ resolution = {resolution!r}
 radius = 2
 linger_s = 0.5
 """
+FILTER: Final = ScanFilter(min_range=1.0, max_range=20.0, min_z=-8.0, max_z=12.0)
+"""Which points of the demonstration's scans count."""
 _TIMEOUT_S: Final = 300.0  # for a compiler on a slow machine
 _WITHOUT_DAEMON: Final = 2  # scans that come while there is none
 
@@ -153,7 +169,7 @@ def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDrive
         daemon.wait_ready(_TIMEOUT_S)
         live = stack.enter_context(shmmap.connect(daemon.endpoint, name="demo")).live(_MAP)
         words = [daemon.endpoint, _MAP, str(work)]
-        mapper = stack.enter_context(Program("mapping program", "shmmap.demo.live_mapper", words, work))
+        mapper = stack.enter_context(Program("mapping program", "shmmap.demo.live_drive", words, work))
         _map(daemon, mapper, _Watch(live, result), progress)
         progress.stage("Saving the map, comparing it with one without bounds", 3)
         live.move_to(*path[-1])  # the vehicle stays where it is, its program ends
@@ -178,9 +194,12 @@ def _take_scans(
 ) -> tuple[list[tuple[float, float, float]], UnboundedMap, LiveDriveResult]:
     """Write the scans to ``work``; returns where the sensor was, the map without bounds, and the result."""
     drive = LidarDrive(
-        Town(seed=settings.seed, blocks=settings.blocks), settings.length, settings.step,
-        lidar=settings.lidar, density=settings.density,
-    )  # fmt: skip
+        Town(seed=settings.seed, blocks=settings.blocks),
+        settings.length,
+        settings.step,
+        lidar=settings.lidar,
+        density=settings.density,
+    )
     progress.stage("Driving through a generated town with a LiDAR", sum(1 for _ in drive.poses()))
     unbounded = UnboundedMap(settings.resolution, FILTER)
     path = []
@@ -270,3 +289,107 @@ def _draw(endpoint: str, path: list[tuple[float, float, float]], work: Path) -> 
     if not picture.exists():
         raise InternalError("the picture was not drawn")
     return picture.read_text(encoding="utf-8")
+
+
+class Comparison(NamedTuple):
+    """A live map beside the unbounded one.
+
+    Attributes
+    ----------
+    voxels
+        That are known in one of the two, or in both.
+    differing
+        Of these, how many are not the same.
+    """
+
+    voxels: int
+    differing: int
+
+
+class UnboundedMap:
+    """Remembers what every scan said of every chunk.
+
+    Parameters
+    ----------
+    resolution
+        Edge of a voxel, metres.
+    scan_filter
+        Which points count.
+    """
+
+    def __init__(self, resolution: float, scan_filter: ScanFilter) -> None:
+        from shmmap.chunks.marking import Marker  # imports compiled kernels
+
+        self._marker = Marker(resolution, scan_filter)
+        self._said: dict[ChunkKey, list[tuple[NDArray[np.uint16], NDArray[np.uint64], int]]] = defaultdict(
+            list
+        )
+
+    def add(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
+        """Take in a scan: (N, 3) metres in the sensor's frame, and T_map_sensor."""
+        marks, _ = self._marker.mark(points, pose)
+        starts = marks.starts.tolist()
+        for at, (key, hits) in enumerate(zip(marks.chunks, marks.hits.tolist(), strict=True)):
+            part = slice(starts[at], starts[at + 1])
+            self._said[key].append((marks.words[part].copy(), marks.bits[part].copy(), hits))
+
+    def chunk(self, key: ChunkKey, occupancy: Occupancy) -> NDArray[np.int16]:
+        """Log-odds of a chunk's voxels by their places, thousandths: scan after scan, from nothing."""
+        hit, miss, low, high = occupancy.steps
+        found = np.zeros((WORDS, 64), np.int16)
+        for words, bits, hits in self._said.get(key, ()):
+            voxels = np.unpackbits(bits.astype("<u8").view(np.uint8), bitorder="little").reshape(-1, 64)
+            for part, step in ((slice(hits), hit), (slice(hits, None), miss)):
+                before = found[words[part]]
+                after = np.clip(before.astype(np.int32) + step, low, high).astype(np.int16)
+                found[words[part]] = np.where(voxels[part] != 0, after, before)
+        return found.reshape(CHUNK_VOXELS)
+
+    def compare(self, path: str) -> Comparison:
+        """Compare with the files of a live map in a directory, voxel for voxel.
+
+        Raises
+        ------
+        MapMissing, MapDataError
+            There is none, or a file of it cannot be read.
+        """
+        voxels = differing = 0
+        nothing = np.zeros(CHUNK_VOXELS, np.int16)
+        with opened_folder_to_read(path) as folder:
+            stored = StoredMap(folder, path)
+            for key in sorted({*self._said, *stored.chunks}):
+                mine = self.chunk(key, stored.settings.occupancy)
+                theirs = stored.chunk(key)[1].dense() if key in stored.chunks else nothing
+                voxels += int(np.count_nonzero(mine | theirs))
+                differing += int(np.count_nonzero(mine != theirs))
+        return Comparison(voxels, differing)
+
+
+def main(argv: list[str]) -> int:
+    """Map until stdin ends."""
+    import shmmap
+
+    endpoint, name, scans = argv
+    with (
+        shmmap.connect(endpoint, name="demo mapper") as client,
+        client.live(name).mapper("demo", FILTER) as mapper,
+    ):
+        _print(mapper.applied + 1)
+        for line in sys.stdin:
+            number = int(line)
+            with np.load(Path(scans, f"{number}.npz")) as scan:
+                sent = mapper.add(scan["xyz"], scan["pose"])
+            if sent != number:
+                raise InternalError(f"scan {number} was sent as {sent}")
+            _print(mapper.applied)
+        mapper.wait_applied()
+    return 0
+
+
+def _print(number: int) -> None:
+    sys.stdout.write(f"{number}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.demo.demo_town import DemoSettings
-from shmmap.demo.program import Program
-from shmmap.demo.progress import Progress
+from shmmap.demo.program import Program, Progress
 from shmmap.errors import InternalError
 from shmmap.processes.end_with_parent import with_us
 from shmmap.testing.daemon_process import DaemonProcess
@@ -108,11 +107,28 @@ def localize(map_path: str, options: Sequence[str], work: Path, progress: Progre
     first_pose_s = math.nan
     with DaemonProcess(map_path, *options, command=with_us()) as daemon:
         words = [
-            "follow", "--scans", str(scans), "--truth", truth, "--odometry", str(work / "odometry.txt"),
-            "--endpoint", daemon.endpoint, "--json", "--json-lines", "-", "--quiet",
-            "--map-radius", str(_WINDOW_METRES), "--lidar-radius", str(_SEEN_METRES),
-            "--update-distance", "10", "--route", truth,
-        ]  # fmt: skip
+            "follow",
+            "--scans",
+            str(scans),
+            "--truth",
+            truth,
+            "--odometry",
+            str(work / "odometry.txt"),
+            "--endpoint",
+            daemon.endpoint,
+            "--json",
+            "--json-lines",
+            "-",
+            "--quiet",
+            "--map-radius",
+            str(_WINDOW_METRES),
+            "--lidar-radius",
+            str(_SEEN_METRES),
+            "--update-distance",
+            "10",
+            "--route",
+            truth,
+        ]
         with Program("shmmap-ndt", _PROGRAM, words, work) as program:
             document: dict[str, Any] = {}
             for line in program.lines(_TIMEOUT_S):
@@ -139,8 +155,7 @@ def main(argv: list[str]) -> int:
     import numpy as np
 
     from shmmap.layers.build import compile_kernels
-    from shmmap.simulation.lidar import Lidar
-    from shmmap.simulation.lidar_drive import LidarDrive
+    from shmmap.simulation.lidar import Lidar, LidarDrive
     from shmmap.simulation.town import Town
 
     out, length = Path(argv[0]), float(argv[4])

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program beside a demonstration: a process that reads and writes lines, and is never left behind."""
+"""Programs beside a demonstration: run and never left behind, measured, and shown to a spectator.
+
+Memory and processor time are what the kernel counts.  *PSS* (proportional set size) divides every shared page
+among the processes that map it, so that the PSS of several processes may be summed.  A page of shared memory
+that no process maps right now is in no process's PSS, although it is in memory.  From
+``/proc/PID/smaps_rollup`` and ``/proc/PID/stat``.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +14,34 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final
 
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
-from shmmap.testing.environment import without_settings
-from shmmap.testing.process_watch import wait_readable
+from shmmap.testing.daemon_process import wait_readable, without_settings
 
-__all__ = ["Program"]
+__all__ = ["ProcessMemory", "Program", "Progress", "cpu_seconds", "descendants", "process_memory"]
 
 _LAST_WORDS: Final = 2000  # characters
+_USER: Final = 11  # utime, stime, cutime, cstime follow one another: proc(5), counted after the command
+_TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
+
+
+class Progress:
+    """Shows nothing; the command line has classes that do."""
+
+    def stage(self, text: str, total: int) -> None:
+        """Begin a stage of ``total`` steps."""
+
+    def step(self, *lines: str) -> None:
+        """Count a step of the stage; ``lines`` describe the state after it."""
+
+    def event(self, text: str) -> None:
+        """Show what has just happened."""
 
 
 class Program:
@@ -186,3 +207,77 @@ class Program:
 
     def _ended_early(self) -> InternalError:
         return InternalError(f"{self.name} ended early: {self.last_words()}")
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessMemory:
+    """Memory of one process.
+
+    Attributes
+    ----------
+    own_bytes
+        Proportional set size without shared memory: interpreter, libraries (its share of them), heap.
+    private_bytes
+        Pages that no other process maps.
+    """
+
+    own_bytes: int
+    private_bytes: int
+
+
+def process_memory(pid: int) -> ProcessMemory:
+    """Read the memory of one process.
+
+    Raises
+    ------
+    ProcessLookupError, FileNotFoundError
+        It is gone.
+    PermissionError
+        It belongs to another user.
+    """
+    fields: dict[str, int] = {}
+    for line in Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]:
+        name, value = line.split(":")
+        fields[name] = int(value.split()[0]) * 1024
+    return ProcessMemory(
+        own_bytes=fields["Pss"] - fields.get("Pss_Shmem", 0),  # since Linux 5.9
+        private_bytes=fields["Private_Clean"] + fields["Private_Dirty"],
+    )
+
+
+def cpu_seconds(pids: Iterable[int]) -> float:
+    """Return the user and system time of processes, and of their children that have ended, seconds.
+
+    Raises
+    ------
+    ProcessLookupError, FileNotFoundError
+        One of them is gone.
+    """
+    ticks = 0
+    for pid in pids:
+        ticks += sum(int(field) for field in _stat(pid)[_USER : _USER + 4])
+    return ticks / _TICKS_PER_S
+
+
+def descendants(pid: int) -> list[int]:
+    """Return ``pid`` and every living process below it, ascending."""
+    children: dict[int, list[int]] = {}
+    for entry in filter(str.isdigit, os.listdir("/proc")):
+        try:
+            state, parent = _stat(int(entry))[:2]
+        except (FileNotFoundError, ProcessLookupError):
+            continue
+        if state != "Z":
+            children.setdefault(int(parent), []).append(int(entry))
+    found, waiting = [], [pid]
+    while waiting:
+        current = waiting.pop()
+        found.append(current)
+        waiting.extend(children.get(current, ()))
+    return sorted(found)
+
+
+def _stat(pid: int) -> list[str]:
+    """Return the fields after the command, which may hold blanks and brackets."""
+    stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    return stat[stat.rindex(")") + 2 :].split()

@@ -237,7 +237,7 @@ class _Run:
         return self._lattice.file_name(self._settings.prefix, ix, iy)
 
     def _job(self) -> dict[str, Any]:
-        """What must be the same for a run to be resumed; as JSON would give it back."""
+        """Return what must be the same for a run to be resumed; as JSON would give it back."""
         settings = self._settings
         job = {
             "files": [asdict(file) for file in self._files],

@@ -165,7 +165,7 @@ def reduce_voxels(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.voi
 
 
 def _keys(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.int64]:
-    """A number for each point's voxel, ascending in x, then y, then z."""
+    """Compute a number for each point's voxel, ascending in x, then y, then z."""
     flat = CellLattice(voxels.step, 0, 0, voxels.scale)
     ix, iy, iz = (np.empty(len(rows), np.int32) for _ in AXES)
     extremes = np.zeros((2, 3))

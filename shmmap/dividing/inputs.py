@@ -38,7 +38,7 @@ class InputFile:
 
     @classmethod
     def of(cls, path: str) -> InputFile:
-        """The file as it is now."""
+        """Describe a file as it is now."""
         try:
             status = os.stat(path)
         except OSError as error:

@@ -88,11 +88,11 @@ class CellLattice:
         return (self.origin_x + ix * self.step) / self.scale, (self.origin_y + iy * self.step) / self.scale
 
     def corner_text(self, ix: int, iy: int) -> tuple[str, str]:
-        """The corner in decimals, exact; an integer whenever it is whole."""
+        """Return a cell's corner in decimals, exact; an integer whenever it is whole."""
         return self._text(self.origin_x + ix * self.step), self._text(self.origin_y + iy * self.step)
 
     def file_name(self, prefix: str, ix: int, iy: int) -> str:
-        """The name of a cell's file, which says its corner."""
+        """Return the name of a cell's file, which says its corner."""
         x, y = self.corner_text(ix, iy)
         return f"{prefix}_{x}_{y}.pcd"
 
@@ -102,7 +102,7 @@ class CellLattice:
         return self._text(self.step)
 
     def moved(self, x: float, y: float) -> CellLattice:
-        """The same squares of ground in a frame whose origin lies at (x, y), metres, of this one."""
+        """Return the same squares of ground in a frame whose origin lies at (x, y), metres, of this one."""
         shift = CellLattice.of(1.0, (x, y))
         scale = max(self.scale, shift.scale)
         mine, theirs = scale // self.scale, scale // shift.scale

@@ -94,7 +94,7 @@ class MapWriter:
         self.discard()
 
     def add(self, columns: Columns) -> None:
-        """Add points to whatever cells they fall into.
+        """Add points to the cells that contain them.
 
         Parameters
         ----------

@@ -84,12 +84,7 @@ def merge(
     """
     progress = progress or NoProgress()
     out = os.path.abspath(out_file)
-    if not out.lower().endswith(".pcd"):
-        raise BadRequest(f"{out} does not end in .pcd", hint="the merged cloud is a PCD file")
-    if encoding not in MERGED_ENCODINGS:
-        raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(MERGED_ENCODINGS)}")
-    if os.path.isdir(out) or (os.path.lexists(out) and not force):
-        raise BadRequest(f"{out} exists", hint="--force replaces a file")
+    _check_output(out, encoding, force=force)
     with contextlib.ExitStack() as stack:
         names = [os.fspath(path) for path in inputs]
         moves = {path: NO_MOVE if keep_frame else _origin_of(path) for path in names}
@@ -132,6 +127,15 @@ def merge(
         fields=field_types(row),
         origin=origins,
     )
+
+
+def _check_output(out: str, encoding: str, *, force: bool) -> None:
+    if not out.lower().endswith(".pcd"):
+        raise BadRequest(f"{out} does not end in .pcd", hint="the merged cloud is a PCD file")
+    if encoding not in MERGED_ENCODINGS:
+        raise BadRequest(f"encoding {encoding!r} is not one of {', '.join(MERGED_ENCODINGS)}")
+    if os.path.isdir(out) or (os.path.lexists(out) and not force):
+        raise BadRequest(f"{out} exists", hint="--force replaces a file")
 
 
 def _checked_inputs(path: str, out: str) -> list[InputFile]:

@@ -141,7 +141,7 @@ def field_types(row: np.dtype[np.void]) -> list[tuple[str, str]]:
 
 
 def word_view(rows: NDArray[np.void]) -> NDArray[Any]:
-    """The same memory as (N, words) unsigned integers, as wide as the row's size allows."""
+    """Return the same memory as (N, words) unsigned integers, as wide as the row's size allows."""
     size = rows.dtype.itemsize
     width = next(width for width in (8, 4, 2, 1) if size % width == 0)
     return rows.view(np.uint8).view(f"<u{width}").reshape(-1, size // width)

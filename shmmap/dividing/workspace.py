@@ -87,7 +87,7 @@ class Workspace:
         os.close(self._lock)
 
     def state(self) -> dict[str, Any] | None:
-        """What `save` wrote last since the machine started; None when there is nothing to continue from."""
+        """Read what `save` wrote last since the machine started; None where there is nothing to resume."""
         try:
             state = json.loads(Path(self.path, _STATE).read_bytes())
         except (OSError, ValueError):

@@ -1,20 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who gets in: the group, the socket, and the daemon itself into the map's directory."""
+"""Access: the group, the socket, bridges to ROS 2, and the daemon itself to the map's directory."""
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import grp
+import json
 import os
 import pwd
 import stat
 import time
+from collections import Counter
 from itertools import islice
-from typing import Final
+from typing import Any, Final
 
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.finding import Finding, fail, ok, warn
-from shmmap.doctor.patient import Patient
-from shmmap.doctor.verdicts import outage_so_far
+from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.verdicts import Finding, fail, ok, outage_so_far, skip, warn
 from shmmap.errors import (
     DaemonUnreachable,
     NoAnswer,
@@ -24,12 +27,14 @@ from shmmap.errors import (
     SocketPermission,
 )
 from shmmap.origin.remote.store import is_url
-from shmmap.protocol.endpoint import fallback_runtime_dir, why_not_private
+from shmmap.protocol.endpoint import fallback_runtime_dir, runtime_dirs, why_not_private
 from shmmap.quantities import counted
+from shmmap.segment.pins import has_slot
 
 __all__ = [
     "check_group",
     "check_map_access",
+    "check_ros_bridge",
     "check_socket",
     "drop_ins",
     "group_name",
@@ -59,35 +64,35 @@ def groups_of(uid: int) -> set[int]:
     return set(os.getgrouplist(entry.pw_name, entry.pw_gid))
 
 
-def check_group(patient: Patient) -> Finding:
-    """Is who asks a member of the group that may connect?"""
+def check_group(diagnosis: Diagnosis) -> Finding:
+    """Check that this account is a member of the group that may connect."""
     name = "group"
     gid = -1
-    if patient.config.group.isdigit():
-        gid = int(patient.config.group)
-    elif patient.config.group:
+    if diagnosis.config.group.isdigit():
+        gid = int(diagnosis.config.group)
+    elif diagnosis.config.group:
         try:
-            gid = grp.getgrnam(patient.config.group).gr_gid
+            gid = grp.getgrnam(diagnosis.config.group).gr_gid
         except KeyError:
             return fail(
                 name,
-                f"there is no group {patient.config.group!r}",
-                f"groupadd --system {patient.config.group}",
+                f"there is no group {diagnosis.config.group!r}",
+                f"groupadd --system {diagnosis.config.group}",
             )
     else:
         try:
-            status = os.stat(patient.socket)
+            status = os.stat(diagnosis.socket)
             gid = status.st_gid if status.st_mode & stat.S_IWGRP else -1
         except OSError:
             pass
     if gid < 0:
         return ok(name, "none is set: only the daemon's own user may connect")
-    group, account = group_name(gid), account_name(patient.uid)
-    if patient.uid in (0, patient.runs_as):
+    group, account = group_name(gid), account_name(diagnosis.uid)
+    if diagnosis.uid in (0, diagnosis.runs_as):
         return ok(name, f"members of {group} may connect; {account} may anyway")
     if gid in (os.getegid(), *os.getgroups()):
         return ok(name, f"{account} is a member of {group}")
-    if gid in groups_of(patient.uid):
+    if gid in groups_of(diagnosis.uid):
         return warn(
             name,
             f"{account} joined {group}, this session is older",
@@ -100,17 +105,17 @@ def check_group(patient: Patient) -> Finding:
     )
 
 
-def check_socket(patient: Patient) -> Finding:
-    """Does the daemon answer, and who could ask it?"""
+def check_socket(diagnosis: Diagnosis) -> Finding:
+    """Check that the daemon answers, and say which accounts may connect."""
     from shmmap.client.discovery import check_socket as connect
 
-    name, path = "socket", patient.socket
-    if patient.awaits_first_client:
+    name, path = "socket", diagnosis.socket
+    if diagnosis.awaits_first_client:
         return ok(name, f"{path} waits for the first client: {_access(path)}")
     try:
         connect(path, time.monotonic() + ANSWER_S)
     except NoSocket as error:
-        if why := _closed_place(patient):
+        if why := _closed_place(diagnosis):
             return fail(name, why, "see whose it is and remove it, or set XDG_RUNTIME_DIR, or runtime_dir")
         return warn(name, error.message, "start it: `systemctl start shmmapd` or `shmmap serve MAP`")
     except SocketPermission as error:
@@ -128,11 +133,11 @@ def check_socket(patient: Patient) -> Finding:
     return ok(name, fact)
 
 
-def _closed_place(patient: Patient) -> str:
+def _closed_place(diagnosis: Diagnosis) -> str:
     """Why a daemon could not have its socket in the directory in /tmp; empty where it can, or needs none."""
     place = fallback_runtime_dir()
     try:
-        chosen = os.path.dirname(patient.config.socket())
+        chosen = os.path.dirname(diagnosis.config.socket())
     except ShmmapError:
         return ""
     why = why_not_private(place) if chosen == place and os.path.lexists(place) else ""
@@ -147,30 +152,28 @@ def _access(path: str) -> str:
     return f"{stat.filemode(status.st_mode)} {account_name(status.st_uid)}:{group_name(status.st_gid)}"
 
 
-def check_map_access(patient: Patient) -> Finding:
-    """Can the daemon read the map, wherever it lies?"""
-    name, path = "map", patient.map_path
-    if not path and (patient.config.live or (patient.seen is not None and patient.seen.live)):
+def check_map_access(diagnosis: Diagnosis) -> Finding:
+    """Check that the daemon can read the map, wherever it lies."""
+    name, path = "map", diagnosis.map_path
+    if not path and (diagnosis.config.live or (diagnosis.seen is not None and diagnosis.seen.live)):
         return ok(name, "none is served: the daemon keeps live maps alone")
     if not path:
         return warn(name, "no map is named", "set map_path, or give `shmmap serve MAP`")
-    if patient.alive:
-        if patient.seen is not None and patient.seen.counters.get("origin_out", 0):
-            since = outage_so_far(patient.seen.counters)
+    if diagnosis.alive:
+        if diagnosis.counters.get("origin_out", 0):
+            since = outage_so_far(diagnosis.counters)
             return warn(
                 name,
                 f"{path} is being served from memory: where it comes from has not answered for {since}",
                 "`shmmap tail` says why loads fail",
             )
-        problems = patient.seen.counters.get("map_problems", 0) if patient.seen is not None else 0
-        if problems:
+        if problems := diagnosis.counters.get("map_problems", 0):
             return warn(
                 name,
                 f"{path} is being served, but reading it found {counted(problems, 'problem')}",
                 "the daemon's log names them, and so does `shmmap reload`",
             )
-        outside = patient.seen.counters.get("cells_outside_box", 0) if patient.seen is not None else 0
-        if outside:
+        if outside := diagnosis.counters.get("cells_outside_box", 0):
             return warn(
                 name,
                 f"{path} is being served, but points of {counted(outside, 'cell')} lie outside its box",
@@ -186,14 +189,14 @@ def check_map_access(patient: Patient) -> Finding:
             return warn(name, f"{path}: this user may not look there", "run it with sudo")
         except OSError:
             return fail(name, f"there is no map at {path}", "set map_path")
-    uid = patient.runs_as
-    if uid != patient.uid and _hidden_from_service(patient, path):
+    uid = diagnosis.runs_as
+    if uid != diagnosis.uid and _hidden_from_service(diagnosis, path):
         return fail(
             name,
             f"{path} lies where the service sees nothing (ProtectHome=, PrivateTmp=)",
             f"sudo shmmap unit install --map {path}, or see `shmmap unit print drop-ins/maps-in-home.conf`",
         )
-    shown = uid != patient.uid and _shown_to_service(patient, path)
+    shown = uid != diagnosis.uid and _shown_to_service(diagnosis, path)
     closed = _closed_to(uid, path, parents=not shown)
     if closed:
         return fail(
@@ -204,35 +207,35 @@ def check_map_access(patient: Patient) -> Finding:
     return ok(name, f"{path} can be read by {account_name(uid)}")
 
 
-def drop_ins(patient: Patient) -> str:
+def drop_ins(diagnosis: Diagnosis) -> str:
     """Return what was added to the service's unit."""
-    directory = patient.machine.path(f"{_UNITS}/shmmapd.service.d")
+    directory = diagnosis.machine.path(f"{_UNITS}/shmmapd.service.d")
     try:
         return "\n".join(one.read_text(errors="replace") for one in sorted(directory.glob("*.conf")))
     except OSError:
         return ""
 
 
-def _shown_to_service(patient: Patient, path: str) -> bool:
+def _shown_to_service(diagnosis: Diagnosis, path: str) -> bool:
     shown = [
         word.split(":")[0].strip('"')
-        for line in drop_ins(patient).splitlines()
+        for line in drop_ins(diagnosis).splitlines()
         if line.startswith(("BindReadOnlyPaths=", "BindPaths="))
         for word in line.split("=", 1)[1].split()
     ]
     return any(path == place or path.startswith(place.rstrip("/") + "/") for place in shown)
 
 
-def _hidden_from_service(patient: Patient, path: str) -> bool:
+def _hidden_from_service(diagnosis: Diagnosis, path: str) -> bool:
     from shmmap.service.program import is_hidden
 
-    if not patient.machine.path(f"{_UNITS}/shmmapd.service").exists():
+    if not diagnosis.machine.path(f"{_UNITS}/shmmapd.service").exists():
         return False
-    return is_hidden(os.path.realpath(path)) and not _shown_to_service(patient, path)
+    return is_hidden(os.path.realpath(path)) and not _shown_to_service(diagnosis, path)
 
 
 def _closed_to(uid: int, path: str, *, parents: bool) -> str:
-    """First directory or file on the way to ``path`` that an account may not pass or read; or empty."""
+    """First directory or file on the path to ``path`` that an account may not pass or read; or empty."""
     if uid == 0:
         return ""
     groups = groups_of(uid)
@@ -254,3 +257,74 @@ def _closed_to(uid: int, path: str, *, parents: bool) -> str:
     except OSError as error:
         return str(error.filename or path)
     return ""
+
+
+_BRIDGE_ADVICE: Final = "start these nodes with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp"
+_MAX_BYTES: Final = 1 << 16
+_NAMED: Final = 3
+_LOCKED: Final = 0
+"""A byte of the file that the bridge has locked: all of it."""
+
+
+def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
+    """Check that bridges to ROS 2 run, and that every node that asks one can be answered.
+
+    A bridge reports in a file beside the daemon's socket, ``INSTANCE.ros-bridge-DOMAIN.json``, and holds a
+    lock on that file while it runs.
+    """
+    name = "ROS bridge"
+    bridges = [one for path in _files(diagnosis) if (one := _read_status(diagnosis, path)) is not None]
+    if not bridges:
+        return skip(name, "none runs")
+    places = ", ".join(
+        sorted(f"domain {one['domain']}: {counted(one['clients'], 'client')}" for one in bridges)
+    )
+    unanswered = Counter(
+        (str(one.get("service")), str(one.get("vendor", "")))
+        for each in bridges
+        for one in each["incompatible"]
+    )
+    if not unanswered:
+        return ok(name, places)
+    named = "; ".join(
+        f"{counted(count, 'client')} of {service}{f', of {vendor}' if vendor else ''}"
+        for (service, vendor), count in unanswered.most_common(_NAMED)
+    )
+    more = "; …" if len(unanswered) > _NAMED else ""
+    return warn(
+        name,
+        f"{places}; not nodes of rmw_cyclonedds_cpp, so that they never get an answer: {named}{more}",
+        _BRIDGE_ADVICE,
+    )
+
+
+def _files(diagnosis: Diagnosis) -> list[str]:
+    """Files of bridges of this instance, where a bridge looks for a place."""
+    places = dict.fromkeys((os.path.dirname(diagnosis.socket), *runtime_dirs()))
+    pattern = f"{glob.escape(diagnosis.config.instance)}.ros-bridge-*.json"
+    root = len(str(diagnosis.machine.path("/")).rstrip("/"))
+    return [
+        found[root:]
+        for place in places
+        for found in sorted(glob.glob(f"{glob.escape(str(diagnosis.machine.path(place)))}/{pattern}"))
+    ]
+
+
+def _read_status(diagnosis: Diagnosis, path: str) -> dict[str, Any] | None:
+    """Read a bridge's file; None if the bridge does not run, or the file is not a bridge's."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        fd = os.open(diagnosis.machine.path(path), flags)
+        try:
+            if not stat.S_ISREG(os.fstat(fd).st_mode) or not has_slot(fd, _LOCKED):
+                return None
+            status = json.loads(os.pread(fd, _MAX_BYTES, 0))
+        finally:
+            os.close(fd)
+        incompatible = [one for one in status["incompatible"] if isinstance(one, dict)]
+        return {
+            "domain": int(status["domain"]),
+            "clients": int(status["clients"]),
+            "incompatible": incompatible,
+        }
+    return None

@@ -7,9 +7,8 @@ import math
 import time
 from typing import Final
 
-from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.patient import Patient
-from shmmap.doctor.verdicts import cache_verdict, outage_so_far
+from shmmap.doctor.diagnosis import Diagnosis
+from shmmap.doctor.verdicts import Finding, cache_verdict, fail, ok, outage_so_far, skip, warn
 from shmmap.errors import ShmmapError
 from shmmap.quantities import counted, format_bytes, format_duration
 
@@ -24,19 +23,19 @@ MAX_MISS_SHARE: Final = 0.02
 """Part of the cells asked for that moving clients may wait for: where they turn is not known."""
 
 
-def check_cells(patient: Patient) -> Finding:
-    """Can every cell be loaded that was asked for?"""
+def check_cells(diagnosis: Diagnosis) -> Finding:
+    """Check that every cell that was asked for can be loaded."""
     name = "cells"
-    if not patient.alive or patient.seen is None:
+    if not diagnosis.alive or diagnosis.seen is None:
         return skip(name, "no daemon runs")
-    failures = patient.seen.counters.get("loads_failed", 0)
+    failures = diagnosis.counters.get("loads_failed", 0)
     if not failures:
         return ok(name, "no load has failed")
     since = f"{counted(failures, 'load')} failed since the start"
-    if patient.seen.state != "healthy":
+    if diagnosis.seen.state != "healthy":
         return warn(name, since, "`shmmap tail` names the cells once the daemon answers; so does its log")
     try:
-        failing = _failing(patient)
+        failing = _failing(diagnosis)
     except ShmmapError as error:
         return warn(name, f"{since}; the daemon was not asked which: {error.message}", "its log says which")
     if not failing:
@@ -52,21 +51,21 @@ def check_cells(patient: Patient) -> Finding:
             "the files are not to blame: give the daemon more memory (MemoryMax=, docker --memory), or divide"
             " the map into smaller cells",
         )
-    if patient.seen.counters.get("origin_out", 0):
+    if diagnosis.counters.get("origin_out", 0):
         return warn(name, fact, "they are loaded once the map's origin answers again: see the row `map`")
-    prefix = patient.seen.identity.id_prefix if patient.seen.identity is not None else ""
+    prefix = diagnosis.seen.identity.id_prefix if diagnosis.seen.identity is not None else ""
     return warn(
         name, fact, f"`shmmap inspect {prefix}{blamed[0]}` reads the file and says what is wrong with it"
     )
 
 
 def _cause(cell: str, layer: str, message: str) -> str:
-    """A line about one failure; messages begin with the path of the file, which ends as the cell's id."""
+    """Describe a failure in a line; messages begin with the path of the file, which ends as the cell's id."""
     before, found, cause = message.partition(f"{cell}: ")
     return f"{cell} ({layer}): {cause if found and before.startswith('/') else message}"
 
 
-def _failing(patient: Patient) -> dict[tuple[str, str], str]:
+def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
     """Return message by cell and layer: what failed and was not loaded since, as far as the daemon recalls.
 
     Raises
@@ -77,11 +76,11 @@ def _failing(patient: Patient) -> dict[tuple[str, str], str]:
     from shmmap.client.event_stream import EventStream
     from shmmap.protocol.events import Changed, Failed, Loaded
 
-    identity = patient.seen.identity if patient.seen is not None else None
+    identity = diagnosis.seen.identity if diagnosis.seen is not None else None
     started_s = identity.started_unix_ns * 1e-9 if identity is not None else 0.0
     since_s = max(time.time() - started_s, 0.0) + 1.0
     failing: dict[tuple[str, str], str] = {}
-    with EventStream(patient.socket, since=since_s, name="shmmap doctor", timeout=ANSWER_S) as stream:
+    with EventStream(diagnosis.socket, since=since_s, name="shmmap doctor", timeout=ANSWER_S) as stream:
         while (event := stream.next(0.0)) is not None:
             if isinstance(event, Failed):
                 failing[event.id, event.layer] = event.message
@@ -92,23 +91,23 @@ def _failing(patient: Patient) -> dict[tuple[str, str], str]:
     return failing
 
 
-def check_cache(patient: Patient) -> Finding:
+def check_cache(diagnosis: Diagnosis) -> Finding:
     """Is the budget enough for what clients ask for?  The verdict of ``status``."""
     name = "cache size"
-    if not patient.alive or patient.seen is None:
+    if not diagnosis.alive:
         return skip(name, "no daemon runs")
-    verdict = cache_verdict(patient.seen.counters)
-    if patient.seen.counters.get("refused_over_budget_1min", 0):
+    verdict = cache_verdict(diagnosis.counters)
+    if diagnosis.counters.get("refused_over_budget_1min", 0):
         return fail(name, verdict.text, verdict.hint)
     return warn(name, verdict.text, verdict.hint) if verdict.too_small else ok(name, verdict.text)
 
 
-def check_prefetching(patient: Patient) -> Finding:
+def check_prefetching(diagnosis: Diagnosis) -> Finding:
     """Do moving clients find their cells in memory?  Judged by the counters of the last ten minutes."""
     name = "prefetching"
-    if not patient.alive or patient.seen is None:
+    if not diagnosis.alive:
         return skip(name, "no daemon runs")
-    count = patient.seen.counters
+    count = diagnosis.counters
     misses = count.get("prefetch_misses_10min", 0)
     waited = (
         f"moving clients waited for {counted(misses, 'cell') if misses else 'no cell'} in the last 10 min"

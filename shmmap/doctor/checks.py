@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All checks, in the order in which they are read."""
+"""Examine an instance of the daemon and its machine, and carry out all checks."""
 
 from __future__ import annotations
 
+import dataclasses
+import os
 from collections.abc import Callable
 from typing import Final
 
-from shmmap.doctor.access import check_group, check_map_access, check_socket
+from shmmap.daemon.config import DaemonConfig
+from shmmap.doctor.access import check_group, check_map_access, check_ros_bridge, check_socket
 from shmmap.doctor.cells import check_cache, check_cells, check_prefetching
 from shmmap.doctor.daemon import (
     check_daemon,
@@ -16,7 +19,7 @@ from shmmap.doctor.daemon import (
     check_pins,
     check_reload,
 )
-from shmmap.doctor.finding import Finding
+from shmmap.doctor.diagnosis import Diagnosis, Machine, answering_at
 from shmmap.doctor.live import check_live_disk, check_live_maps, check_live_memory
 from shmmap.doctor.memory import (
     check_container,
@@ -25,14 +28,22 @@ from shmmap.doctor.memory import (
     check_memory_limit,
     check_shared_memory,
 )
-from shmmap.doctor.patient import Patient
-from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
-from shmmap.doctor.ros_bridge import check_ros_bridge
-from shmmap.doctor.signed_map import check_signature
+from shmmap.doctor.published import (
+    check_clock,
+    check_credentials,
+    check_link,
+    check_signature,
+    check_versions,
+)
+from shmmap.doctor.verdicts import Finding
+from shmmap.errors import ShmmapError
+from shmmap.segment.directory import DEFAULT_SHM_DIR
+from shmmap.segment.names import usual_directory
+from shmmap.statistics.reader import read_statistics
 
-__all__ = ["CHECKS", "diagnose"]
+__all__ = ["CHECKS", "diagnose", "examine"]
 
-CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
+CHECKS: Final[tuple[Callable[[Diagnosis], Finding], ...]] = (  # in the order in which they are read
     check_daemon,
     check_socket,
     check_group,
@@ -62,6 +73,35 @@ CHECKS: Final[tuple[Callable[[Patient], Finding], ...]] = (
 )
 
 
-def diagnose(patient: Patient) -> list[Finding]:
+def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Diagnosis:
+    """Look at the machine and at what the instance's daemon reports."""
+    if config.shm_dir == DEFAULT_SHM_DIR:
+        config = dataclasses.replace(config, shm_dir=usual_directory(config.instance))
+    try:
+        seen, unreadable = read_statistics(config.instance, config.shm_dir), ""
+    except ShmmapError as error:
+        seen, unreadable = None, error.message
+    except OSError as error:
+        seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
+    if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
+        path = seen.identity.endpoint
+    else:
+        path = _socket(config)
+    diagnosis = Diagnosis(machine or Machine(), config, file, path, seen, unreadable)
+    if diagnosis.alive:
+        return diagnosis
+    return dataclasses.replace(diagnosis, answering=answering_at(path).get(config.instance, 0))
+
+
+def diagnose(diagnosis: Diagnosis) -> list[Finding]:
     """Carry out every check."""
-    return [check(patient) for check in CHECKS]
+    return [check(diagnosis) for check in CHECKS]
+
+
+def _socket(config: DaemonConfig) -> str:
+    from shmmap.protocol.endpoint import runtime_dirs, socket_path
+
+    if config.endpoint or config.runtime_dir:
+        return config.socket()
+    places = [socket_path(place, config.instance) for place in runtime_dirs()]
+    return next((place for place in places if os.path.exists(place)), places[-1])

@@ -12,8 +12,8 @@ from typing import Final
 
 from shmmap.daemon.pins.probe import probe_pins
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.patient import Machine, Patient, answering_at
+from shmmap.doctor.diagnosis import Diagnosis, Machine, answering_at
+from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import CannotStart, ShmmapError
 from shmmap.quantities import counted, format_bytes
 from shmmap.segment.directory import ShmDirectory
@@ -37,27 +37,27 @@ _SEGMENT: Final = re.compile(r"shmmap\.([A-Za-z0-9_-]{1,64})\.[0-9a-f]{16}(?:\.z
 _CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+")
 
 
-def check_daemon(patient: Patient) -> Finding:
-    """How is the daemon?"""
+def check_daemon(diagnosis: Diagnosis) -> Finding:
+    """Check that the daemon runs, answers and matches the installed version."""
     name = "daemon"
-    if patient.seen is None:
-        return warn(name, patient.unreadable, "join its group, or run it with sudo")
-    identity, state = patient.seen.identity, patient.seen.state
-    instance = patient.config.instance
-    if patient.awaits_first_client:
+    if diagnosis.seen is None:
+        return warn(name, diagnosis.unreadable, "join its group, or run it with sudo")
+    identity, state = diagnosis.seen.identity, diagnosis.seen.state
+    instance = diagnosis.config.instance
+    if diagnosis.awaits_first_client:
         return ok(name, f"instance {instance} does not run; its first client starts it")
-    if identity is None and patient.answering:
+    if identity is None and diagnosis.answering:
         return warn(
             name,
-            f"instance {instance}, pid {patient.answering}, answers, but its statistics were removed",
+            f"instance {instance}, pid {diagnosis.answering}, answers, but its statistics were removed",
             "it makes them again within seconds, or its log says why not",
         )
     if identity is None:
         return warn(
             name, f"instance {instance} does not run", "`systemctl start shmmapd` or `shmmap serve MAP`"
         )
-    told = {"stopped": "paused (SIGSTOP or a debugger)"}.get(state, state)
-    fact = f"instance {instance}, pid {identity.pid}, is {told}"
+    shown = {"stopped": "paused (SIGSTOP or a debugger)"}.get(state, state)
+    fact = f"instance {instance}, pid {identity.pid}, is {shown}"
     if state == "dead":
         return fail(
             name, f"{fact}: it crashed or was killed", "start it again: it keeps the cells that are in memory"
@@ -73,7 +73,7 @@ def check_daemon(patient: Patient) -> Finding:
             "if its log says that it cannot write its statistics, lift that limit; else the watchdog ends it"
             f" under systemd, elsewhere kill -ABRT {identity.pid}",
         )
-    if defects := patient.seen.counters.get("defects", 0):
+    if defects := diagnosis.seen.counters.get("defects", 0):
         return warn(
             name,
             f"{fact}; it survived {counted(defects, 'exception')}",
@@ -88,26 +88,26 @@ def check_daemon(patient: Patient) -> Finding:
     return ok(name, fact)
 
 
-def check_leftovers(patient: Patient) -> Finding:
-    """Is memory held by segments that no daemon looks after?"""
+def check_leftovers(diagnosis: Diagnosis) -> Finding:
+    """Check for memory in segments that no daemon looks after."""
     name = "leftovers"
     found: dict[str, tuple[int, int]] = {}
     with_chunks: set[str] = set()
     try:
-        with os.scandir(patient.machine.path(patient.shm_dir)) as entries:
+        with os.scandir(diagnosis.machine.path(diagnosis.shm_dir)) as entries:
             for entry in entries:
                 chunk = _CHUNK.fullmatch(entry.name)
                 match = chunk or _SEGMENT.fullmatch(entry.name)
-                with contextlib.suppress(FileNotFoundError):  # a daemon that lives frees some meanwhile
+                with contextlib.suppress(FileNotFoundError):  # a running daemon frees some meanwhile
                     if match:
                         held = entry.stat(follow_symlinks=False).st_blocks * 512
                         count, nbytes = found.get(match[1], (0, 0))
                         found[match[1]] = (count + 1, nbytes + held)
                         with_chunks |= {match[1]} if chunk else set()
     except OSError as error:
-        return warn(name, f"{patient.shm_dir}: {error.strerror}", "run it with sudo")
-    orphans = {name: held for name, held in found.items() if not _looked_after(patient, name)}
-    listening = patient.listening if orphans else set()
+        return warn(name, f"{diagnosis.shm_dir}: {error.strerror}", "run it with sudo")
+    orphans = {name: held for name, held in found.items() if not _has_daemon(diagnosis, name)}
+    listening = diagnosis.listening if orphans else set()
     silent = ""
     for path in sorted(listening):
         if path.removesuffix(".sock") + ".events.sock" in listening:  # a daemon, whatever its files
@@ -136,14 +136,14 @@ def check_leftovers(patient: Patient) -> Finding:
     return warn(
         name,
         f"segments of daemons that do not run: {listed}",
-        "start that instance: it serves or frees them; or `rm " + patient.shm_dir + "/shmmap.INSTANCE.*`",
+        "start that instance: it serves or frees them; or `rm " + diagnosis.shm_dir + "/shmmap.INSTANCE.*`",
     )
 
 
-def _looked_after(patient: Patient, instance: str) -> bool:
-    if instance == patient.config.instance:
-        return patient.alive or patient.seen is None or patient.answering > 0
-    places = {patient.shm_dir, usual_directory(instance)}  # live maps may be elsewhere than cells
+def _has_daemon(diagnosis: Diagnosis, instance: str) -> bool:
+    if instance == diagnosis.config.instance:
+        return diagnosis.alive or diagnosis.seen is None or diagnosis.answering > 0
+    places = {diagnosis.shm_dir, usual_directory(instance)}  # live maps may be elsewhere than cells
     try:
         states = [read_statistics(instance, place).state for place in places]
         return any(state not in ("dead", "absent") for state in states)
@@ -166,9 +166,9 @@ def _logind_setting(machine: Machine, key: str) -> str:
     return value
 
 
-def check_logind(patient: Patient) -> Finding:
-    """Will the session manager delete the segments at logout?"""
-    name, machine, uid = "logout", patient.machine, patient.runs_as
+def check_logind(diagnosis: Diagnosis) -> Finding:
+    """Check whether the session manager will delete the segments at logout."""
+    name, machine, uid = "logout", diagnosis.machine, diagnosis.runs_as
     if uid <= SYSTEM_UIDS:
         return ok(name, "the daemon runs as a system account: logind does not delete its segments")
     if not machine.path("/run/systemd/system").exists():
@@ -185,12 +185,12 @@ def check_logind(patient: Patient) -> Finding:
     )
 
 
-def check_reload(patient: Patient) -> Finding:
-    """Could the map be read the last time?"""
+def check_reload(diagnosis: Diagnosis) -> Finding:
+    """Check that the map could be read the last time."""
     name = "reload"
-    if not patient.alive or patient.seen is None:
+    if not diagnosis.alive:
         return skip(name, "no daemon runs")
-    count = patient.seen.counters
+    count = diagnosis.counters
     at_ns = count.get("last_reload_unix_ns", 0)
     at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at_ns * 1e-9)) if at_ns else ""
     if again := count.get("reloads", 0):
@@ -212,13 +212,13 @@ FEW_DESCRIPTORS: Final = 4096
 _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
-def check_pins(patient: Patient) -> Finding:
-    """Can the kernel tell which processes map a segment?"""
+def check_pins(diagnosis: Diagnosis) -> Finding:
+    """Check that the kernel reports whether any process maps a segment."""
     name = "leases"
     try:
-        directory = ShmDirectory(patient.shm_dir)
+        directory = ShmDirectory(diagnosis.shm_dir)
     except CannotStart as error:
-        if patient.alive:
+        if diagnosis.alive:
             return ok(name, "tried by the daemon when it started: see `shmmap status`")
         return fail(name, error.message, error.hint)
     try:
@@ -228,7 +228,7 @@ def check_pins(patient: Patient) -> Finding:
     if not found.leases:
         return warn(
             name,
-            f"{patient.shm_dir} grants none: memory in use is known from {found.source.value} only",
+            f"{diagnosis.shm_dir} grants none: memory in use is known from {found.source.value} only",
             "name a directory on a tmpfs with shm_dir",
         )
     parts = {"locks": found.locks, "inotify": found.close_events}
@@ -238,14 +238,14 @@ def check_pins(patient: Patient) -> Finding:
             f"they work, but not all of what goes with them: {lacking}",
             "clients may stay unnamed, or memory be freed late: use a newer kernel",
         )
-    return ok(name, "leases and locks work: the kernel tells which processes map a segment")
+    return ok(name, "leases and locks work: the kernel reports which processes map a segment")
 
 
-def check_descriptors(patient: Patient) -> Finding:
-    """How many clients does the limit of open files allow?"""
-    limits = _LIMIT.search(patient.machine.text(f"/proc/{patient.pid}/limits")) if patient.pid else None
+def check_descriptors(diagnosis: Diagnosis) -> Finding:
+    """Check how many clients the limit of open files allows."""
+    limits = _LIMIT.search(diagnosis.machine.text(f"/proc/{diagnosis.pid}/limits")) if diagnosis.pid else None
     hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
-    whose = f"of the daemon (pid {patient.pid})" if limits else "here"
+    whose = f"of the daemon (pid {diagnosis.pid})" if limits else "here"
     if not hard.isdigit() or int(hard) < 0:
         return ok("open files", f"no limit {whose}")
     fact = f"limit {whose}: {hard}, enough for {int(hard) // 2} clients"

@@ -13,9 +13,9 @@ from typing import Final
 from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 from shmmap.daemon.prerequisites import account_name
 from shmmap.doctor.access import drop_ins, group_name, groups_of
-from shmmap.doctor.finding import Finding, fail, ok, skip, warn
+from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.memory import mount_of
-from shmmap.doctor.patient import Patient
+from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.errors import ConfigError, ShmmapError
 from shmmap.protocol.rows import LiveMapRow
 from shmmap.quantities import counted, format_bytes
@@ -35,19 +35,19 @@ ROOM_BYTES: Final = 64 << 20
 _MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # with a group of mappers, and without
 
 
-def _rows(patient: Patient) -> list[LiveMapRow]:
-    return patient.seen.live if patient.alive and patient.seen is not None else []
+def _rows(diagnosis: Diagnosis) -> list[LiveMapRow]:
+    return diagnosis.seen.live if diagnosis.alive and diagnosis.seen is not None else []
 
 
-def _told(patient: Patient) -> tuple[LiveMapRow, ...]:
+def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
     """All that the daemon says of its live maps, paths and damaged files; empty where it does not answer."""
     from shmmap.client.client import connect
 
-    if patient.seen is None or patient.seen.state != "healthy" or not _rows(patient):
+    if diagnosis.seen is None or diagnosis.seen.state != "healthy" or not _rows(diagnosis):
         return ()
     try:
         with connect(
-            patient.socket, timeout=ANSWER_S, connect_timeout=ANSWER_S, name="shmmap doctor"
+            diagnosis.socket, timeout=ANSWER_S, connect_timeout=ANSWER_S, name="shmmap doctor"
         ) as client:
             return client.live_maps()
     except ShmmapError:
@@ -57,12 +57,12 @@ def _told(patient: Patient) -> tuple[LiveMapRow, ...]:
 # --- what is wrong ------------------------------------------------------------------------------------
 
 
-def check_live_maps(patient: Patient) -> Finding:
-    """Can every chunk be loaded and saved, and is none lost?"""
-    name, rows = "live maps", _rows(patient)
+def check_live_maps(diagnosis: Diagnosis) -> Finding:
+    """Check that every chunk can be loaded and saved, and none is lost."""
+    name, rows = "live maps", _rows(diagnosis)
     if not rows:
-        running = "this daemon keeps none" if patient.alive else "no daemon runs"
-        return skip(name, running if patient.alive or patient.config.live else "none are set up")
+        running = "this daemon keeps none" if diagnosis.alive else "no daemon runs"
+        return skip(name, running if diagnosis.alive or diagnosis.config.live else "none are set up")
     unsaved = sum(row.unsaved for row in rows)
     fact = f"{', '.join(row.name for row in rows)}: {counted(unsaved, 'chunk')} not saved yet"
     if failing := [row for row in rows if row.problem]:
@@ -73,14 +73,14 @@ def check_live_maps(patient: Patient) -> Finding:
             "see to its files and its disk: it is tried again, and what is in memory stays there meanwhile",
         )
     if damaged := sum(row.damaged_count for row in rows):
-        texts = [f"{row.name}: {text}" for row in _told(patient) for text in row.damaged][:NAMED]
+        texts = [f"{row.name}: {text}" for row in _reported(diagnosis) for text in row.damaged][:NAMED]
         named = f" ({'; '.join(texts)}{'; …' if damaged > NAMED else ''})" if texts else ""
         return warn(
             name,
             f"damaged files, missing chunks: {damaged:,}{named}",
-            "damaged files were put aside; stop the daemon, then `shmmap live fsck` says what is left",
+            "damaged files are in quarantine; stop the daemon, then `shmmap live fsck` says what is left",
         )
-    if restarts := patient.seen.counters.get("live_restarts", 0) if patient.seen is not None else 0:
+    if restarts := diagnosis.counters.get("live_restarts", 0):
         return warn(
             name,
             f"{fact}; the process that keeps them ended {counted(restarts, 'time')}",
@@ -92,20 +92,20 @@ def check_live_maps(patient: Patient) -> Finding:
 # --- the disk -----------------------------------------------------------------------------------------
 
 
-def check_live_disk(patient: Patient) -> Finding:
-    """Can the daemon write where live maps are kept, and is there room?"""
+def check_live_disk(diagnosis: Diagnosis) -> Finding:
+    """Check that the daemon can write where live maps are kept, and that there is room."""
     name = "live disk"
-    places = _places(patient)
+    places = _places(diagnosis)
     if not places:
         return skip(name, "no live map is set up")
-    facts, kept = [], {row.name for row in _rows(patient)}
+    facts, kept = [], {row.name for row in _rows(diagnosis)}
     for which, path in places.items():
         if not path:
             return warn(name, f"{which}: there is no state directory", f"set path in [live.{which}]")
         try:
-            place = _existing(patient, path)
-            space = os.statvfs(patient.machine.path(place))
-            closed = _not_writable(patient, path, place, read_only=bool(space.f_flag & os.ST_RDONLY))
+            place = _existing(diagnosis, path)
+            space = os.statvfs(diagnosis.machine.path(place))
+            closed = _not_writable(diagnosis, path, place, read_only=bool(space.f_flag & os.ST_RDONLY))
         except PermissionError:
             return warn(name, f"{which}: {path}: this user may not look there", "run it with sudo")
         if place != path and which in kept:
@@ -117,7 +117,7 @@ def check_live_disk(patient: Patient) -> Finding:
         if closed:
             return fail(name, f"{which}: {closed}", f"allow it, or set path in [live.{which}]")
         free = space.f_bavail * space.f_frsize
-        budget = max((row.budget_bytes for row in _rows(patient) if row.name == which), default=0)
+        budget = max((row.budget_bytes for row in _rows(diagnosis) if row.name == which), default=0)
         facts.append(f"{which}: {path}, {format_bytes(free)} free")
         if free < max(budget, ROOM_BYTES):
             return warn(
@@ -128,49 +128,49 @@ def check_live_disk(patient: Patient) -> Finding:
     return ok(name, "; ".join(facts))
 
 
-def _places(patient: Patient) -> dict[str, str]:
+def _places(diagnosis: Diagnosis) -> dict[str, str]:
     """Directory by map: as the daemon says, else as it is set up; empty where there can be none."""
-    if told := _told(patient):
-        return {row.name: row.path for row in told}
-    instance = patient.config.instance
+    if reported := _reported(diagnosis):
+        return {row.name: row.path for row in reported}
+    instance = diagnosis.config.instance
     environ: Mapping[str, str] = os.environ
-    if patient.is_service:
+    if diagnosis.is_service:
         environ = {"STATE_DIRECTORY": f"{SERVICE_STATE}/{instance}"}
     found = {}
-    for one in patient.config.live:
+    for one in diagnosis.config.live:
         found[one.name] = one.path
         with contextlib.suppress(ConfigError):
             found[one.name] = one.path or live_directory(instance, one.name, environ)
     return found
 
 
-def _existing(patient: Patient, path: str) -> str:
-    """The path, or the nearest directory above that is there: the daemon makes the rest."""
+def _existing(diagnosis: Diagnosis, path: str) -> str:
+    """Return the path, or the nearest directory above that is there: the daemon makes the rest."""
     while path != "/":
         try:
-            os.stat(patient.machine.path(path))
+            os.stat(diagnosis.machine.path(path))
             break
         except (FileNotFoundError, NotADirectoryError):
             path = os.path.dirname(path)
     return path
 
 
-def _not_writable(patient: Patient, path: str, place: str, *, read_only: bool) -> str:
+def _not_writable(diagnosis: Diagnosis, path: str, place: str, *, read_only: bool) -> str:
     """Why the daemon cannot write to ``path``, of which there is ``place``; empty if it can."""
-    uid = patient.runs_as
+    uid = diagnosis.runs_as
     if read_only:
         return f"the file system of {place} is read-only"
-    if patient.is_service and not patient.alive:
-        own = f"{SERVICE_STATE}/{patient.config.instance}"
+    if diagnosis.is_service and not diagnosis.alive:
+        own = f"{SERVICE_STATE}/{diagnosis.config.instance}"
         if _is_in(path, own) and not _is_in(place, own):
             return ""  # systemd makes it
-        shown = re.findall(r"^(?:ReadWritePaths|BindPaths)=(.*)$", drop_ins(patient), re.MULTILINE)
+        shown = re.findall(r"^(?:ReadWritePaths|BindPaths)=(.*)$", drop_ins(diagnosis), re.MULTILINE)
         writable = [own, *(word.strip('"-+').split(":")[0] for word in " ".join(shown).split())]
         if not any(_is_in(place, one) for one in writable):
             return f"the service may not write to {place}: ProtectSystem=, no ReadWritePaths="
     if uid == 0:
         return ""
-    status = os.stat(patient.machine.path(place))
+    status = os.stat(diagnosis.machine.path(place))
     shift = 6 if status.st_uid == uid else 3 if status.st_gid in groups_of(uid) else 0
     return "" if (status.st_mode >> shift) & 3 == 3 else f"{account_name(uid)} may not write to {place}"
 
@@ -182,28 +182,28 @@ def _is_in(path: str, directory: str) -> bool:
 # --- memory -------------------------------------------------------------------------------------------
 
 
-def check_live_memory(patient: Patient) -> Finding:
-    """Is the place of chunks in order, and does no reader take much?"""
-    name, rows = "live memory", _rows(patient)
-    if not rows and not patient.config.live:
+def check_live_memory(diagnosis: Diagnosis) -> Finding:
+    """Check that the place of chunks is in order, and that no reader takes much."""
+    name, rows = "live memory", _rows(diagnosis)
+    if not rows and not diagnosis.config.live:
         return skip(name, "no live map is set up")
-    path = _live_shm_dir(patient)
-    if huge := _huge_pages(patient, path):
+    path = _live_shm_dir(diagnosis)
+    if huge := _huge_pages(diagnosis, path):
         return fail(
             name,
             f"{path} has huge pages ({huge}): a chunk of a few KiB takes 2 MiB there",
             "name a tmpfs without them with live_shm_dir, such as /dev/shm",
         )
-    if wrong := _wrong_marks(patient, path):
+    if wrong := _wrong_marks(diagnosis, path):
         return warn(name, wrong, "restart the daemon: it puts the directory right, or says why it cannot")
-    if keeping := _keeping(patient):
+    if keeping := _keeping(diagnosis):
         return warn(
             name,
             f"chunks are kept open or mapped: {keeping}",
             "have it read them by pread, as CHUNKS.md says: it keeps no memory by that, and SIGBUS ends it"
             " where it looks at one that was given up",
         )
-    if busy := _busy(patient):
+    if busy := _busy(diagnosis):
         return warn(
             name,
             f"requests take much of the time of the process that keeps live maps: {busy}",
@@ -214,52 +214,52 @@ def check_live_memory(patient: Patient) -> Finding:
     return ok(name, f"{path}: {format_bytes(taken)} of {format_bytes(budget)} taken" if rows else path)
 
 
-def _live_shm_dir(patient: Patient) -> str:
+def _live_shm_dir(diagnosis: Diagnosis) -> str:
     """Where the chunks are: as set, else with the cells, unless those are on huge pages."""
-    if patient.config.live_shm_dir:
-        return patient.config.live_shm_dir
-    return DEFAULT_SHM_DIR if _huge_pages(patient, patient.shm_dir) else patient.shm_dir
+    if diagnosis.config.live_shm_dir:
+        return diagnosis.config.live_shm_dir
+    return DEFAULT_SHM_DIR if _huge_pages(diagnosis, diagnosis.shm_dir) else diagnosis.shm_dir
 
 
-def _huge_pages(patient: Patient, path: str) -> str:
-    options = mount_of(patient.machine, path).options
+def _huge_pages(diagnosis: Diagnosis, path: str) -> str:
+    options = mount_of(diagnosis.machine, path).options
     huge = next((option for option in options if option.startswith("huge=")), "")
     return "" if huge in ("huge=never", "huge=advise") else huge
 
 
-def _wrong_marks(patient: Patient, path: str) -> str:
-    """What is wrong with the directory where mappers put their scans."""
-    marks = f"{path}/shmmap-live.{patient.config.instance}.marks"
-    if not _rows(patient):
+def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:
+    """Say what is wrong with the directory where mappers put their scans."""
+    marks = f"{path}/shmmap-live.{diagnosis.config.instance}.marks"
+    if not _rows(diagnosis):
         return ""
     try:
-        status = os.stat(patient.machine.path(marks), follow_symlinks=False)
+        status = os.stat(diagnosis.machine.path(marks), follow_symlinks=False)
     except FileNotFoundError:
-        return f"{marks} is gone: nobody can map"
+        return f"{marks} is gone: no process can map"
     except OSError as error:
         return f"{marks}: {error.strerror}"
-    group = patient.config.live_group
+    group = diagnosis.config.live_group
     mode = stat.S_IMODE(status.st_mode)
     if mode not in _MARKS_MODE.values() or (group and mode != _MARKS_MODE[True]):
         return f"{marks} has mode {mode:o}, not {_MARKS_MODE[bool(group)]:o}"
-    if patient.pid and status.st_uid != patient.runs_as:
+    if diagnosis.pid and status.st_uid != diagnosis.runs_as:
         return f"{marks} belongs to {account_name(status.st_uid)}, not to the daemon's user"
     if group and group not in (group_name(status.st_gid), str(status.st_gid)):
         return f"{marks} belongs to group {group_name(status.st_gid)}, not {group}"
     return ""
 
 
-def _keeping(patient: Patient) -> str:
+def _keeping(diagnosis: Diagnosis) -> str:
     """Which processes have files of chunks mapped, or many open, the greediest first; empty for none."""
-    start = f"/shmmap-live.{patient.config.instance}."
+    start = f"/shmmap-live.{diagnosis.config.instance}."
     chunk = re.compile(re.escape(start) + r"[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+")
     found = []
-    processes = patient.machine.path("/proc")
+    processes = diagnosis.machine.path("/proc")
     with contextlib.suppress(OSError):
         for entry in os.listdir(processes):
-            if not entry.isdecimal() or patient.pid in (0, int(entry), _parent(patient, entry)):
+            if not entry.isdecimal() or diagnosis.pid in (0, int(entry), _parent(diagnosis, entry)):
                 continue  # the daemon, and the process that writes the chunks
-            mapped = set(chunk.findall(patient.machine.text(f"/proc/{entry}/maps")))
+            mapped = set(chunk.findall(diagnosis.machine.text(f"/proc/{entry}/maps")))
             names = list(mapped)
             with contextlib.suppress(OSError):  # it has ended, or is another account's
                 for fd in os.listdir(processes / entry / "fd"):
@@ -268,27 +268,29 @@ def _keeping(patient: Patient) -> str:
             if mapped or len(names) >= OPEN:
                 found.append((len(set(names)), entry))
     texts = [
-        f"{patient.machine.text(f'/proc/{pid}/comm').strip() or '?'}, pid {pid}: {counted(count, 'chunk')}"
+        f"{diagnosis.machine.text(f'/proc/{pid}/comm').strip() or '?'}, pid {pid}: {counted(count, 'chunk')}"
         for count, pid in sorted(found, key=lambda row: -row[0])
     ]
     more = f"; and {len(texts) - NAMED:,} more" if len(texts) > NAMED else ""
     return "; ".join(texts[:NAMED]) + more
 
 
-def _parent(patient: Patient, pid: str) -> int:
-    fields = patient.machine.text(f"/proc/{pid}/stat").rpartition(")")[2].split()
+def _parent(diagnosis: Diagnosis, pid: str) -> int:
+    fields = diagnosis.machine.text(f"/proc/{pid}/stat").rpartition(")")[2].split()
     return int(fields[1]) if len(fields) > 1 else 0
 
 
-def _busy(patient: Patient) -> str:
+def _busy(diagnosis: Diagnosis) -> str:
     """Which clients' requests about live maps take much time; empty for none."""
-    seen = patient.seen.clients if patient.seen is not None else []
+    seen = diagnosis.seen.clients if diagnosis.seen is not None else []
     clients = {client.session: client for client in seen}
     texts = []
-    for row in _told(patient):
+    for row in _reported(diagnosis):
         for session, thousandths in row.readers:
             if thousandths >= BUSY:
                 client = clients.get(session)
-                who = f"{client.client or client.command}, pid {client.pid or '?'}" if client else ""
-                texts.append(f"{who or f'session {session:x}'}: {thousandths / 10:.0f} % for {row.name}")
+                client_name = f"{client.client or client.command}, pid {client.pid or '?'}" if client else ""
+                texts.append(
+                    f"{client_name or f'session {session:x}'}: {thousandths / 10:.0f} % for {row.name}"
+                )
     return "; ".join(texts[:NAMED])

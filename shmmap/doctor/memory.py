@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 from shmmap.daemon.host.memory import room_in_group
 from shmmap.daemon.prerequisites import account_name
 from shmmap.disk_budget import OBJECTS, DiskBudget, why_not_private
-from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.patient import Machine, Patient
+from shmmap.doctor.diagnosis import Diagnosis, Machine
+from shmmap.doctor.verdicts import Finding, fail, ok, skip, warn
 from shmmap.origin.catalogue_bytes import default_cache_directory
 from shmmap.quantities import format_bytes
 from shmmap.service.huge_pages import kernel_version, of_all_sizes
@@ -48,14 +48,14 @@ def mount_of(machine: Machine, path: str) -> _Mount:
     return found
 
 
-def check_shared_memory(patient: Patient) -> Finding:
-    """Is the file system large enough for the budget?"""
-    name, path = "shared memory", patient.shm_dir
+def check_shared_memory(diagnosis: Diagnosis) -> Finding:
+    """Check that the file system is large enough for the budget."""
+    name, path = "shared memory", diagnosis.shm_dir
     try:
-        state = os.statvfs(patient.machine.path(path))
+        state = os.statvfs(diagnosis.machine.path(path))
     except OSError as error:
         return fail(name, f"{path}: {error.strerror}", "name a directory on a tmpfs with shm_dir")
-    mount = mount_of(patient.machine, path)
+    mount = mount_of(diagnosis.machine, path)
     if mount.kind not in ("tmpfs", "ramfs", "unknown"):
         return fail(
             name,
@@ -65,11 +65,8 @@ def check_shared_memory(patient: Patient) -> Finding:
     if not state.f_blocks:
         return ok(name, f"{path}: {mount.kind} without a limit")
     size, free = state.f_blocks * state.f_frsize, state.f_bavail * state.f_frsize
-    used = 0
-    if patient.alive and patient.seen is not None:
-        count = patient.seen.counters
-        used = sum(count.get(f"bytes_{kind}", 0) for kind in ("resident", "zombie", "statistics"))
-    budget = patient.budget_bytes
+    used = sum(diagnosis.counters.get(f"bytes_{kind}", 0) for kind in ("resident", "zombie", "statistics"))
+    budget = diagnosis.budget_bytes
     fact = f"{path}: {format_bytes(size)}, {format_bytes(free)} free"
     if not budget:
         return ok(name, f"{fact}; the budget is chosen at start")
@@ -86,10 +83,10 @@ def _enough(budget: int) -> str:
     return f"{-(-(budget * 5 // 4) // (1 << 30))}G"
 
 
-def check_container(patient: Patient) -> Finding:
-    """Does a container see enough shared memory?"""
+def check_container(diagnosis: Diagnosis) -> Finding:
+    """Check that a container sees enough shared memory."""
     name = "container"
-    machine = patient.machine
+    machine = diagnosis.machine
     marks = ("/.dockerenv", "/run/.containerenv")
     contained = any(machine.path(mark).exists() for mark in marks) or bool(
         machine.text("/run/systemd/container")
@@ -97,21 +94,21 @@ def check_container(patient: Patient) -> Finding:
     if not contained:
         return ok(name, "not in a container")
     try:
-        state = os.statvfs(machine.path(patient.shm_dir))
+        state = os.statvfs(machine.path(diagnosis.shm_dir))
     except OSError as error:
-        return fail(name, f"{patient.shm_dir}: {error.strerror}", "mount the host's with --ipc=host")
+        return fail(name, f"{diagnosis.shm_dir}: {error.strerror}", "mount the host's with --ipc=host")
     size = state.f_blocks * state.f_frsize
     if 0 < size <= CONTAINER_DEFAULT_BYTES:
         return warn(
             name,
-            f"in a container whose {patient.shm_dir} has {format_bytes(size)}, the default",
+            f"in a container whose {diagnosis.shm_dir} has {format_bytes(size)}, the default",
             "a daemon inside needs --shm-size=8g; clients of a daemon outside need --ipc=host",
         )
     return ok(name, f"in a container with {format_bytes(size)} of shared memory")
 
 
 def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
-    """Smallest limit on the way up from the process's cgroup, 0 for none; bytes that are no tmpfs's."""
+    """Smallest limit from the process's cgroup to the root, 0 for none; and bytes outside tmpfs."""
     limits = []
     private = 0
     for line in machine.text(f"/proc/{pid or 'self'}/cgroup").splitlines():
@@ -133,15 +130,15 @@ def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
     return min(limits, default=0), private
 
 
-def check_memory_limit(patient: Patient) -> Finding:
-    """Would the cgroup's limit kill the daemon before its budget is full?
+def check_memory_limit(diagnosis: Diagnosis) -> Finding:
+    """Check whether the cgroup's limit would kill the daemon before its budget is full.
 
     Segments are charged to the group, as the daemon reckons when it chooses its budget; what its processes
     use beside them is measured while it runs.
     """
     name = "memory limit"
-    limit, private = _cgroup_limit(patient.machine, patient.pid)
-    budget = patient.budget_bytes
+    limit, private = _cgroup_limit(diagnosis.machine, diagnosis.pid)
+    budget = diagnosis.budget_bytes
     if not limit:
         return ok(name, "the control group sets no limit")
     chosen = format_bytes(budget) if budget else "chosen at start"
@@ -150,18 +147,18 @@ def check_memory_limit(patient: Patient) -> Finding:
     kills = "crossing it kills the daemon (segments are charged to it): lower the budget to"
     if budget > room:
         return fail(name, fact, f"{kills} {format_bytes(room)}, or raise MemoryMax=")
-    if patient.alive:
+    if diagnosis.alive:
         fact += f", and its processes use {format_bytes(private)}"
         if budget + private > limit:
-            most = format_bytes(max(limit - private, 1 << 20))
-            return warn(name, fact, f"{kills} {most}, or raise MemoryMax=")
+            left = format_bytes(max(limit - private, 1 << 20))
+            return warn(name, fact, f"{kills} {left}, or raise MemoryMax=")
     return ok(name, fact)
 
 
-def check_huge_pages(patient: Patient) -> Finding:
-    """Are segments on huge pages, and does that pay on this kernel?"""
-    name, machine = "huge pages", patient.machine
-    mount = mount_of(machine, patient.shm_dir)
+def check_huge_pages(diagnosis: Diagnosis) -> Finding:
+    """Check whether segments are on huge pages, and whether that pays on this kernel."""
+    name, machine = "huge pages", diagnosis.machine
+    mount = mount_of(machine, diagnosis.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
     switch = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/shmem_enabled"))
     release = machine.text("/proc/sys/kernel/osrelease")
@@ -192,14 +189,16 @@ def check_huge_pages(patient: Patient) -> Finding:
 _SERVICE_CACHE: Final = "/var/cache/shmmap"
 
 
-def check_disk_cache(patient: Patient) -> Finding:
-    """Is the cache directory the daemon's, and can more be kept in it?"""
-    name, uid = "disk cache", patient.runs_as
-    if not patient.config.cache_bytes:
+def check_disk_cache(diagnosis: Diagnosis) -> Finding:
+    """Check that the cache directory is the daemon's, and that there is room in it."""
+    name, uid = "disk cache", diagnosis.runs_as
+    if not diagnosis.config.cache_bytes:
         return skip(name, "nothing is kept: cache_bytes is 0")
-    place = patient.config.cache_dir or (_SERVICE_CACHE if patient.is_service else default_cache_directory())
+    place = diagnosis.config.cache_dir or (
+        _SERVICE_CACHE if diagnosis.is_service else default_cache_directory()
+    )
     place = os.path.abspath(place)
-    directory = patient.machine.path(place)
+    directory = diagnosis.machine.path(place)
     try:
         status = os.stat(directory)
     except FileNotFoundError:
@@ -209,17 +208,17 @@ def check_disk_cache(patient: Patient) -> Finding:
     if not stat.S_ISDIR(status.st_mode):
         return warn(name, f"{place} is no directory", "remove it, or name another cache_dir")
     account = account_name(uid)
-    if why := _why_not_used(patient, place, status.st_uid):
+    if why := _why_not_used(diagnosis, place, status.st_uid):
         return warn(
             name,
             f"{why}: objects of published maps are not kept there: without a connection there is no map",
             f"chown -R {account} {place} && chmod go-w {place}/{OBJECTS}, or name another cache_dir",
         )
-    budget = DiskBudget(str(directory), patient.config.cache_bytes, owner=uid)
+    budget = DiskBudget(str(directory), diagnosis.config.cache_bytes, owner=uid)
     space = os.statvfs(directory)
     free = f"{format_bytes(space.f_bavail * space.f_frsize)} free"
     used, limit = budget.used_bytes(), format_bytes(budget.limit_bytes)
-    if patient.uid not in (0, uid):
+    if diagnosis.uid not in (0, uid):
         fact = f"{place} of {account}: up to {limit}, {free}"
     else:
         fact = f"{place}: {format_bytes(used)} of {limit} used, {free}"
@@ -232,13 +231,13 @@ def check_disk_cache(patient: Patient) -> Finding:
     return ok(name, fact)
 
 
-def _why_not_used(patient: Patient, place: str, owner: int) -> str:
-    uid = patient.runs_as
+def _why_not_used(diagnosis: Diagnosis, place: str, owner: int) -> str:
+    uid = diagnosis.runs_as
     if owner not in (0, uid):
         return f"{place} belongs to {account_name(owner)}, the daemon runs as {account_name(uid)}"
     objects = f"{place}/{OBJECTS}"
     try:
-        why = why_not_private(os.lstat(patient.machine.path(objects)), uid)
+        why = why_not_private(os.lstat(diagnosis.machine.path(objects)), uid)
     except OSError:
         return ""  # not there yet, or not to be looked at
     return f"{objects} {why}" if why else ""

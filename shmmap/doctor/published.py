@@ -1,44 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map: link, credentials, clock and versions, as this account sees them beside the daemon."""
+"""A published map: link, credentials, clock, versions and signature, as this account sees them."""
 
 from __future__ import annotations
 
 import datetime
 import time
-from collections.abc import Mapping
 from typing import Final
 
 from shmmap.daemon.prerequisites import account_name
-from shmmap.doctor.finding import Finding, fail, ok, skip, warn
-from shmmap.doctor.patient import Patient
-from shmmap.doctor.signed_map import refused_offer
+from shmmap.doctor.diagnosis import Diagnosis
 from shmmap.doctor.store_probe import ASKED_S
-from shmmap.doctor.verdicts import outage_so_far
+from shmmap.doctor.verdicts import (
+    Finding,
+    fail,
+    ok,
+    outage_so_far,
+    refused_offer,
+    signature_expiry,
+    signature_times,
+    skip,
+    valid_until,
+    warn,
+)
 from shmmap.origin.remote.store import is_published, is_url
-from shmmap.quantities import format_duration
+from shmmap.quantities import format_duration, format_utc
 
-__all__ = ["check_clock", "check_credentials", "check_link", "check_versions"]
+__all__ = ["check_clock", "check_credentials", "check_link", "check_signature", "check_versions"]
 
-MOST_OFF_S: Final = 60.0
+MAX_OFF_S: Final = 60.0
 """The link cannot explain a minute; a difference of 5 or 15 makes stores refuse signed requests."""
 FILES: Final = "the map is files"
+_SKEW_S: Final = 300.0
+"""Difference allowed between the clocks of a publisher and of a vehicle, seconds."""
 
 
-def _is_published(patient: Patient) -> bool:
-    path = patient.map_path
-    return bool(path) and is_published(path if is_url(path) else str(patient.machine.path(path)))
+def _is_published(diagnosis: Diagnosis) -> bool:
+    path = diagnosis.map_path
+    return bool(path) and is_published(path if is_url(path) else str(diagnosis.machine.path(path)))
 
 
-def _counters(patient: Patient) -> Mapping[str, int]:
-    return patient.seen.counters if patient.alive and patient.seen is not None else {}
-
-
-def check_link(patient: Patient) -> Finding:
-    """Does the store answer, and how soon?"""
+def check_link(diagnosis: Diagnosis) -> Finding:
+    """Check that the store answers, and how soon."""
     name = "link"
-    if not _is_published(patient):
+    if not _is_published(diagnosis):
         return skip(name, FILES)
-    answer, path, counters = patient.store, patient.map_path, _counters(patient)
+    answer, path, counters = diagnosis.store, diagnosis.map_path, diagnosis.counters
     away = (
         f"the daemon has not reached it for {outage_so_far(counters)}" if counters.get("origin_out") else ""
     )
@@ -52,23 +58,23 @@ def check_link(patient: Patient) -> Finding:
         if away:
             return warn(name, f"{fact}; {away}", "it tries again each second; if that stays so, see its log")
         return ok(name, fact)
-    if answer.is_refused and patient.environment is None and patient.alive and not away:
+    if answer.is_refused and diagnosis.environment is None and diagnosis.alive and not away:
         return ok(name, f"{path} answers; it refuses what this account has for credentials")
     if answer.credentials_error:
         return skip(name, f"{path} was not asked: see credentials")
     error = answer.error or f"no answer within {ASKED_S:.0f} s"
     fact = error if error.startswith(path) else f"{path}: {error}"
-    if patient.alive:
+    if diagnosis.alive:
         fact += f"; {away or 'the daemon reached it when it last asked'}"
     return warn(name, fact, answer.hint or "is the network up?")
 
 
-def check_credentials(patient: Patient) -> Finding:
-    """Where do credentials come from, and does the store take them?"""
+def check_credentials(diagnosis: Diagnosis) -> Finding:
+    """Check where credentials come from, and that the store takes them."""
     name = "credentials"
-    if not _is_published(patient):
+    if not _is_published(diagnosis):
         return skip(name, FILES)
-    answer, hidden = patient.store, _hidden(patient)
+    answer, hidden = diagnosis.store, _hidden(diagnosis)
     if answer.credentials_error:
         hint = answer.credentials_hint or "`shmmap publish --help` says where they may come from"
         return (warn if hidden else fail)(name, f"{answer.credentials_error}{hidden}", hint)
@@ -82,24 +88,24 @@ def check_credentials(patient: Patient) -> Finding:
     return ok(name, f"{fact}; the store takes them")
 
 
-def _hidden(patient: Patient) -> str:
-    """What cannot be seen of the daemon's own credentials; empty if nothing."""
-    if not patient.alive or patient.environment is not None:
+def _hidden(diagnosis: Diagnosis) -> str:
+    """Return a note if the daemon's own credentials cannot be seen, else an empty text."""
+    if not diagnosis.alive or diagnosis.environment is not None:
         return ""
-    account = account_name(patient.runs_as)
+    account = account_name(diagnosis.runs_as)
     return f" (this account's: those of the daemon, of {account}, can be seen with sudo)"
 
 
-def check_clock(patient: Patient) -> Finding:
-    """Does this machine's clock agree with the store's?"""
+def check_clock(diagnosis: Diagnosis) -> Finding:
+    """Check that this machine's clock agrees with the store's."""
     name = "clock"
-    if not _is_published(patient):
+    if not _is_published(diagnosis):
         return skip(name, FILES)
-    off_s = patient.store.clock_s
+    off_s = diagnosis.store.clock_s
     if off_s is None:
-        answers = patient.store.answers
+        answers = diagnosis.store.answers
         return skip(name, f"the store {'does not say what time it is' if answers else 'was not reached'}")
-    if abs(off_s) <= MOST_OFF_S:
+    if abs(off_s) <= MAX_OFF_S:
         return ok(name, f"within {max(abs(off_s), 1.0):.0f} s of the store's")
     side = "behind" if off_s > 0 else "ahead of"
     return warn(
@@ -109,12 +115,12 @@ def check_clock(patient: Patient) -> Finding:
     )
 
 
-def check_versions(patient: Patient) -> Finding:
-    """Is what is served what is offered, and how old is it?"""
+def check_versions(diagnosis: Diagnosis) -> Finding:
+    """Check that the version offered is the one served, and how old it is."""
     name = "versions"
-    if not _is_published(patient):
+    if not _is_published(diagnosis):
         return skip(name, FILES)
-    answer, counters = patient.store, _counters(patient)
+    answer, counters = diagnosis.store, diagnosis.counters
     served, offered = counters.get("published_version", 0), answer.version
     offer = "what is offered is not known"
     if offered:
@@ -135,6 +141,32 @@ def check_versions(patient: Patient) -> Finding:
             f"if it is meant: shmmap serve --accept-version {offered}; else publish again",
         )
     return ok(name, f"{fact}; {offer}", "it is taken at the next --poll; `shmmap reload` takes it now")
+
+
+def check_signature(diagnosis: Diagnosis) -> Finding:
+    """Check that the map is verified, and its signature not expired."""
+    name = "signature"
+    if not diagnosis.alive:
+        return skip(name, "no daemon runs")
+    counters, now_s = diagnosis.counters, time.time()
+    signed_s, until_s = signature_times(counters)
+    if not until_s:
+        return skip(name, "the map is not verified: the daemon runs without --trust")
+    if now_s + _SKEW_S < signed_s:
+        return fail(
+            name,
+            f"this machine's clock says {format_utc(now_s)}, earlier than {format_utc(signed_s)},"
+            " when the map was signed",
+            "set the clock: without it nothing can be found to have expired",
+        )
+    if expired := signature_expiry(counters, now_s):
+        return fail(
+            name,
+            expired,
+            "is the store in reach and the clock right? shmmap versions URL --refresh --sign KEYDIR, once a"
+            " day, keeps it valid",
+        )
+    return ok(name, valid_until(until_s))
 
 
 def _published(created_s: float | None) -> str:

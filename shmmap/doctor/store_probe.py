@@ -28,10 +28,20 @@ ASKED_S: Final = 12.0
 _CLOCK_S: Final = 3.0
 _NAMED: Final = ("AWS_", "GOOGLE_", "AZURE_")
 _OTHERS: Final = (
-    "SERVICE_ACCOUNT", "CREDENTIALS_DIRECTORY", "SSL_CERT_FILE", "SSL_CERT_DIR", "HOME",
-    "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY",
-    "http_proxy", "https_proxy", "all_proxy", "no_proxy",
-)  # fmt: skip
+    "SERVICE_ACCOUNT",
+    "CREDENTIALS_DIRECTORY",
+    "SSL_CERT_FILE",
+    "SSL_CERT_DIR",
+    "HOME",
+    "HTTP_PROXY",
+    "HTTPS_PROXY",
+    "ALL_PROXY",
+    "NO_PROXY",
+    "http_proxy",
+    "https_proxy",
+    "all_proxy",
+    "no_proxy",
+)
 
 
 class StoreQuestion(msgspec.Struct):
@@ -44,44 +54,30 @@ class StoreQuestion(msgspec.Struct):
 
 
 class StoreAnswer(msgspec.Struct):
-    """What the store answered; times in seconds, Unix time where they are moments.
-
-    Attributes
-    ----------
-    credentials, credentials_error, credentials_hint
-        Where credentials come from, never what they are; or why they cannot be used.
-    is_refused
-        The store refuses them.
-    answers
-        Whether anything answers, be it a refusal.
-    first_s, next_s
-        How long one small object takes over a new connection, and the next one.
-    error, hint
-        Why it could not be read.
-    version
-        Number of the version that is offered; 0: not known.
-    created_s, served_created_s
-        When the offered version was published, and when the served one was.
-    clock_s
-        By how much the store's clock is ahead of this machine's.
-    is_late
-        The process was ended because it took too long.
-    """
+    """What the store answered; times in seconds, Unix time where they are moments."""
 
     credentials: str = ""
+    """Where credentials come from, never what they are."""
     credentials_error: str = ""
     credentials_hint: str = ""
     is_refused: bool = False
+    """The store refuses the credentials."""
     answers: bool = False
+    """Whether anything answers, be it a refusal."""
     first_s: float | None = None
+    """How long one small object takes over a new connection; ``next_s``: the next one."""
     next_s: float | None = None
     error: str = ""
     hint: str = ""
     version: int = 0
+    """Number of the version that is offered; 0: not known."""
     created_s: float | None = None
+    """When the offered version was published; ``served_created_s``: when the served one was."""
     served_created_s: float | None = None
     clock_s: float | None = None
+    """By how much the store's clock is ahead of this machine's."""
     is_late: bool = False
+    """The process was ended because it took too long."""
 
 
 def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) -> StoreAnswer:
@@ -101,8 +97,12 @@ def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) ->
     try:
         process = subprocess.Popen(
             [sys.executable, "-m", "shmmap.doctor.store_probe", msgspec.json.encode(question).decode()],
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=given, cwd="/",
-        )  # fmt: skip
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=given,
+            cwd="/",
+        )
     except OSError as error:
         return StoreAnswer(error=f"it cannot be asked: {sys.executable}: {error.strerror}")
     is_late = False

@@ -1,21 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the counters alone say: whether the cache is too small, how long the storage is out of reach.
+"""Findings, and what the counters alone say, in the same words for ``status``, ``top`` and ``doctor``.
 
-``status``, ``top`` and ``doctor`` say it in the same words.
+Whether the cache is too small, how long the storage has been out of reach, whether the map's signature holds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple
 
-from shmmap.quantities import format_bytes, format_duration
+from shmmap.quantities import format_bytes, format_duration, format_utc
+from shmmap.statistics.counters import REFUSALS
 
-__all__ = ["Verdict", "cache_verdict", "outage_so_far"]
+__all__ = [
+    "Finding",
+    "State",
+    "Verdict",
+    "cache_verdict",
+    "fail",
+    "ok",
+    "outage_so_far",
+    "refused_offer",
+    "signature_expiry",
+    "signature_lines",
+    "signature_times",
+    "skip",
+    "trust_problems",
+    "valid_until",
+    "warn",
+    "worst",
+]
 
-AGAIN_SHARE: Final = 0.05
-AGAIN_COUNT: Final = 10
-"""Fewer loads than this tell nothing, whatever their share."""
+State = Literal["ok", "warn", "fail"]
+_SEVERITY: Final[dict[State, int]] = {"ok": 0, "warn": 1, "fail": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What was looked at, what was found, and what to do about it."""
+
+    name: str
+    state: State
+    """``ok``; ``warn`` for what may hurt later; ``fail`` for what hinders now."""
+    fact: str
+    advice: str = ""
+    """Empty where nothing has to be done."""
+    skipped: bool = False
+    """Whether it could not be checked, and nothing is wrong with that; ``state`` is ``ok`` then."""
+
+
+def skip(name: str, fact: str) -> Finding:
+    """Return that there was nothing to look at."""
+    return Finding(name, "ok", fact, skipped=True)
+
+
+def ok(name: str, fact: str, advice: str = "") -> Finding:
+    """Return a finding that needs nothing; ``advice`` may still point at something better."""
+    return Finding(name, "ok", fact, advice)
+
+
+def warn(name: str, fact: str, advice: str) -> Finding:
+    """Return a finding that may hurt later."""
+    return Finding(name, "warn", fact, advice)
+
+
+def fail(name: str, fact: str, advice: str) -> Finding:
+    """Return a finding that hinders the daemon or a client now."""
+    return Finding(name, "fail", fact, advice)
+
+
+def worst(findings: list[Finding]) -> State:
+    """Return the most severe state among findings."""
+    return max((one.state for one in findings), key=_SEVERITY.__getitem__, default="ok")
+
+
+RELOADED_SHARE: Final = 0.05
+RELOADED_COUNT: Final = 10
+"""Fewer loads than this prove nothing, whatever their share."""
 
 
 class Verdict(NamedTuple):
@@ -48,7 +110,7 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
             f" {format_bytes(budget)}",
             "raise --budget; `shmmap clients` says who uses the memory",
         )
-    if again >= AGAIN_COUNT and again > AGAIN_SHARE * misses:
+    if again >= RELOADED_COUNT and again > RELOADED_SHARE * misses:
         share = 100 * again / misses
         return Verdict(
             True,
@@ -77,3 +139,67 @@ def outage_so_far(counters: Mapping[str, int]) -> str:
     """Return how long the map's storage is out of reach: ``"less than a second"``, ``"5.0 s"``."""
     outage_s = counters.get("last_outage_ns", 0) * 1e-9
     return "less than a second" if outage_s < 1.0 else format_duration(outage_s)
+
+
+_ADVICE: Final = {
+    "unsigned": "shmmap publish MAP URL --sign KEYDIR signs it",
+    "older": "is something old served to this machine, or was the map restored from a backup?"
+    " if it is meant, serve it once with --accept-version",
+    "expired": "shmmap versions URL --refresh --sign KEYDIR signs it again; is the clock right?",
+    "altered": "was it damaged on its way or by others? `shmmap reload` names what",
+    "foreign_root": "is it the right URL, and the ROOT.json of the keys that sign it?",
+    "other": "`shmmap reload` says why",
+}
+
+
+def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
+    """List what is wrong with the signature of the map that is served, and with the version offered.
+
+    Parameters
+    ----------
+    now_s
+        This machine's clock, Unix time.
+    """
+    expired, (refused, _) = signature_expiry(counters, now_s), refused_offer(counters)
+    return [problem for problem in (expired, refused) if problem]
+
+
+def refused_offer(counters: Mapping[str, int]) -> tuple[str, str]:
+    """Say why the version that the map's origin offers is not taken, and what to do; empty if it is taken."""
+    at = counters.get("published_refusal", 0)
+    cause = REFUSALS[at] if at < len(REFUSALS) else REFUSALS[-1]
+    if not cause:
+        return "", ""
+    number = counters.get("published_refused", 0)
+    offer = f"version {number}, which is offered," if number else "what the map's origin offers"
+    why = "cannot be taken" if cause == REFUSALS[-1] else f"is refused, {cause.replace('_', ' ')}"
+    return f"{offer} {why}: what was taken is served", _ADVICE[cause]
+
+
+def signature_lines(counters: Mapping[str, int], now_s: float) -> list[str]:
+    """Until when the map is signed, and the problems with that; empty for a map without either."""
+    until_s = signature_times(counters)[1]
+    problems = trust_problems(counters, now_s)
+    if not until_s or signature_expiry(counters, now_s):
+        return problems
+    return [valid_until(until_s), *problems]
+
+
+def signature_times(counters: Mapping[str, int]) -> tuple[float, float]:
+    """When the map was signed, and until when that is valid, Unix time; 0: it is not signed."""
+    names = ("published_signed_unix_ns", "published_expires_unix_ns")
+    signed_s, until_s = (counters.get(name, 0) * 1e-9 for name in names)
+    return signed_s, until_s
+
+
+def signature_expiry(counters: Mapping[str, int], now_s: float) -> str:
+    """Say when the signature expired; empty if it has not.  The clock may be behind the signing time."""
+    signed_s, until_s = signature_times(counters)
+    if not until_s or until_s > max(now_s, signed_s):
+        return ""
+    return f"what signs the map has expired since {format_utc(until_s)}: it is served on"
+
+
+def valid_until(until_s: float) -> str:
+    """Say until when a verified signature is valid."""
+    return f"verified, valid until {format_utc(until_s)}"

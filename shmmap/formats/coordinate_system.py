@@ -50,7 +50,7 @@ FEET: Final = {
 """Feet by the names that options have; they differ by 2 mm in a kilometre."""
 
 UNITS: Final = ("auto", "m", *FEET)
-"""What options for units may be: ``auto`` is what each file says of itself."""
+"""What options for units may be: ``auto`` is what each file says about itself."""
 
 _SAME: Final = 5e-8  # lengths in files are rounded; the two feet differ by 6e-7
 

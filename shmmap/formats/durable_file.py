@@ -27,7 +27,7 @@ _HINTS: Final = {
 
 @contextlib.contextmanager
 def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[IO[bytes]]:
-    """A file that has its name only once it is complete and on the disk.
+    """Open a file that gets its name only once it is complete and on the disk.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def flush_directory(path: str | os.PathLike[str]) -> None:
 
 @contextlib.contextmanager
 def writing_errors(what: str) -> Iterator[None]:
-    """Turn what the operating system refuses into `CannotWrite`, with a hint; ``what`` was to be written."""
+    """Turn an OSError into `CannotWrite`, with a hint; ``what`` is the thing to be written."""
     try:
         yield
     except ShmmapError:

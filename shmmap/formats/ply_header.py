@@ -19,14 +19,7 @@ from shmmap.errors import BadRequest, MapDataError
 from shmmap.formats.pcd.fields import AXES, MAX_FIELDS, PcdField
 from shmmap.formats.source_file import refusal
 
-__all__ = [
-    "HEADER_LIMIT_BYTES",
-    "PlyElement",
-    "PlyHeader",
-    "PlyProperty",
-    "parse_ply_header",
-    "ply_header",
-]
+__all__ = ["HEADER_LIMIT_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "parse_ply_header", "ply_header"]
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
 """A header must end within these."""

@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from shmmap.errors import MapDataError
 
-__all__ = [
-    "CAUSES",
-    "FileReader",
-    "SourceFile",
-    "open_regular",
-    "refusal",
-]
+__all__ = ["CAUSES", "FileReader", "SourceFile", "open_regular", "refusal"]
 
 _Self = TypeVar("_Self", bound="FileReader")
 
@@ -88,7 +82,7 @@ class FileReader:
         self.close()
 
     def fileno(self) -> int:
-        """The open file's descriptor."""
+        """Return the open file's descriptor."""
         return self._fd
 
     def close(self) -> None:

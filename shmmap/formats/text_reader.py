@@ -38,7 +38,7 @@ _UNIT: Final = re.compile(r"[\[(].*")
 _NORMALS: Final = ("nx", "ny", "nz")
 _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
-"""What columns after x, y and z are, by their number, as PTS has them."""
+"""Names of the columns after x, y and z, by how many there are, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
 _LOOKED_AT: Final = 32  # rows
 _SHOWN: Final = 60
@@ -173,7 +173,7 @@ class TextReader(FileReader):
             )
 
     def _line_at(self, offset: int) -> int:
-        """Number of the line that begins at a byte of the file, counted from 1."""
+        """Return the number, counted from 1, of the line that begins at a byte of the file."""
         line, at = 1, 0
         newline = b"\r" if self._bare_cr else b"\n"
         while part := os.pread(self._fd, min(_HEAD_BYTES, offset - at), at):

@@ -140,7 +140,7 @@ class Derived:
 
 
 def combined_digest(own: bytes, neighbours: Sequence[bytes]) -> bytes:
-    """Digest of everything that a layer was computed from: the source's own where there is no more."""
+    """Return the digest of a layer's inputs: the source's own digest if no neighbour was used."""
     return xxhash.xxh3_128_digest(b"".join([own, *neighbours])) if neighbours else own
 
 

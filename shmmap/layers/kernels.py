@@ -16,14 +16,7 @@ from numba import float32, float64, int32, int64, types
 
 from shmmap.compiling import compiled, inlined, read_only
 
-__all__ = [
-    "bounds",
-    "count_points",
-    "heights",
-    "inverse_covariances",
-    "moments",
-    "number_voxels",
-]
+__all__ = ["bounds", "count_points", "heights", "inverse_covariances", "moments", "number_voxels"]
 
 
 _POINTS: Final = tuple((read_only(real, 2), real) for real in (float32, float64))
@@ -98,7 +91,7 @@ def count_points(
 
 @compiled(types.int64(int32[::1], int32, int32[::1], int32[::1]))
 def number_voxels(table: Any, least: Any, counts: Any, places: Any) -> Any:
-    """Number the voxels that have at least ``least`` points, in the order of the table.
+    """Assign rows to the voxels that have at least ``least`` points, in the order of the table.
 
     ``table`` holds counts on entry, row numbers or -1 afterwards; ``counts`` and ``places`` (at least
     as long as there are occupied voxels) receive each row's count and position.  Returns the rows.
@@ -236,6 +229,38 @@ def _least_and_greatest(c: Any) -> Any:
     return q + 2.0 * p * math.cos(angle + 2.0 * math.pi / 3.0), q + 2.0 * p * math.cos(angle)
 
 
+@inlined
+def _raise_eigenvalues(c: Any, least_ratio: Any, a: Any, v: Any) -> None:
+    """Raise eigenvalues of (xx, xy, xz, yy, yz, zz) to ``least_ratio`` times the greatest, at least.
+
+    ``a`` and ``v``, (3, 3), are scratch.
+    """
+    a[0, 0], a[1, 1], a[2, 2] = c[0], c[3], c[5]
+    a[0, 1] = a[1, 0] = c[1]
+    a[0, 2] = a[2, 0] = c[2]
+    a[1, 2] = a[2, 1] = c[4]
+    _jacobi(a, v)
+    low, middle, high = 0, 1, 2
+    if a[low, low] > a[middle, middle]:
+        low, middle = middle, low
+    if a[middle, middle] > a[high, high]:
+        middle, high = high, middle
+    if a[low, low] > a[middle, middle]:
+        low, middle = middle, low
+    floor = least_ratio * a[high, high]
+    if a[low, low] < floor:
+        a[low, low] = floor
+        if a[middle, middle] < floor:
+            a[middle, middle] = floor
+        at = 0
+        for i in range(3):
+            for j in range(i, 3):
+                c[at] = (
+                    a[0, 0] * v[i, 0] * v[j, 0] + a[1, 1] * v[i, 1] * v[j, 1] + a[2, 2] * v[i, 2] * v[j, 2]
+                )
+                at += 1
+
+
 @compiled(types.int64(_INDICES, read_only(float64, 2), int64, float64, _TABLE, _TABLE))
 def inverse_covariances(
     counts: Any, scatter: Any, convention: Any, least_ratio: Any, covariance: Any, inverse: Any
@@ -264,32 +289,7 @@ def inverse_covariances(
         least, greatest = _least_and_greatest(c)
         good = n > 1.0 and greatest > 0.0 and least >= -1e-7 * greatest and math.isfinite(greatest)
         if good and least < (least_ratio + 1e-6) * greatest:
-            a[0, 0], a[1, 1], a[2, 2] = c[0], c[3], c[5]
-            a[0, 1] = a[1, 0] = c[1]
-            a[0, 2] = a[2, 0] = c[2]
-            a[1, 2] = a[2, 1] = c[4]
-            _jacobi(a, v)
-            low, middle, high = 0, 1, 2
-            if a[low, low] > a[middle, middle]:
-                low, middle = middle, low
-            if a[middle, middle] > a[high, high]:
-                middle, high = high, middle
-            if a[low, low] > a[middle, middle]:
-                low, middle = middle, low
-            floor = least_ratio * a[high, high]
-            if a[low, low] < floor:
-                a[low, low] = floor
-                if a[middle, middle] < floor:
-                    a[middle, middle] = floor
-                at = 0
-                for i in range(3):
-                    for j in range(i, 3):
-                        c[at] = (
-                            a[0, 0] * v[i, 0] * v[j, 0]
-                            + a[1, 1] * v[i, 1] * v[j, 1]
-                            + a[2, 2] * v[i, 2] * v[j, 2]
-                        )
-                        at += 1
+            _raise_eigenvalues(c, least_ratio, a, v)
         xx = c[3] * c[5] - c[4] * c[4]
         xy = c[2] * c[4] - c[1] * c[5]
         xz = c[1] * c[4] - c[2] * c[3]

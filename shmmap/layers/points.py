@@ -118,7 +118,7 @@ def _append(writer: SegmentWriter, block: Block) -> None:
 
 
 def _from_arrays(points: PointTable, parameters: Parameters) -> LayerTable:
-    """The same from arrays: points that are finite, every column."""
+    """Build the layer from arrays: points that are finite, every column."""
     del parameters
     return points.selected(points.finite())
 

@@ -2,7 +2,7 @@
 """Layers whose rows are the source's points, all or some, in its order and with every column.
 
 ``crop`` keeps those between two heights, ``sample`` every n-th or a random choice that is the same
-everywhere, ``denoise`` those that are no statistical outliers (as PCL has it, with Open3D's neighbour
+everywhere, ``denoise`` those that are no statistical outliers (as in PCL, with Open3D's neighbour
 search); ``normals`` adds the direction of the surface at each, by Open3D.
 """
 
@@ -34,7 +34,7 @@ __all__ = [
 
 _XYZ: Final = LayerColumn("xyz", None, "(rows, 3)", "m", "coordinates, map frame, in the source's order")
 _SOURCE_COLUMNS: Final = (_XYZ, LayerColumn("*", None, "as in the source", "", "every other field"))
-_QUERIES_AT_ONCE: Final = 1 << 16
+_QUERIES_PER_BATCH: Final = 1 << 16
 SYSTEM_PACKAGES: Final = (
     "libegl1", "libgl1", "libx11-6", "libusb-1.0-0",
     *(() if platform.machine() == "x86_64" else ("libgfortran5",)),  # its build for others links to it
@@ -164,8 +164,8 @@ def _mean_distances(xyz: NDArray[np.float64], queries: int, neighbours: int) -> 
     search.knn_index()
     wanted = min(neighbours + 1, len(xyz))
     means = np.empty(queries)
-    for at in range(0, queries, _QUERIES_AT_ONCE):
-        end = min(queries, at + _QUERIES_AT_ONCE)
+    for at in range(0, queries, _QUERIES_PER_BATCH):
+        end = min(queries, at + _QUERIES_PER_BATCH)
         _, squared = search.knn_search(core.Tensor(np.ascontiguousarray(xyz[at:end])), wanted)
         # the nearest is the point itself, or one that lies where it does: 0 away either way
         means[at:end] = np.sqrt(squared.numpy()[:, 1:]).mean(axis=1)

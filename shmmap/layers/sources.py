@@ -267,7 +267,7 @@ class Files:
         reserve: Callable[[int], None] | None,
         warn: Callable[[str], None],
     ) -> SegmentHeader | None:
-        """Stream the file into the segment, for ``points`` alone."""
+        """Stream the file into the segment if the layer is ``points``; do nothing for others."""
         if spec.kind.name != LAYER:
             return None
         return build_points(

@@ -123,7 +123,7 @@ class LayerSpec:
 
     @property
     def halo_m(self) -> float:
-        """How far beyond the cell it looks, metres; that of what it is built of included."""
+        """How far beyond the cell the layer looks, metres, the layers that it is built from included."""
         return self.kind.halo_m(self.parameters) + (self.of.halo_m if self.of is not None else 0.0)
 
     @property
@@ -172,7 +172,7 @@ class _Words:
         return self._tokens[self._at]
 
     def take(self, kind: str, value: str | None = None) -> str | None:
-        """The next token if it is this one, else None."""
+        """Take the next token if it is this one, else return None."""
         found, text = self._tokens[self._at]
         if found != kind or (value is not None and text != value):
             return None
@@ -280,7 +280,7 @@ def _checked(kind: LayerKind, given: dict[str, Value], of: LayerSpec | None) -> 
     return LayerSpec(kind, ordered, of)
 
 
-@lru_cache(maxsize=1024)  # a request's specs are a few texts, read again and again
+@lru_cache(maxsize=1024)  # requests have few specs, and repeat them
 def canonical_layer(spec: str) -> str:
     """Return the canonical form of a layer spec; errors are those of `parse_layer`."""
     return str(parse_layer(spec))

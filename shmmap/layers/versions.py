@@ -26,7 +26,7 @@ __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 MAX_NEIGHBOURS: Final = 64
 """Most files that a layer with a halo reads beside its own."""
 MAX_REMEMBERED: Final = 1 << 18
-"""Versions, about 100 bytes each; requests for ever new layers must not fill the daemon's memory."""
+"""Versions, about 100 bytes each; requests for always new layers must not fill the daemon's memory."""
 
 
 _SLACK_M: Final = 1e-3
@@ -38,7 +38,7 @@ class ReadyLayer(Protocol):
 
     @property
     def version(self) -> int:
-        """Its version."""
+        """The version."""
 
 
 class Cells(Protocol):
@@ -62,7 +62,7 @@ class Cells(Protocol):
         """64-bit version of a cell."""
 
     def ready(self, index: int, layer: str) -> ReadyLayer | None:
-        """What is known of a layer that the origin has ready made; None: it is computed here."""
+        """Return what is known of a layer that the origin has computed; None: it is computed here."""
 
     def box(self, index: int) -> tuple[float, float, float, float]:
         """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
@@ -99,7 +99,7 @@ class LayerVersions:
         self._count = 0
 
     def version(self, index: int, layer: str) -> int:
-        """Current version of one layer of a cell, see `shmmap.segment.version`.
+        """Return the current version of one layer of a cell, see `shmmap.segment.version`.
 
         0 where it is not known yet: not all of the cells are that it looks into.
         """
@@ -220,7 +220,7 @@ class LayerVersions:
         self._count += 1
 
     def cell_changed(self, index: int) -> None:
-        """A cell has another version: so have the layers that look into it."""
+        """Forget the versions of layers that look into a cell: it has another version."""
         for layer, cells in self.dependents(index, list(self._known)):
             known = self._known[layer]
             for cell in cells:
@@ -229,6 +229,6 @@ class LayerVersions:
                 del self._known[layer]
 
     def forget(self) -> list[ShardedDict[int, int]]:
-        """Indices mean other cells from now on; returns what was known, which takes time to be freed."""
+        """Forget all versions, as indices now mean other cells; return them: freeing them takes time."""
         known, self._known, self._count = list(self._known.values()), {}, 0
         return known

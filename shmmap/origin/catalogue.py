@@ -334,6 +334,6 @@ class NoMap:
     path = ""
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
-        """An empty catalogue."""
+        """Return an empty catalogue."""
         del fresh, before
         return Catalogue.from_cells([])

@@ -20,23 +20,30 @@ _BLOCK_CELLS: Final = 1 << 15
 
 
 class CellIds(Protocol):
-    """Cells whose ids can be had by index."""
+    """Cells whose ids are found by index."""
 
     def ids(self, indices: Indices) -> list[str]:
         """Ids of several cells, in the order given."""
 
 
 class Tables(CellIds, Protocol):
-    """What is compared of two catalogues; each as `Catalogue` has it."""
+    """What is compared of two catalogues; each as in `Catalogue`."""
 
     @property
-    def id_prefix(self) -> str: ...
+    def id_prefix(self) -> str:
+        """What all ids begin with."""
+
     @property
-    def names(self) -> NDArray[np.bytes_]: ...
+    def names(self) -> NDArray[np.bytes_]:
+        """(N,) bytes, what follows `id_prefix` in each id."""
+
     @property
-    def boxes(self) -> NDArray[np.float64]: ...
+    def boxes(self) -> NDArray[np.float64]:
+        """(N, 4): ``min_x, min_y, max_x, max_y``, metres, map frame."""
+
     @property
-    def stamps(self) -> NDArray[np.int64]: ...
+    def stamps(self) -> NDArray[np.int64]:
+        """(N, 3) int64: size, mtime_ns, ctime_ns of each source."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,7 +105,7 @@ def compare(old: Tables, new: Tables) -> CatalogueChange:
 
 
 def _matched(old: Tables, new: Tables) -> Iterator[tuple[Indices, Indices]]:
-    """Indices in the old one, -1 where it has no such cell, and in the new one; some cells at a time."""
+    """Yield indices in the old one, -1 where it has no such cell, and in the new one, block by block."""
     names = new.names
     same = old.id_prefix == new.id_prefix and (names is old.names or np.array_equal(names, old.names))
     for begin in range(0, len(names), _BLOCK_CELLS):

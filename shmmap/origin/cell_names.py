@@ -105,7 +105,7 @@ class CellNames:
         return int(order[first]) if last > first else None
 
     def _base(self, place: int) -> bytes:
-        """Base name at a place in the order of base names."""
+        """Return the base name at a place in the order of base names."""
         return bytes(self.names[self.by_base[place]]).rpartition(b"/")[2]
 
 
@@ -142,7 +142,7 @@ def common_directory(paths: Sequence[str]) -> str:
 
 
 def _encoded(wanted: str) -> bytes | None:
-    """A name as the tables have it; None if no file is called that."""
+    """Encode a name as the tables have it; None if no file is called that."""
     try:
         key = os.fsencode(wanted)
     except UnicodeEncodeError:

@@ -71,10 +71,11 @@ class _Found:
 def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> ScannedFiles:
     """List the PCD files in ``root``, the absolute path of a directory; of a file that one.
 
-    ``at`` says where to find what a path names.
+    ``at`` turns a path into the one under which this process can open it.
 
-    Symbolic links are followed and keep their own names; a directory reached twice is listed once.  Hidden
-    directories are passed over when recursing, and names that are no UTF-8 everywhere.
+    A file that is reached twice counts once; a directory that is reached twice is listed once.  Symbolic
+    links are followed and keep their own names.  Names that are not UTF-8 are left out; so are hidden
+    directories when recursing.
 
     Raises
     ------

@@ -38,13 +38,7 @@ from shmmap.origin.metadata import (
 from shmmap.origin.reading_apart import read_apart
 from shmmap.segment.layout import SourceStamp
 
-__all__ = [
-    "MAX_SINGLE_PCD_BYTES",
-    "MapDirectory",
-    "is_served_whole",
-    "load_single_pcd",
-    "open_map",
-]
+__all__ = ["MAX_SINGLE_PCD_BYTES", "MapDirectory", "is_served_whole", "load_single_pcd", "open_map"]
 
 # Smaller maps are scanned in a few milliseconds: a cached catalogue would only be less fresh.
 _CACHED_FROM_CELLS = 2000

@@ -28,14 +28,7 @@ from typing import Final
 
 from shmmap.errors import MapDataError, MapMissing
 
-__all__ = [
-    "KUBERNETES_LINK",
-    "MapLayout",
-    "OpenedDirectories",
-    "absolute_path",
-    "find_layout",
-    "is_pcd",
-]
+__all__ = ["KUBERNETES_LINK", "MapLayout", "OpenedDirectories", "absolute_path", "find_layout", "is_pcd"]
 
 KUBERNETES_LINK: Final = "..data"
 """In a Kubernetes volume every visible name is a link through this one, which is switched in one step."""

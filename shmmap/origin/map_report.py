@@ -81,7 +81,7 @@ def _frame_of(report: dict[str, Any]) -> MapFrame:
 def read_map_frame(directory: str | os.PathLike[str]) -> MapFrame:
     """Return where the frame of the map whose metadata is in ``directory`` lies.
 
-    Never raises: a map without a report, or with one that cannot be read, is a map.
+    Never raises: a map whose report is missing or unreadable is still served, with an unknown frame.
     """
     try:
         report = read_report(directory)

@@ -150,7 +150,7 @@ class EntryCollector:
         self._oddities.setdefault(what, []).append(shortened(key.decode("utf-8", "replace")))
 
     def metadata(self) -> MapMetadata | None:
-        """Everything taken, or None while a resolution is missing.  A repeated key: the last one counts."""
+        """Return what was collected, None if a resolution is missing; of repeated keys the last counts."""
         if len(self.resolutions) < len(_RESOLUTIONS):
             return None
         self._flush()
@@ -184,7 +184,7 @@ def shortened(text: str) -> str:
 
 
 def list_some(names: list[str]) -> str:
-    """The first few of ``names``, and how many there are when that is not all."""
+    """List the first few of ``names``, and say how many there are when that is not all."""
     some = ", ".join(names[:_NAMED_IN_PROBLEMS])
     return some if len(names) <= _NAMED_IN_PROBLEMS else f"{some}, ... ({len(names)} in all)"
 
@@ -260,7 +260,7 @@ def parse_metadata(data: bytes, *, path: str, strict: bool = False, lines: bool 
     entries = EntryCollector(strict)
     if not (lines and collect_lines(data, entries)):
         entries = EntryCollector(strict)
-        _collect_events(data, entries, path)
+        _EventReader(data, entries, path).read()
     metadata = entries.metadata()
     if metadata is None:
         missing = " and ".join(
@@ -297,7 +297,7 @@ def _collect_plain(block: bytes, entries: EntryCollector) -> bool:
 
 
 def _collect_each(block: bytes, entries: EntryCollector) -> bool:
-    """Take a block line by line: quotes, comments, floats, spaces, CRLF."""
+    """Read a block line by line, with quotes, comments, floats, spaces and CRLF; False if that fails."""
     position = 0
     while position < len(block):
         line = _LINE.match(block, position)  # here or nowhere: to search a long line takes time by its square
@@ -316,96 +316,134 @@ def _collect_each(block: bytes, entries: EntryCollector) -> bool:
     return True
 
 
-def _collect_events(data: bytes, entries: EntryCollector, path: str) -> None:
-    """Read YAML of any style, from parser events: nothing recurses, however deep the file nests."""
-    depth = 0
-    key: str | None = None
-    value: list[str] | str = []
-    nested = False
+class _EventReader:
+    """Reads YAML of any style, from parser events: nothing recurses, however deep the file nests.
 
-    def refuse(message: str, mark: Any, cause: str) -> MapDataError:
-        return MapDataError(
-            f"line {mark.line + 1}: {message}", path=path, offset=_line_offset(data, mark.line), cause=cause
-        )
+    Parameters
+    ----------
+    data
+        Bytes of the file.
+    entries
+        Takes what is found.
+    path
+        For messages.
+    """
 
-    if tag := _TAG_DIRECTIVE.search(data):
-        raise MapDataError(
-            "tag directives are not read",
-            path=path,
-            offset=tag.start(),
-            cause="bad_yaml",
-            hint="metadata needs none: remove the line that begins with %TAG",
-        )
-    try:
-        for event in yaml.parse(data, Loader=_LOADER):
-            if isinstance(event, yaml.AliasEvent):
-                raise refuse("aliases are not read", event.start_mark, "bad_yaml")
-            if isinstance(event, yaml.DocumentEndEvent):
-                return  # like yaml-cpp's LoadFile: the first document only
-            if isinstance(event, yaml.CollectionStartEvent):
-                is_mapping = isinstance(event, yaml.MappingStartEvent)
-                if (depth == 0) != is_mapping and depth == 0:
-                    raise refuse("the file is not a YAML mapping", event.start_mark, "bad_yaml")
-                if depth == 1 and key is None:
-                    raise refuse("a key must be a name", event.start_mark, "bad_yaml")
-                if depth >= _MAX_DEPTH:
-                    raise refuse("nested too deeply", event.start_mark, "bad_yaml")
-                nested = depth > 1 or (depth == 1 and is_mapping)
-                depth += 1
-            elif isinstance(event, yaml.CollectionEndEvent):
-                depth -= 1
-            elif isinstance(event, yaml.ScalarEvent):
-                if depth == 0:
-                    raise refuse("the file is not a YAML mapping", event.start_mark, "bad_yaml")
-                if depth == 1 and key is None:
-                    key, value, nested = event.value, [], False
-                    continue
-                if depth == 1:
-                    value = event.value
-                elif isinstance(value, list):
-                    value.append(event.value)
-            if depth == 1 and key is not None:
-                _take(entries, key, None if nested else value, refuse, event.start_mark)
-                key = None
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        if mark is None:
-            raise MapDataError(f"no YAML: {error.problem}", path=path, cause="bad_yaml") from error
-        if error.problem == _TOO_DEEP_FOR_LIBYAML:
-            raise refuse("nested too deeply", mark, "bad_yaml") from error
-        raise refuse(f"no YAML: {error.problem}", mark, "bad_yaml") from error
-    except yaml.YAMLError as error:
-        raise MapDataError(f"no YAML: {error}", path=path, cause="bad_yaml") from error
+    def __init__(self, data: bytes, entries: EntryCollector, path: str) -> None:
+        self._data = data
+        self._entries = entries
+        self._path = path
+        self._depth = 0
+        self._key: str | None = None
+        """Of the entry being read; None between entries."""
+        self._values: list[str] = []
+        self._is_nested = False
 
+    def read(self) -> None:
+        """Read the first document, as yaml-cpp's LoadFile does.
 
-def _take(entries: EntryCollector, key: str, value: list[str] | str | None, refuse: Any, mark: Any) -> None:
-    name, key = key.encode(), shortened(key)
-    if isinstance(value, str):
-        if entries.scalar(name, value):
-            return
-        if key in ("x_resolution", "y_resolution"):
-            raise refuse(
-                f"{key} must be a positive number of metres, not {shortened(value)!r}", mark, "no_resolution"
+        Raises
+        ------
+        MapDataError
+            It is no YAML, or no mapping of names to corners.
+        """
+        if tag := _TAG_DIRECTIVE.search(self._data):
+            raise MapDataError(
+                "tag directives are not read",
+                path=self._path,
+                offset=tag.start(),
+                cause="bad_yaml",
+                hint="metadata needs none: remove the line that begins with %TAG",
             )
-        raise refuse(f"{key} is not an [x, y] corner", mark, "unknown_key")
-    if value is None:
-        if entries.strict:
-            raise refuse(f"{key} is not an [x, y] corner", mark, "unknown_key")
-        entries.report("unknown key ignored", name)
-        return
-    if len(value) < 2:
-        raise refuse(f"{key} needs two values, x and y", mark, "bad_corner")
-    if len(value) > 2:
-        entries.report("values after x and y ignored", name)
-    if not entries.entry(name, value[0], value[1]):
-        if len(name) > MAX_NAME_BYTES:
-            raise refuse(f"{key}: no file has so long a name", mark, "bad_corner")
-        kind = "integers" if entries.strict else "numbers"
-        raise refuse(
-            f"{key}: the corner must be two {kind}, not [{', '.join(map(shortened, value[:2]))}]",
-            mark,
-            "bad_corner",
+        try:
+            for event in yaml.parse(self._data, Loader=_LOADER):
+                if isinstance(event, yaml.DocumentEndEvent):
+                    return
+                self._follow(event)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            if mark is None:
+                raise MapDataError(f"no YAML: {error.problem}", path=self._path, cause="bad_yaml") from error
+            if error.problem == _TOO_DEEP_FOR_LIBYAML:
+                raise self._refusal("nested too deeply", mark) from error
+            raise self._refusal(f"no YAML: {error.problem}", mark) from error
+        except yaml.YAMLError as error:
+            raise MapDataError(f"no YAML: {error}", path=self._path, cause="bad_yaml") from error
+
+    def _refusal(self, message: str, mark: Any, cause: str = "bad_yaml") -> MapDataError:
+        return MapDataError(
+            f"line {mark.line + 1}: {message}",
+            path=self._path,
+            offset=_line_offset(self._data, mark.line),
+            cause=cause,
         )
+
+    def _follow(self, event: yaml.Event) -> None:
+        if isinstance(event, yaml.ScalarEvent):
+            self._scalar(event)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            self._begin(event)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            self._depth -= 1
+            if self._depth == 1 and self._key is not None:
+                self._take(self._key, None if self._is_nested else self._values, event.start_mark)
+        elif isinstance(event, yaml.AliasEvent):
+            raise self._refusal("aliases are not read", event.start_mark)
+
+    def _begin(self, event: yaml.CollectionStartEvent) -> None:
+        is_mapping = isinstance(event, yaml.MappingStartEvent)
+        if self._depth == 0 and not is_mapping:
+            raise self._refusal("the file is not a YAML mapping", event.start_mark)
+        if self._depth == 1 and self._key is None:
+            raise self._refusal("a key must be a name", event.start_mark)
+        if self._depth >= _MAX_DEPTH:
+            raise self._refusal("nested too deeply", event.start_mark)
+        self._is_nested = self._depth > 1 or (self._depth == 1 and is_mapping)
+        self._depth += 1
+
+    def _scalar(self, event: yaml.ScalarEvent) -> None:
+        if self._depth == 0:
+            raise self._refusal("the file is not a YAML mapping", event.start_mark)
+        if self._depth > 1:
+            self._values.append(event.value)
+        elif self._key is None:
+            self._key, self._values, self._is_nested = event.value, [], False
+        else:
+            self._take(self._key, event.value, event.start_mark)
+
+    def _take(self, key: str, value: list[str] | str | None, mark: Any) -> None:
+        """Hand on the entry that ends at ``mark``; ``value`` is None if nested."""
+        entries = self._entries
+        name, key = key.encode(), shortened(key)
+        self._key = None
+        if isinstance(value, str):
+            if entries.scalar(name, value):
+                return
+            if key in ("x_resolution", "y_resolution"):
+                raise self._refusal(
+                    f"{key} must be a positive number of metres, not {shortened(value)!r}",
+                    mark,
+                    "no_resolution",
+                )
+            raise self._refusal(f"{key} is not an [x, y] corner", mark, "unknown_key")
+        if value is None:
+            if entries.strict:
+                raise self._refusal(f"{key} is not an [x, y] corner", mark, "unknown_key")
+            entries.report("unknown key ignored", name)
+            return
+        if len(value) < 2:
+            raise self._refusal(f"{key} needs two values, x and y", mark, "bad_corner")
+        if len(value) > 2:
+            entries.report("values after x and y ignored", name)
+        if not entries.entry(name, value[0], value[1]):
+            if len(name) > MAX_NAME_BYTES:
+                raise self._refusal(f"{key}: no file has so long a name", mark, "bad_corner")
+            kind = "integers" if entries.strict else "numbers"
+            raise self._refusal(
+                f"{key}: the corner must be two {kind}, not [{', '.join(map(shortened, value[:2]))}]",
+                mark,
+                "bad_corner",
+            )
 
 
 def _line_offset(data: bytes, line: int) -> int:

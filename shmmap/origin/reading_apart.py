@@ -60,7 +60,7 @@ _OUTCOME: Final = msgspec.json.Decoder(Outcome)
 def read_apart(
     map_path: str, words: str, before: Catalogue | None, descriptors: Sequence[int] = ()
 ) -> Catalogue:
-    """Have a process read a map.
+    """Read a map in a process of its own.
 
     Parameters
     ----------

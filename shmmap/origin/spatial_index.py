@@ -35,7 +35,7 @@ Bounds = tuple[float, float, float, float]
 _LINEAR_CELLS = 5000
 
 # Candidates that are tested at a time where there are very many.
-_AT_ONCE = 1 << 15
+_CELLS_PER_BATCH = 1 << 15
 
 # Rows of buckets whose ends are sooner found than how much of each lies in a circle.
 _FEW_ROWS = 128
@@ -114,6 +114,7 @@ class Grid:
 
     @property
     def nbytes(self) -> int:
+        """Memory of the arrays."""
         return int(self.keys.nbytes + self.cells.nbytes)
 
     def runs(self, bounds: Bounds, slack: float, circle: Circle | None = None) -> tuple[Indices, Indices]:
@@ -142,7 +143,7 @@ class Grid:
         first = np.arange(iy0 << 32, (iy1 + 1) << 32, 1 << 32, dtype=np.int64)
         if circle is None or len(first) <= _FEW_ROWS:
             begins, ends = self.keys.searchsorted(first + ix0), self.keys.searchsorted(first + (ix1 + 1))
-            if circle is None or int((ends - begins).sum()) <= _AT_ONCE:
+            if circle is None or int((ends - begins).sum()) <= _CELLS_PER_BATCH:
                 return begins, ends
         low, high = self._within(circle, slack, iy0, iy1)
         return self.keys.searchsorted(first + low), self.keys.searchsorted(first + high + 1)
@@ -215,7 +216,7 @@ class SpatialIndex:
     boxes
         (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame, finite, min <= max.
     made
-        What was made of the same boxes before.
+        Search structure of the same boxes, if one exists already.
     """
 
     def __init__(self, boxes: Floats, made: MadeOfBoxes | None = None) -> None:
@@ -253,25 +254,25 @@ class SpatialIndex:
 
 
 def _candidates(cells: NDArray[np.int32], begins: Indices, ends: Indices) -> Iterator[NDArray[np.int32]]:
-    """Return the cells of runs, at most `_AT_ONCE` at a time."""
+    """Return the cells of runs, at most `_CELLS_PER_BATCH` at a time."""
     lengths = ends - begins
     total = int(lengths.sum())
-    if total <= _AT_ONCE:
+    if total <= _CELLS_PER_BATCH:
         if total:
             pairs = zip(begins.tolist(), ends.tolist(), strict=True)
             yield np.concatenate([cells[i:j] for i, j in pairs])
         return
     before = np.cumsum(lengths) - lengths
-    for first in range(0, total, _AT_ONCE):
-        places = np.arange(first, min(first + _AT_ONCE, total))
+    for first in range(0, total, _CELLS_PER_BATCH):
+        places = np.arange(first, min(first + _CELLS_PER_BATCH, total))
         run = before.searchsorted(places, side="right") - 1
         yield cells[begins[run] + (places - before[run])]
 
 
 def _blocks(cells: Indices, boxes: Floats) -> Iterator[tuple[slice, Floats]]:
     """Return the columns of rows ``cells`` of boxes, some at a time: nothing as long as the map is made."""
-    for begin in range(0, len(cells), _AT_ONCE):
-        block = slice(begin, begin + _AT_ONCE)
+    for begin in range(0, len(cells), _CELLS_PER_BATCH):
+        block = slice(begin, begin + _CELLS_PER_BATCH)
         yield block, boxes.T.take(cells[block], axis=1)
 
 

@@ -25,7 +25,7 @@ class PrepareProgress(Protocol):
     """How far a run is."""
 
     def stage(self, name: str, total: int) -> None:
-        """A stage of ``total`` cells begins."""
+        """Begin a stage of ``total`` cells."""
 
     def advance(self, cells: int) -> None:
         """More cells are done."""
@@ -89,7 +89,7 @@ def prepare_map(
     workers: int,
     progress: PrepareProgress,
 ) -> Prepared:
-    """Have layers of every cell of a map in the disk cache.
+    """Bring layers of every cell of a map into the disk cache.
 
     Parameters
     ----------

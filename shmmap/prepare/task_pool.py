@@ -163,7 +163,7 @@ class TaskPool(Generic[_Task, _Done]):
             self._selector.close()
 
     def _next(self) -> _Task | None:
-        """The next task: one given back, or a new one."""
+        """Return the next task: one given back, or a new one."""
         return self._again.pop() if self._again else next(self._tasks, None)
 
     def _start(self, task: _Task) -> None:

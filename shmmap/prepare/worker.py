@@ -31,7 +31,7 @@ _BLOCK_BYTES: Final = 1 << 20
 
 
 def _prepare_cell(task: CellTask, cache: LayerCache, *, recognise: bool) -> CellDone:
-    """Have every layer of a cell in the cache; the file is read once for all computed layers.
+    """Bring every layer of a cell into the cache; the file is read once for all computed layers.
 
     ``recognise``: look in the cache for layers of other states of the same files.
     """
@@ -76,7 +76,7 @@ class CellPoints:
         )
 
     def points(self, spec: LayerSpec) -> CellSource:
-        """The columns that one layer takes: exactly those, whatever the others need."""
+        """Return the columns that one layer takes: exactly those, whatever the others need."""
         if self._read is None:
             self._read = self._reader.read(self._source, self._box, self._needs)
         names = spec.source_columns

@@ -57,7 +57,7 @@ def signals_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _handled_by(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Have a function handle these signals, save one of a program in C, which Python cannot put back."""
+    """Handle these signals by a function, save one of a program in C, which Python cannot restore."""
     before = {number: handler for number in ENDINGS if (handler := signal.getsignal(number)) is not None}
     try:
         for number in before:

@@ -201,7 +201,7 @@ def fork_child(main: Callable[[int, int], int]) -> tuple[ForkedProcess, socket.s
 
 
 def _become(main: Callable[[int, int], int], fd: int, parent: int) -> NoReturn:
-    """Be the child: of what the parent has open only standard error is left."""
+    """Run as the child: of what the parent has open only standard error is left."""
     code = 1
     try:
         os.environ.setdefault("OMP_NUM_THREADS", "1")

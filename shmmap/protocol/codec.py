@@ -83,12 +83,17 @@ class PackedArray:
             self._count += len(elements)
             self._parts.append(encode(elements)[len(_head(len(elements))) :])
 
+    def add_encoded(self, elements: Sequence[bytes]) -> None:
+        """Add elements that are encoded already."""
+        self._count += len(elements)
+        self._parts.append(b"".join(elements))
+
     def __bytes__(self) -> bytes:
         return b"".join((_head(self._count), *self._parts))
 
 
 def _head(count: int) -> bytes:
-    """The head of an array of ``count`` elements."""
+    """Encode the head of an array of ``count`` elements."""
     if count < 16:
         return bytes((0x90 | count,))
     if count < 1 << 16:
@@ -103,7 +108,7 @@ def encode_cells(
     request: int,
     epoch: int,
     map_version: int,
-    handles: Sequence[bytes],
+    handles: PackedArray,
     removed: tuple[str, ...],
     removed_packed: bytes,
     layers: tuple[str, ...],
@@ -118,7 +123,7 @@ def encode_cells(
     dropped = encode((removed, removed_packed))
     end = encode((layers, covered, reason))
     # one array of twelve elements instead of three: replace their one-byte heads
-    parts = (start[1:], _head(len(handles)), *handles, dropped[1:], bytes(pending), bytes(failed), end[1:])
+    parts = (start[1:], bytes(handles), dropped[1:], bytes(pending), bytes(failed), end[1:])
     return b"".join((b"\x9c", *parts))
 
 

@@ -31,7 +31,7 @@ _SUN_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) - 1 on Linux
 def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
     """Directories a client looks in, in order: the user's own, then the system's.
 
-    ``XDG_RUNTIME_DIR`` is ignored where it is not absolute, as its specification has it.  The directory in
+    ``XDG_RUNTIME_DIR`` is ignored where it is not absolute, as its specification says.  The directory in
     /tmp counts where it is there and belongs to this user.
     """
     own = environ.get("XDG_RUNTIME_DIR", "")

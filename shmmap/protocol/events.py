@@ -201,7 +201,7 @@ class LiveEnded(_Numbered, tag="live_ended", frozen=True):
 
 
 class LiveProblem(_Numbered, tag="live_problem", frozen=True):
-    """What keeps chunks of a live map from being loaded or saved; empty: nothing does any more."""
+    """Chunks of a live map cannot be loaded or saved, and why; an empty reason: the problem is over."""
 
     map: str
     problem: str

@@ -164,7 +164,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     shm_dir, prefix
         Chunks are ``prefix`` + key + ``.`` + generation in this directory.
     marks_dir
-        Where files of marks are to lie; empty for who does not map.
+        Where files of marks are to lie; empty for a session that does not map.
     mapper, next_scan
         The mapper's number, and the least that a new scan of it may have.
     max_marks_bytes

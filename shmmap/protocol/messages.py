@@ -89,8 +89,8 @@ Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NA
 class Hello(msgspec.Struct, array_like=True, tag="hello"):
     """First message of a session.
 
-    ``session`` is the slot of the client's session with a previous run of the daemon, 0 for none: it
-    keeps it, so that the locks it holds still name it.
+    ``session`` is the number that the client's session had with a previous run of the daemon, 0 for none.
+    The session keeps this number, so that the locks that the client holds still name it.
     """
 
     request: int
@@ -168,7 +168,7 @@ class Stats(msgspec.Struct, array_like=True, tag="stats"):
 
 
 class Show(msgspec.Struct, array_like=True, tag="show"):
-    """Everything about one cell: versions, segments, who holds them, last failure."""
+    """Everything about one cell: versions, segments, their holders, last failure."""
 
     request: int
     id: str
@@ -296,7 +296,7 @@ class PendingCell(msgspec.Struct, array_like=True, frozen=True):
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell that could not be had; ``id`` as the client asked for it, else without the prefix.
+    """A cell that could not be loaded; ``id`` as the client asked for it, else without the prefix.
 
     ``box`` says where it lies, ``min_x, min_y, max_x, max_y`` in metres; None where that is not known.
     """

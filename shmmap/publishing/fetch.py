@@ -33,7 +33,7 @@ from shmmap.origin.remote.store import Store
 __all__ = ["FetchedMap", "fetch_map"]
 
 _CELLS: Final = "pointcloud_map.pcd"
-_FETCHED_AT_ONCE: Final = 16
+_CONCURRENT_FETCHES: Final = 16
 _SAME_M: Final = 1e-6
 
 
@@ -153,7 +153,7 @@ class _Fetch:
         names: list[str] = []
         progress.stage("fetch", self._root.cells)
         os.makedirs(self._cells_dir, exist_ok=True)
-        with ThreadPoolExecutor(_FETCHED_AT_ONCE, "fetch") as pool:
+        with ThreadPoolExecutor(_CONCURRENT_FETCHES, "fetch") as pool:
             for shard in read_shards(self._pages, self._root):
                 boxes.append(shard.boxes)
                 names += (name.decode() for name in shard.names)
@@ -217,7 +217,7 @@ def _cells_of(shard: Shard) -> Iterator[_Cell]:
 
 
 def _only_size(low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
-    """The size that all cells have along an axis, such that a corner and it give the box again."""
+    """Find the size that all cells have along an axis, such that a corner and it give the box again."""
     sizes = high - low
     for size in (round(float(sizes[0]), 9), float(sizes[0])):
         if (low + size == high).all():

@@ -43,7 +43,7 @@ from shmmap.origin.remote.store import Store, refuse_read_only
 from shmmap.origin.remote.zstd_frame import pack_frame
 from shmmap.prepare.run import PrepareProgress
 from shmmap.publishing.new_version import (
-    ASKED_AT_ONCE,
+    CONCURRENT_REQUESTS,
     absent_objects,
     begin_version,
     refuse_if_late,
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 __all__ = ["Joined", "join_slices", "numbers_text"]
 
 _OLD_S: Final = 6 * 86_400.0  # pruning may remove an object that no version names after seven days
-_READ_AT_ONCE: Final = 16
+_CONCURRENT_READS: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ class _Join:
                 raise
 
         try:
-            with ThreadPoolExecutor(_READ_AT_ONCE, "part") as threads:
+            with ThreadPoolExecutor(_CONCURRENT_READS, "part") as threads:
                 return {part.slice: part for part in threads.map(read, numbers)}
         except MapMissing:
             self._refuse_if_changed()  # another join has removed it
@@ -295,7 +295,7 @@ class _Join:
         looked = 0
         self._progress.stage("look for objects", root.cells)
         shards = zip(belongs, read_shards(self._store, base), read_shards(self._store, root), strict=True)
-        with ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads:
+        with ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads:
             for number, (of_slice, before, after) in enumerate(shards):
                 path = f"{self._store.url}/{self._run.part_path(of_slice)}"
                 changed = changed_layers(before, after, layers, name=path)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
 
 __all__ = [
-    "ASKED_AT_ONCE",
+    "CONCURRENT_REQUESTS",
     "absent_objects",
     "begin_version",
     "refuse_if_late",
@@ -42,13 +42,13 @@ __all__ = [
     "switch_version",
 ]
 
-ASKED_AT_ONCE: Final = 32
+CONCURRENT_REQUESTS: Final = 32
 _YOUNG_S: Final = 86_400.0
 """An object that no version has is used again if it is younger: pruning spares it for much longer."""
 
 
 def send_object(store: Store, path: str, frame: bytes, *, look: bool = True) -> bool:
-    """Have an object in the store; returns whether it was sent.
+    """Send an object unless the store has it; returns whether it was sent.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def run_workers(
     finished: Callable[[CellTask, CellSent | NotSent], None],
     died: Callable[[CellTask, str], None],
 ) -> None:
-    """Have the worker processes of ``module`` make layers of cells and send them, until all tasks are done.
+    """Run worker processes of ``module``, which make layers of cells and send them, until all tasks are done.
 
     Parameters
     ----------

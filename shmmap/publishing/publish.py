@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Published", "packed_root", "publish_map"]
 
-_SENT_AT_ONCE: Final = 16
+_SHARDS_PER_BATCH: Final = 16
 
 
 @dataclass(slots=True)
@@ -255,7 +255,7 @@ class _Run:
         return wanted or f"/{last}/"
 
     def _known_layers(self) -> Iterator[LayerObjects]:
-        """The objects of the version before, by shard and layer; none where all is sent again."""
+        """Yield the objects of the version before, by shard and layer; none where all is sent again."""
         root = self._before
         if root is None or self._resend:
             return
@@ -269,7 +269,7 @@ class _Run:
     # --- sending --------------------------------------------------------------------------------
 
     def _send_cells(self, settings: PublishSettings, workers: int) -> CellObjects:
-        """Have the objects of all cells in the store; failures go into the result."""
+        """Bring the objects of all cells into the store; failures go into the result."""
         catalogue, result = self._catalogue, self._result
         objects = CellObjects(len(catalogue), self._names)
         versions = LayerVersions(lambda: catalogue)
@@ -310,8 +310,8 @@ class _Run:
         rows: list[_ShardRow] = []
         self._progress.stage("index", len(self._catalogue))
         divided = divide_into_shards(self._catalogue, objects, side)
-        with ThreadPoolExecutor(_SENT_AT_ONCE, "shard") as pool:
-            while some := list(itertools.islice(divided, _SENT_AT_ONCE)):
+        with ThreadPoolExecutor(_SHARDS_PER_BATCH, "shard") as pool:
+            while some := list(itertools.islice(divided, _SHARDS_PER_BATCH)):
                 for row, sent_bytes in pool.map(self._send_shard, some):
                     rows.append(row)
                     self._count(sent_bytes)

@@ -22,7 +22,7 @@ from shmmap.origin.remote.published_index import Root
 from shmmap.origin.remote.published_object import blob_path
 from shmmap.origin.remote.store import Store
 from shmmap.prepare.run import PrepareProgress
-from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, begin_version, switch_version
+from shmmap.publishing.new_version import CONCURRENT_REQUESTS, absent_objects, begin_version, switch_version
 
 if TYPE_CHECKING:
     from shmmap.publishing.signing import MapSigner
@@ -98,7 +98,7 @@ def _look_for_objects(store: Store, current: Current, progress: PrepareProgress)
     missing: list[str] = []
     looked = 0
 
-    with ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads:
+    with ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads:
         for shard in read_shards(store, root):  # which reads the shards themselves
             objects = {named for layer in shard.layers.values() for named in layer.objects()}
             missing += map(blob_path, absent_objects(store, sorted(objects), threads))

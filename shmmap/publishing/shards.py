@@ -96,7 +96,7 @@ def shard_side(catalogue: Catalogue, layers: int, before: float | None) -> float
 
 
 def _rounded(length: float) -> float:
-    """The length with three digits: it does not change with the last bit of a mean."""
+    """Round a length to three digits, so that it does not change with the last bit of a mean."""
     return float(f"{length:.3g}") if math.isfinite(length) and length > 0 else 1.0
 
 

@@ -162,7 +162,7 @@ class MapSigner:
         step("sign.switched")
 
     def keep(self, current: Current) -> None:
-        """Have the current version signed where nothing has changed, and again in time."""
+        """Sign the current version where nothing has changed, and again in time."""
         self._sign(current, current.version)
 
     def refresh(self) -> Refreshed:
@@ -265,7 +265,7 @@ class MapSigner:
     def _sign(
         self, current: Current | None, before: int, *, read_under: Metadata[Root] | None = None
     ) -> SignedState:
-        """Have ``current`` named by targets, snapshot and timestamp; None: what is named already.
+        """Make targets, snapshot and timestamp name ``current``; None: what is named already.
 
         ``before`` is the version that was current when this one was made: if another one is by now, that
         one stays.  ``read_under`` is the root whose keys signed the present state, if that is not the
@@ -348,7 +348,7 @@ class MapSigner:
         return all(signer.public_key.keyid in metadata.signatures for signer in here)
 
     def _check_origin(self) -> None:
-        """Have the first root at the store, which must be the one of these keys."""
+        """Bring the first root to the store; it must be the one of these keys."""
         number = Metadata[Root].from_bytes(self.trusted).signed.version
         path = metadata_path(Root.type, number)
         try:
@@ -369,7 +369,7 @@ class MapSigner:
     # --- entry and CURRENT ----------------------------------------------------------------------
 
     def _repair(self, current: Current, seen: CurrentState) -> None:
-        """Have entry and ``CURRENT`` say what is signed; what ``CURRENT`` says otherwise was never signed."""
+        """Make entry and ``CURRENT`` say what is signed; what ``CURRENT`` says otherwise was never signed."""
         store = self._store
         try:
             is_right = read_entry(store, current.version).current == current
@@ -386,7 +386,7 @@ class MapSigner:
         put_over(store, CURRENT, pack_json(current), seen.tag)
 
     def _follow(self, current: Current) -> None:
-        """Have ``CURRENT`` say this version, unless a later one is signed already."""
+        """Make ``CURRENT`` name this version, unless a later one is signed already."""
         for _ in range(_MAX_TRIES):
             seen = read_current(self._store)
             if seen.current is not None and seen.current.version >= current.version:

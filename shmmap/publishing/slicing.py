@@ -56,7 +56,7 @@ from shmmap.origin.remote.zstd_frame import DAMAGED, pack_frame, unpack_frame
 from shmmap.prepare.run import Failure, PrepareProgress, task_of
 from shmmap.prepare.task_pool import CellTask
 from shmmap.publishing.messages import CellSent, NotSent, SliceSettings
-from shmmap.publishing.new_version import ASKED_AT_ONCE, absent_objects, run_workers, send_object
+from shmmap.publishing.new_version import CONCURRENT_REQUESTS, absent_objects, run_workers, send_object
 from shmmap.publishing.shards import CellObjects
 from shmmap.segment.version import Source
 
@@ -343,7 +343,7 @@ class _Slice:
         since_s = time() - _THERE_S
         self._progress.stage("look for objects", self._result.cells)
         with (
-            ThreadPoolExecutor(ASKED_AT_ONCE, "head") as threads,
+            ThreadPoolExecutor(CONCURRENT_REQUESTS, "head") as threads,
             contextlib.suppress(MapMissing, MapDataError),
         ):
             root = with_parts(self._root, [part])
@@ -403,7 +403,7 @@ class _Slice:
                 yield task
 
     def _around(self, number: int, shard: Shard) -> list[Shard]:
-        """A shard and those with cells that its own may look into."""
+        """Return a shard and those with cells that its own may look into."""
         if not self._halo_m:
             return [shard]
         low, high = shard.boxes[:, :2].min(axis=0), shard.boxes[:, 2:].max(axis=0)
@@ -453,7 +453,7 @@ class _Slice:
                 self._rows[number] = self._send_shard(making)
 
     def _number_of(self, task: CellTask) -> int:
-        """Number of the shard that a task's cell is in."""
+        """Return the number of the shard that a task's cell is in."""
         return int(np.searchsorted(self._first, task.number, side="right")) - 1
 
     def _send_shard(self, making: _Making) -> _ShardRow:

@@ -47,13 +47,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-__all__ = [
-    "AttachedSegment",
-    "Owned",
-    "attach",
-    "attach_writable",
-    "map_file",
-]
+__all__ = ["AttachedSegment", "Owned", "attach", "attach_writable", "map_file"]
 
 
 class Owned:
@@ -111,14 +105,7 @@ LEASE_RETRY_S: Final = 0.0002
 _libc: Final = ctypes.CDLL(None, use_errno=True)
 _mmap: Final = _libc.mmap
 _mmap.restype = ctypes.c_void_p
-_mmap.argtypes = (
-    ctypes.c_void_p,
-    ctypes.c_size_t,
-    ctypes.c_int,
-    ctypes.c_int,
-    ctypes.c_int,
-    ctypes.c_long,
-)
+_mmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long)
 _munmap: Final = _libc.munmap
 _munmap.argtypes = (ctypes.c_void_p, ctypes.c_size_t)
 

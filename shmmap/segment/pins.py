@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who still uses a segment: what the kernel reports, not a timer.
+"""The users of a segment: what the kernel reports, not a timer.
 
 A write lease (``F_SETLEASE``) on a file is granted only if no other descriptor or mapping of it exists.  That
 holds through renames, client crashes, SIGSTOP and daemon restarts, and costs 6 us.  A process that
 takes a lease must ignore SIGIO: an opener makes the kernel send it.
 
-*Who* it is comes from open-file-description locks: a reader locks the one byte at its session's
+*Which* session it is comes from open-file-description locks: a reader locks the one byte at its session's
 slot right after opening, and the lock lives as long as its mapping.
 """
 
@@ -74,7 +74,7 @@ def in_use(fd: int) -> bool:
 
 
 def keep_if_unused(fd: int) -> bool:
-    """As `in_use`, negated; an open of the file waits from now on until ``fd`` is closed."""
+    """Return `in_use`, negated; an open of the file waits from now on until ``fd`` is closed."""
     try:
         fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
     except BlockingIOError:

@@ -158,7 +158,7 @@ def no_threads_left(what: str = "") -> LimitReached:
 
 
 def _group_limit() -> str | None:
-    """What the control group of this process allows, or the strictest of those above it."""
+    """Return what the control group of this process allows, or the strictest of those above it."""
     limits = []
     try:
         with open("/proc/self/cgroup", encoding="utf-8") as file:
@@ -185,7 +185,7 @@ def no_memory_left(nbytes: int | None = None) -> LimitReached:
     limits = ", ".join(_memory_limits()) or "no limit is set"
     what = "more private memory is" if nbytes is None else f"{nbytes} bytes of private memory are"
     return LimitReached(
-        f"{what} not to be had ({limits})", hint="raise the limit: ulimit -d and -v, or free memory"
+        f"{what} cannot be allocated ({limits})", hint="raise the limit: ulimit -d and -v, or free memory"
     )
 
 

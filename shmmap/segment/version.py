@@ -3,8 +3,8 @@
 
 ``LAYOUT.md`` has the recipe.  A cell's version is that of its ``points``.  It follows from the cell's id, its
 source's *stamp* and its box; a computed layer's from that, from how the layer is computed, and from the cells
-that it looks into.  So it is the same across restarts, and another one as soon as anything has changed that
-the bytes depend on.
+that it looks into.  So a version is the same across restarts, and differs as soon as anything changes
+that the bytes depend on.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def check_possible(*, user: bool, switch: str = _SWITCH) -> None:
     Parameters
     ----------
     user
-        The service is one user's, who may mount nothing.
+        The service is that of a user, and may mount nothing.
     switch
         The kernel's own setting; there is none where it has no huge pages for a tmpfs.
 

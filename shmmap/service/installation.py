@@ -69,7 +69,7 @@ class PlannedFile:
 
     @property
     def action(self) -> Literal["new", "changed", "same", "kept"]:
-        """What writing it means for what is there."""
+        """What an installation does to this file: create it, change it, or leave it as it is."""
         if not os.path.lexists(self.path):
             return "new"
         if self.keep:
@@ -124,7 +124,7 @@ def _map_path(given: str, file_system: FileSystem) -> tuple[str, bool]:
 
 
 def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFile]:
-    """A drop-in that shows directories to the daemon.
+    """Plan a drop-in that shows directories to the daemon.
 
     One that is needed no more is emptied of settings, for nothing is deleted here.
     """
@@ -135,7 +135,7 @@ def _drop_in(path: Path, directories: Sequence[str], why: str) -> list[PlannedFi
 
 
 def _network(path: Path, file_system: FileSystem, *, is_remote: bool) -> list[PlannedFile]:
-    """A drop-in that lets the daemon fetch the map, with the credentials that there are."""
+    """Plan a drop-in that lets the daemon fetch the map, with the credentials that there are."""
     if not is_remote and not path.exists():
         return []
     if not is_remote:

@@ -112,7 +112,7 @@ class Program:
 
     @property
     def hidden_directories(self) -> list[str]:
-        """Directories that it needs and that the units would hide."""
+        """Directories that the program needs and that the units would hide from it."""
         return outermost(place for place in self.places if is_hidden(place))
 
     def check_readable(self) -> None:

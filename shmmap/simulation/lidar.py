@@ -1,21 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LiDAR looking at a dense cloud: which points it returns, with occlusion, drop-out and noise.
+"""A simulated LiDAR, and its scans of a drive through a generated town, with the true poses.
 
-Each ray returns the nearest point in its aperture.  There are no mixed pixels and no motion
-distortion, and what the cloud does not hold is not seen; so the cloud should be several times denser
-than the rays.
+The LiDAR looks at a dense cloud, with occlusion, drop-out and noise: each ray returns the nearest point in
+its aperture.  There are no mixed pixels and no motion distortion, and what the cloud does not hold is not
+seen; so the cloud should be several times denser than the rays.  Cars and people move beside the drive.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Lidar", "LidarReturns"]
+from shmmap.simulation.town import Town
+from shmmap.simulation.town_surfaces import BLOCK_METRES
+
+__all__ = ["Lidar", "LidarDrive", "LidarReturns", "LidarScan", "Traffic"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,3 +98,209 @@ class Lidar:
         scale = 1.0 + self.noise * rng.standard_normal(len(hit)) / distance[hit]
         xyz = (np.column_stack((x[hit], y[hit], z[hit])) * scale[:, None]).astype(np.float32)
         return LidarReturns(xyz, ring[hit].astype(np.uint8), near[hit])
+
+
+_SENSOR_METRES: Final = 1.8  # above the ground
+_LIDAR: Final = Lidar(rings=40, azimuth_deg=0.4, farthest=60.0)
+_ODOMETRY_DISTANCE: Final = 1.01
+_ODOMETRY_TURN: Final = 1.02
+_CAR: Final = (4.4, 1.8, 1.5)  # length, width, height, metres
+_PERSON: Final = (0.5, 0.5, 1.75)
+_ONCOMING_METRES: Final = 3.2  # from the drive's lane to the other one
+_PAVEMENT_METRES: Final = 4.5  # from the drive's lane to where people walk
+_CAR_GAP: Final = 18.0
+_PERSON_GAP: Final = 11.0
+_CAR_SPEED: Final = 8.0
+_PERSON_SPEED: Final = 1.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarScan:
+    """One scan and the truth about it.
+
+    Attributes
+    ----------
+    stamp_s
+        Since the start of the drive.
+    T_map_sensor
+        (4, 4) float64, metres.
+    xyz
+        (N, 3) float32, sensor frame, metres.
+    ring
+        (N,) uint8: 0 is the lowest.
+    moving
+        (N,) uint8: 1 for a point of what moves.
+    """
+
+    stamp_s: float
+    T_map_sensor: NDArray[np.float64]
+    xyz: NDArray[np.float32]
+    ring: NDArray[np.uint8]
+    moving: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class LidarDrive:
+    """A drive, and what the LiDAR on the roof is like.
+
+    Attributes
+    ----------
+    town
+        Where.
+    length, step
+        Of the drive, and between scans, metres.
+    speed
+        Metres per second.
+    lidar
+        Its ``farthest`` bounds what is simulated at all.
+    density
+        Of the surfaces that the LiDAR sees, points per square metre.  They are the map's, but other
+        points of them: no scan holds the map's own.
+    seed
+        Of the traffic and of the LiDAR's noise.
+    """
+
+    town: Town
+    length: float
+    step: float = 2.0
+    speed: float = 10.0
+    lidar: Lidar = _LIDAR
+    density: float = 40.0
+    seed: int = 0
+
+    def poses(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
+        """Time (seconds) and T_map_sensor of every scan."""
+        route = self.town.route(length=self.length, step=self.step)
+        heights = self.town.ground_height(route[:, 0], route[:, 1]) + _SENSOR_METRES
+        for number, ((x, y, heading), z) in enumerate(zip(route.tolist(), heights.tolist(), strict=True)):
+            T = np.eye(4)
+            T[:2, :2] = [[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]]
+            T[:3, 3] = x, y, z
+            yield number * self.step / self.speed, T
+
+    def odometry(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
+        """Time and pose of every scan as wheels would measure it, from the first scan's, which is unit.
+
+        Distances are 1 % too long, turns 2 % too wide.
+        """
+        before, T_odom = np.eye(4), np.eye(4)
+        for number, (stamp_s, T) in enumerate(self.poses()):
+            if number:
+                step = np.linalg.inv(before) @ T
+                turn = math.atan2(step[1, 0], step[0, 0]) * _ODOMETRY_TURN
+                moved = np.eye(4)
+                moved[:2, :2] = [[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]
+                moved[:3, 3] = step[:3, 3] * _ODOMETRY_DISTANCE
+                T_odom = T_odom @ moved
+            before = T
+            yield stamp_s, T_odom
+
+    def scans(self) -> Iterator[LidarScan]:
+        """Take one scan after the other."""
+        reach, town = self.lidar.farthest, self.town
+        traffic = Traffic(town, town.route(length=self.length + reach, step=self.step), seed=self.seed)
+        seen = Town(seed=town.seed, blocks=town.blocks, origin=town.origin, density=self.density)
+        tile = lru_cache(maxsize=9)(lambda bx, by: seen.tile(bx, by)["xyz"])
+        rng = np.random.Generator(np.random.PCG64([self.seed, 11]))
+        for stamp_s, T in self.poses():
+            x, y = T[:2, 3].tolist()
+            parts: list[NDArray[np.floating]] = []
+            for block in self._blocks(x, y):
+                part = tile(*block)
+                parts.append(part[(np.abs(part[:, :2] - (x, y)) < reach).all(axis=1)])
+            still = sum(len(part) for part in parts)
+            returns = self.lidar.scan(np.concatenate([*parts, traffic.points(stamp_s)]), T, rng)
+            moving = (returns.source >= still).astype(np.uint8)
+            yield LidarScan(stamp_s, T, returns.xyz, returns.ring, moving)
+
+    def _blocks(self, x: float, y: float) -> list[tuple[int, int]]:
+        """Blocks that the LiDAR reaches from a place."""
+        reach = self.lidar.farthest
+        spans = [
+            range(
+                max(0, math.floor((at - reach - start) / BLOCK_METRES)),
+                min(count, math.floor((at + reach - start) / BLOCK_METRES) + 1),
+            )
+            for at, start, count in zip((x, y), self.town.origin, self.town.blocks, strict=True)
+        ]
+        return [(bx, by) for by in spans[1] for bx in spans[0]]
+
+
+class Traffic:
+    """Cars that come towards a drive on its other lane, and people on the pavement beside it.
+
+    Parameters
+    ----------
+    town
+        Where.
+    route
+        (N, 3) as `Town.route` gives it.
+    seed
+        Which traffic.
+    density
+        Points per square metre of surface.
+    """
+
+    def __init__(
+        self, town: Town, route: NDArray[np.float64], *, seed: int = 0, density: float = 600.0
+    ) -> None:
+        self._town = town
+        self._route = route
+        steps = np.hypot(*np.diff(route[:, :2], axis=0).T)
+        self._along = np.concatenate([[0.0], np.cumsum(steps)])
+        rng = np.random.Generator(np.random.PCG64([seed, 7]))
+        length = float(self._along[-1])
+        self._cars = _spread(rng, 2 * length, _CAR_GAP)
+        self._people = _spread(rng, length, _PERSON_GAP)
+        self._car = _box(rng, _CAR, density)
+        self._person = _box(rng, _PERSON, density)
+
+    def points(self, time_s: float) -> NDArray[np.float64]:
+        """Points of everything that moves, at a time, (N, 3) float64, map frame, metres."""
+        parts = [
+            self._placed(self._car, at - _CAR_SPEED * time_s, -_ONCOMING_METRES, 0.25) for at in self._cars
+        ]
+        parts += [
+            self._placed(self._person, at + _PERSON_SPEED * time_s, _PAVEMENT_METRES, 0.0)
+            for at in self._people
+        ]
+        every = [part for part in parts if part is not None]
+        return np.concatenate(every) if every else np.empty((0, 3))
+
+    def _placed(
+        self, shape: NDArray[np.float64], at: float, right: float, above: float
+    ) -> NDArray[np.float64] | None:
+        if not 0.0 <= at <= self._along[-1]:
+            return None
+        x, y, heading = (float(np.interp(at, self._along, self._route[:, n])) for n in range(3))
+        cos, sin = math.cos(heading), math.sin(heading)
+        x, y = x + right * sin, y - right * cos
+        z = float(self._town.ground_height(np.array(x), np.array(y))) + above
+        turned = np.column_stack(
+            [cos * shape[:, 0] - sin * shape[:, 1], sin * shape[:, 0] + cos * shape[:, 1], shape[:, 2]]
+        )
+        turned += np.array([x, y, z])
+        return turned
+
+
+def _spread(rng: np.random.Generator, length: float, gap: float) -> NDArray[np.float64]:
+    """Places along a length, about a gap apart, metres."""
+    places = np.arange(0.0, length, gap)
+    return places + rng.uniform(-0.25 * gap, 0.25 * gap, len(places))
+
+
+def _box(rng: np.random.Generator, size: tuple[float, float, float], density: float) -> NDArray[np.float64]:
+    """Points on the sides and the top of a box that stands on the ground, its middle at the origin."""
+    length, width, height = size
+    sides = ((length, 0, -width / 2), (length, 0, width / 2), (width, 1, -length / 2), (width, 1, length / 2))
+    parts = []
+    for side, along, offset in sides:
+        count = max(1, round(side * height * density))
+        face = np.full((count, 3), offset)
+        face[:, along] = rng.uniform(-side / 2, side / 2, count)
+        face[:, 2] = rng.uniform(0, height, count)
+        parts.append(face)
+    count = max(1, round(length * width * density))
+    middle = np.array([length, width]) / 2
+    top = np.column_stack([rng.uniform(-middle, middle, (count, 2)), np.full(count, height)])
+    return np.concatenate([*parts, top])

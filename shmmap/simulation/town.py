@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from shmmap.dividing.map_writer import MapWriter, WrittenMap
 from shmmap.errors import BadRequest
 from shmmap.simulation.town_blocks import build_block
-from shmmap.simulation.town_ground import BLOCK_METRES, ROAD_HALF_METRES, Ground, street_distance
-from shmmap.simulation.town_surfaces import Surfaces
+from shmmap.simulation.town_surfaces import BLOCK_METRES, ROAD_HALF_METRES, Ground, Surfaces, street_distance
 
 __all__ = ["Town", "drive"]
 
@@ -262,20 +261,20 @@ def _walk(seed: int, blocks: tuple[int, int], steps: int) -> list[tuple[int, int
 def _follow(crossings: list[tuple[int, int]]) -> NDArray[np.float64]:
     """Poses in the right lane along the crossings, densest in the corners."""
     nodes = np.array(crossings, dtype=np.float64) * BLOCK_METRES
-    ways = np.diff(nodes, axis=0) / BLOCK_METRES
-    heading = math.atan2(ways[0, 1], ways[0, 0])
+    directions = np.diff(nodes, axis=0) / BLOCK_METRES
+    heading = math.atan2(directions[0, 1], directions[0, 0])
     poses: list[tuple[float, float, float]] = [(*nodes[0], heading)]
-    for node, way, onward in zip(nodes[1:-1], ways[:-1], ways[1:], strict=True):
-        turn = math.atan2(way[0] * onward[1] - way[1] * onward[0], float(way @ onward))
+    for node, ahead, onward in zip(nodes[1:-1], directions[:-1], directions[1:], strict=True):
+        turn = math.atan2(ahead[0] * onward[1] - ahead[1] * onward[0], float(ahead @ onward))
         if abs(turn) < 1e-9:
             poses.append((*node, heading))
             continue
-        left = np.array([-way[1], way[0]]) * math.copysign(1.0, turn)
-        start = node - way * _TURN_METRES
+        left = np.array([-ahead[1], ahead[0]]) * math.copysign(1.0, turn)
+        start = node - ahead * _TURN_METRES
         center = start + left * _TURN_METRES
         for part in np.linspace(0.0, 1.0, 25):
             angle = part * abs(turn)
-            spot = center + _TURN_METRES * (way * math.sin(angle) - left * math.cos(angle))
+            spot = center + _TURN_METRES * (ahead * math.sin(angle) - left * math.cos(angle))
             poses.append((*spot, heading + part * turn))
         heading += turn
     poses.append((*nodes[-1], heading))

@@ -8,8 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from shmmap.simulation.town_ground import BLOCK_METRES, ROAD_HALF_METRES
-from shmmap.simulation.town_surfaces import Surfaces
+from shmmap.simulation.town_surfaces import BLOCK_METRES, ROAD_HALF_METRES, Surfaces
 
 __all__ = ["build_block"]
 
@@ -55,7 +54,7 @@ def _building(
     ridge: float = 0.0,
     windows: bool = True,
 ) -> None:
-    """A building whose walls reach below the lowest ground around it; what is buried is not seen."""
+    """Add a building whose walls reach below the lowest ground around it; what is buried is not seen."""
     reach = max(half)
     around = [ground(center[0] + a * reach, center[1] + b * reach) for a in (-1, 1) for b in (-1, 1)]
     depth = max(around) - min(around) + 0.5
@@ -75,7 +74,7 @@ def _building(
 def _wall(
     rng: Rng, ground: Height, surfaces: Surfaces, start: tuple[float, float], stop: tuple[float, float]
 ) -> None:
-    """A garden wall or hedge along the ground, in steps of a few metres."""
+    """Add a garden wall or hedge along the ground, in steps of a few metres."""
     height, intensity = float(rng.uniform(0.8, 2.0)), float(rng.choice([_STONE, _FOLIAGE]))
     length = math.dist(start, stop)
     yaw = math.atan2(stop[1] - start[1], stop[0] - start[0])
@@ -155,7 +154,7 @@ def _build_park(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
 
 
 def _build_hall(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
-    """A large hall and a yard with containers."""
+    """Build a large hall and a yard with containers."""
     half = (float(rng.uniform(18.0, 28.0)), float(rng.uniform(12.0, 18.0)))
     center = (_MIDDLE, _HIGH - half[1] - 2.0)
     _building(rng, ground, surfaces, center, half, float(rng.uniform(7.0, 11.0)), windows=False, ridge=1.5)
@@ -166,7 +165,7 @@ def _build_hall(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
 
 
 def _build_square(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
-    """A church with a tower on an open square, rows of trees along two sides."""
+    """Build a church with a tower on an open square, with rows of trees along two sides."""
     yaw = float(rng.uniform(-0.5, 0.5))
     _building(rng, ground, surfaces, (_MIDDLE, _MIDDLE), (14.0, 6.0), 11.0, yaw=yaw, ridge=6.0)
     tower = (_MIDDLE - 17.0 * math.cos(yaw), _MIDDLE - 17.0 * math.sin(yaw))

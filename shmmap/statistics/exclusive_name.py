@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One daemon for an instance's names, whatever its runtime directory: who writes the statistics has them.
+"""One daemon for an instance's names, whatever its runtime directory: the writer of the statistics has them.
 
 The writer holds an open-file-description lock on its segment while it lives.  It is a write lock, which
 a process that may only read the file cannot get: a client can neither hold the name nor keep a daemon from
@@ -102,10 +102,10 @@ def _taken(directory: ShmDirectory, name: str, error: OSError | None) -> CannotS
 
 def _busy(directory: ShmDirectory, instance: str) -> InstanceBusy:
     try:
-        who = read_statistics(instance, directory.path).identity
+        holder = read_statistics(instance, directory.path).identity
     except (ShmmapError, OSError):
-        who = None
-    named = f" (pid {who.pid}, listening at {who.endpoint})" if who is not None else ""
+        holder = None
+    named = f" (pid {holder.pid}, listening at {holder.endpoint})" if holder is not None else ""
     return InstanceBusy(
         f"another daemon{named} has instance {instance} in {directory.path}",
         hint="stop it, or choose another --instance or --shm-dir",

@@ -12,14 +12,7 @@ from typing import Final, Literal, TypeAlias
 
 from shmmap.errors import SegmentCorrupt
 
-__all__ = [
-    "DaemonIdentity",
-    "DaemonState",
-    "WriterProcess",
-    "judge",
-    "pid_namespace",
-    "start_time_ticks",
-]
+__all__ = ["DaemonIdentity", "DaemonState", "WriterProcess", "judge", "pid_namespace", "start_time_ticks"]
 
 DaemonState: TypeAlias = Literal["healthy", "starting", "stopped", "hung", "dead"]
 

@@ -31,7 +31,7 @@ class Snapshot:
         ``hung`` (runs, but has not beaten for 5 s); ``dead`` (the process is gone and left its segment);
         ``absent`` (no segment: never started, or stopped cleanly).  All but ``absent`` come with an identity.
     identity : DaemonIdentity or None
-        Who wrote the statistics; None when absent.
+        The daemon that wrote the statistics; None when absent.
     beat_age_s : float
         Seconds since the daemon last wrote; infinite when absent.
     beat_monotonic_ns : int
@@ -131,7 +131,7 @@ class Snapshot:
 
 
 def _in_use(kind: type[_Row], data: bytes, step: int) -> list[_Row]:
-    """The rows of a table that are in use, but for those that were being changed."""
+    """Read the rows of a table that are in use, but for those that were being changed."""
     from shmmap.statistics.rows import unpack_row
 
     found = []

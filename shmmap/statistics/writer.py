@@ -108,7 +108,7 @@ class _RowTable(Generic[_Row]):
         self._rows: list[_Row | None] = []
 
     def show(self, rows: Sequence[_Row]) -> None:
-        """Have these rows in the table, the first of them if there is no room for all."""
+        """Bring these rows into the table, the first of them if there is no room for all."""
         count = min(len(rows), self._room_for(min(len(rows), self._most)))
         self._rows += [None] * (count - len(self._rows))
         self.used = 0
@@ -136,7 +136,7 @@ class StatisticsWriter:
     directory, instance
         Where the segment goes, in place of what a dead predecessor left.
     identity
-        Who writes.
+        The daemon that writes.
     mode, gid
         Access of the segment; ``gid`` -1 leaves the group alone.
     starting
@@ -207,15 +207,7 @@ class StatisticsWriter:
         self._is_logged = False
         self._fd = directory.create()
         try:
-            # with the first rows, so that a small daemon never grows after it took its budget
-            start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
-            os.posix_fallocate(self._fd, 0, start)
-            os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * CELL_ROW_BYTES)
-            self._allocated = _GROWTH_ROWS
-            os.pwrite(self._fd, pack_header(self._layout), 0)
-            self.update_identity(identity)
-            self.map_changed()
-            self.beat()
+            self._write_first(identity)
             if gid >= 0:
                 os.fchown(self._fd, -1, gid)
             os.fchmod(self._fd, mode)
@@ -224,6 +216,20 @@ class StatisticsWriter:
         except BaseException:
             os.close(self._fd)
             raise
+
+    def _write_first(self, identity: DaemonIdentity) -> None:
+        """Fill the new file, with room for the first rows.
+
+        So a small daemon never grows after it took its budget.
+        """
+        start = self._layout.clients_offset + _CLIENTS_A_PAGE * CLIENT_ROW_BYTES
+        os.posix_fallocate(self._fd, 0, start)
+        os.posix_fallocate(self._fd, self._layout.rows_offset, _GROWTH_ROWS * CELL_ROW_BYTES)
+        self._allocated = _GROWTH_ROWS
+        os.pwrite(self._fd, pack_header(self._layout), 0)
+        self.update_identity(identity)
+        self.map_changed()
+        self.beat()
 
     def set(self, name: str, value: int) -> None:
         """Set a gauge."""
@@ -252,7 +258,7 @@ class StatisticsWriter:
             self.values[name] = duration_ns
 
     def map_changed(self) -> None:
-        """Have clients see at once that the map has other cells, or a cell another version, than before.
+        """Show clients at once that the map has other cells, or a cell another version, than before.
 
         Call it before any reply or event shows the change.
         """
@@ -403,7 +409,7 @@ class StatisticsWriter:
         return True
 
     def _allocate(self, start: int, nbytes: int) -> bool:
-        """Have memory where nothing is yet, if the budget and the file system allow."""
+        """Allocate memory where there is none yet, if the budget and the file system allow."""
         if not self._reserve(nbytes):
             return False
         try:

@@ -17,6 +17,7 @@ import gc
 import os
 import re
 import secrets
+import select
 import shutil
 import signal
 import socket
@@ -33,10 +34,18 @@ from typing import IO, Any, Final, TypeVar
 from shmmap.errors import InternalError
 from shmmap.processes.interrupts import interrupts_later
 from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.testing.environment import without_settings
-from shmmap.testing.process_watch import open_files, processes_marked, wait_ended, wait_readable
 
-__all__ = ["READY_S", "STOP_S", "DaemonProcess", "isolated_daemons"]
+__all__ = [
+    "READY_S",
+    "STOP_S",
+    "DaemonProcess",
+    "isolated_daemons",
+    "open_files",
+    "processes_marked",
+    "wait_ended",
+    "wait_readable",
+    "without_settings",
+]
 
 READY_S: Final = 60.0
 STOP_S: Final = 30.0
@@ -74,9 +83,9 @@ class DaemonProcess:
     cache_dir, state_dir
         ``XDG_CACHE_HOME`` and ``XDG_STATE_HOME`` of the daemon.
     process
-        Of its present life; None when it does not run.
+        Of its present run; None when it does not run.
     killed
-        Whether its last life ended without cleaning up, by `kill` or `leave`.
+        Whether its last run ended without cleaning up, by `kill` or `leave`.
 
     Used as a context manager it is ready on entry; on exit it is stopped and its directories are removed.
     Without one: `start`, `stop` and, in the end, `dispose`.
@@ -108,7 +117,7 @@ class DaemonProcess:
         self._own_shm_dir = shm_dir is None
         self._leftovers: list[str] | None = None
         self._directories: list[str] = []
-        # also when the constructor is interrupted, or nobody calls dispose()
+        # also when the constructor is interrupted, or dispose() is never called
         self._finalizer = weakref.finalize(self, _remove, self._directories, os.getpid())
         with interrupts_later():
             # under /tmp whatever TMPDIR says: a socket's path holds 107 bytes
@@ -124,7 +133,7 @@ class DaemonProcess:
             directory.mkdir()
         self.environment = {
             **without_settings(),
-            # compiled kernels are everybody's: they cost seconds, and depend on their source alone
+            # compiled kernels are shared by all: they cost seconds, and depend on their source alone
             "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR") or _kernels_dir(),
             "TMPDIR": str(self._temporary_dir),
             "XDG_CACHE_HOME": str(self.cache_dir),
@@ -165,10 +174,10 @@ class DaemonProcess:
 
     @property
     def log(self) -> str:
-        """What the daemon wrote to stderr in all its lives."""
+        """What the daemon wrote to stderr in all its runs."""
         return self.log_path.read_text(errors="replace") if self.log_path.exists() else ""
 
-    # --- its lives ----------------------------------------------------------------------------------
+    # --- its runs -----------------------------------------------------------------------------------
 
     def spawn(self, *, arguments: Sequence[str] | None = None, notify: str = "") -> subprocess.Popen[bytes]:
         """Start the process without waiting for it to be ready."""
@@ -177,10 +186,19 @@ class DaemonProcess:
         if notify:
             environment["NOTIFY_SOCKET"] = notify
         command = [
-            *self.command, sys.executable, "-m", "shmmap.daemon", self.map_path,
-            "--instance", self.instance, "--runtime-dir", self.runtime_dir, "--shm-dir", self.shm_dir,
+            *self.command,
+            sys.executable,
+            "-m",
+            "shmmap.daemon",
+            self.map_path,
+            "--instance",
+            self.instance,
+            "--runtime-dir",
+            self.runtime_dir,
+            "--shm-dir",
+            self.shm_dir,
             *(self.arguments if arguments is None else arguments),
-        ]  # fmt: skip
+        ]
         with self.log_path.open("ab") as log:
             return self._run(command, environment, log)
 
@@ -246,7 +264,7 @@ class DaemonProcess:
         return self._end(signal.SIGTERM)
 
     def leave(self) -> int:
-        """End the daemon with SIGUSR1, which leaves the segments to its next life; returns its exit code."""
+        """End the daemon with SIGUSR1, which leaves the segments to its next run; returns its exit code."""
         code = self._end(signal.SIGUSR1)
         self.killed = True
         return code
@@ -290,7 +308,7 @@ class DaemonProcess:
         return sorted(pid for pid in processes_marked(self.instance, _MARK) if pid != own)
 
     def segments(self) -> list[str]:
-        """Published and retired segments, sorted; statistics and lock are not among them."""
+        """List published and retired segments, sorted; statistics and lock are not among them."""
         own = re.compile(rf"shmmap\.{self.instance}\.[0-9a-f]{{16}}(\.zombie)?")
         return sorted(name for name in os.listdir(self.shm_dir) if own.fullmatch(name))
 
@@ -320,7 +338,7 @@ class DaemonProcess:
         prefix = f"shmmap.{self.instance}."
         found = [f"process {pid}" for pid in self.children() if not wait_ended(pid, 10.0)]
         if self.killed:
-            return found  # names are left behind for the next life to adopt
+            return found  # names are left behind for the next run to adopt
         found += [f"segment {name}" for name in os.listdir(self.shm_dir) if name.startswith(prefix)]
         if self._own_shm_dir:
             found += [
@@ -347,7 +365,7 @@ class DaemonProcess:
 
 
 def _remove(directories: list[str], owner: int) -> None:
-    """Remove directories, unless this is a forked child of who made them."""
+    """Remove directories, unless this is a forked child of the process that made them."""
     if os.getpid() == owner:
         for path in directories:
             shutil.rmtree(path, ignore_errors=True)
@@ -411,3 +429,55 @@ def _stopped(one: DaemonProcess) -> list[str]:
         return [*problems, one.log] if problems else []
     finally:
         one.dispose()
+
+
+def wait_readable(fds: Sequence[int], timeout_s: float) -> list[int]:
+    """Wait until one of the descriptors is readable; returns those that are, none after ``timeout_s``."""
+    poller = select.poll()
+    for fd in fds:
+        poller.register(fd, select.POLLIN)
+    return [fd for fd, _ in poller.poll(max(0.0, timeout_s) * 1000)]
+
+
+def wait_ended(pid: int, timeout_s: float = 30.0) -> bool:
+    """Wait until a process has ended; True if it has."""
+    try:
+        fd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        return bool(wait_readable([fd], timeout_s))
+    finally:
+        os.close(fd)
+
+
+def processes_marked(mark: str, variable: str = "SHMMAP_TEST_RUN") -> list[int]:
+    """Ids of the living processes that were started with ``variable=mark`` in their environment."""
+    wanted = f"{variable}={mark}".encode()
+    found = []
+    for entry in os.listdir("/proc"):
+        if entry.isdigit():
+            try:
+                if wanted in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
+                    found.append(int(entry))
+            except OSError:  # gone by now, or another account's
+                continue
+    return found
+
+
+def open_files() -> dict[int, str]:
+    """Descriptors of this process and what they refer to."""
+    found = {}
+    for entry in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):  # the one that lists the directory
+            found[int(entry)] = os.readlink(f"/proc/self/fd/{entry}")
+    return found
+
+
+def without_settings(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the variables without ``SHMMAP_*``, the settings of a real daemon; ``SHMMAP_TEST_*`` stay."""
+    return {
+        name: value
+        for name, value in environ.items()
+        if not name.startswith("SHMMAP_") or name.startswith("SHMMAP_TEST_")
+    }

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for pytest, which has to be installed; in the `conftest.py` of one's own tests::
+"""Fixtures for pytest, which has to be installed.
+
+In the `conftest.py` of your tests::
 
     pytest_plugins = ["shmmap.testing.fixtures"]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every layer kind has to keep, checked on clouds of every sort.
+"""Checks of what every layer kind must guarantee, on clouds of every sort.
 
 ::
 
@@ -7,8 +7,7 @@
     def test_my_kind(cloud: str) -> None:
         check_layer("roughness(leaf=1.0)", cloud)
 
-It does not know what a layer should hold; a test of one's own, against an independent and slow
-computation, has to say that.
+It does not know what a layer should hold: test that against an independent, slow computation.
 """
 
 from __future__ import annotations
@@ -31,9 +30,18 @@ from shmmap.segment.writer import SegmentOrigin, write_table
 __all__ = ["CORNERS", "check_layer", "corner", "surface"]
 
 CORNERS: Final = (
-    "origin", "negative", "large_f4", "large_f8", "borders", "empty", "one_point", "duplicates", "not_finite",
-    "flat", "far_apart",
-)  # fmt: skip
+    "origin",
+    "negative",
+    "large_f4",
+    "large_f8",
+    "borders",
+    "empty",
+    "one_point",
+    "duplicates",
+    "not_finite",
+    "flat",
+    "far_apart",
+)
 
 MOVED: Final[NDArray[Any]] = np.array([89570.0, 42300.0, 3.0])
 
@@ -45,12 +53,12 @@ MAY_BE_REFUSED = frozenset({"far_apart"})
 def check_layer(layer: str, cloud: str) -> LayerTable | None:
     """Build a layer of one of `CORNERS` and check everything that holds for every kind.
 
-    Returns the table; None where the builder refused the cloud, which it may only for ``far_apart``.
+    Return the table, or None if the builder refused the cloud.  It may refuse ``far_apart`` only.
 
     Raises
     ------
     InternalError
-        Naming what the kind does not keep.
+        The kind breaks a rule; the message names it.
     """
     spec = parse_layer(layer)
     _must(parse_layer(str(spec)) == spec, f"{layer} is not the same spec as its canonical form {spec}")
@@ -137,15 +145,22 @@ def _check_columns(spec: LayerSpec, table: LayerTable, source: Mapping[str, NDAr
 
 
 def _check_segment(spec: LayerSpec, table: LayerTable) -> None:
-    """The table fits a segment, and comes back out of it."""
+    """Check that the table fits a segment, and comes back out of it."""
     origin = SegmentOrigin("/cell.pcd", _BOX, "map", NO_SOURCE, bytes(16), 0, 0)
     fd = os.memfd_create("layer")
     try:
         header = write_table(
-            fd, table.columns, layer=str(spec), rows=table.rows, origin=origin,
-            builder_version=spec.builder_version, units=table.units, lattice=table.lattice,
-            z_min=0.0, z_max=0.0,
-        )  # fmt: skip
+            fd,
+            table.columns,
+            layer=str(spec),
+            rows=table.rows,
+            origin=origin,
+            builder_version=spec.builder_version,
+            units=table.units,
+            lattice=table.lattice,
+            z_min=0.0,
+            z_max=0.0,
+        )
         data = os.pread(fd, os.fstat(fd).st_size, 0)
     finally:
         os.close(fd)

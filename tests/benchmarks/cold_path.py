@@ -27,11 +27,10 @@ import argparse
 import json
 import os
 import statistics
-import subprocess
 import tempfile
 from pathlib import Path
 
-from tests.benchmarks.two_versions import python
+from tests.benchmarks.two_versions import Measuring
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import make_map
 
@@ -152,32 +151,6 @@ for line in sys.stdin:
     one.dispose()
     print(json.dumps([first, incomplete / turns]), flush=True)
 """
-
-
-class Measuring:
-    """A program of one checkout that measures on request."""
-
-    def __init__(self, checkout: Path, program: str, *arguments: str) -> None:
-        self._process = subprocess.Popen(
-            [python(checkout), "-c", program, *arguments],
-            cwd=checkout, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"},
-        )  # fmt: skip
-        assert self._say() == "up"
-
-    def _say(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline().strip()
-
-    def measure(self, what: str = "") -> str:
-        """Return what it found."""
-        assert self._process.stdin is not None
-        print(what, file=self._process.stdin, flush=True)
-        return self._say()
-
-    def close(self) -> None:
-        """End it."""
-        self._process.communicate()
 
 
 def ratio(some: list[float], others: list[float]) -> float:

@@ -32,8 +32,7 @@ from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 
 import shmmap
 from shmmap.dividing.map_writer import MapWriter
-from shmmap.simulation.lidar import Lidar
-from shmmap.simulation.lidar_drive import Traffic
+from shmmap.simulation.lidar import Lidar, Traffic
 from shmmap.simulation.town import Town
 from tests.benchmarks.street_data import street
 from tests.support.daemon_process import DaemonProcess
@@ -68,15 +67,15 @@ def town_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
 
 def street_drive(directory: Path, updates: int) -> tuple[Path, Iterator[Scene]]:
     """Divide the street's map; return it and the drive's scans."""
-    way = street()
-    cloud = shmmap.read_cloud(way.map_file).xyz
+    drive = street()
+    cloud = shmmap.read_cloud(drive.map_file).xyz
     with MapWriter(directory / "map", durable=False) as writer:
         writer.add({"xyz": cloud})
         writer.finish()
-    trajectory = read_trajectory(way.scan_poses_file)
+    trajectory = read_trajectory(drive.scan_poses_file)
 
     def scans() -> Iterator[Scene]:
-        for n, scan in enumerate(ScanSequence(way.scan_folder, trajectory)):
+        for n, scan in enumerate(ScanSequence(drive.scan_folder, trajectory)):
             if n < updates and scan.T_map_sensor is not None:
                 yield scan.xyz, scan.T_map_sensor, None
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // A vehicle's control loop with a window, for the benchmark `control_loop` and for tests:
 //
-//   control_loop ENDPOINT RADIUS PATIENCE
+//   control_loop ENDPOINT RADIUS TIMEOUT
 //
 // Reads lines.  "go STEPS WAIT PERIOD": that many rounds of PERIOD seconds each, 0.1 m along x in each; prints how long
 // each `move_to` took, and after it a sleep of WAIT seconds alone (nanoseconds), how often each error came, how many

@@ -4,7 +4,7 @@
     python -m tests.benchmarks.divide_large [--points 2e8] [--max-memory 1G] [--fields xyzi|xyzircaedt]
         [--random] [--repeat 3] [--dir DIR]
 
-The cloud is what a mapping drive gives: points around a vehicle on its way, in the order of time;
+The cloud is what a mapping drive gives: points around a moving vehicle, in the order of time;
 ``--random`` shuffles all order out of it, the worst case.  Both programs run in turn, each on the same
 cached input, each with the disk synced and nothing left to write before it starts.
 """
@@ -46,14 +46,14 @@ def generate(path: Path, points: int, row: np.dtype[np.void], *, random: bool) -
         file.write(pcd_header([(name, row[name], 1) for name in row.names or ()], points, "binary"))
         for start in range(0, points, BLOCK):
             count = min(BLOCK, points - start)
-            way = np.arange(start, start + count) / points * 2 * np.pi
+            phase = np.arange(start, start + count) / points * 2 * np.pi
             near = rng.normal(0.0, 25.0, (3, count)).astype(np.float32)
             if random:
                 block["x"][:count] = rng.uniform(-1000, 1000, count)
                 block["y"][:count] = rng.uniform(-1000, 1000, count)
             else:
-                block["x"][:count] = 900 * np.cos(way) + near[0]
-                block["y"][:count] = 900 * np.sin(2 * way) + near[1]
+                block["x"][:count] = 900 * np.cos(phase) + near[0]
+                block["y"][:count] = 900 * np.sin(2 * phase) + near[1]
             block["z"][:count] = near[2] / 10
             block["intensity"][:count] = np.arange(count) % 251
             file.write(block[:count].tobytes())

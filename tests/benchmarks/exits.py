@@ -61,7 +61,7 @@ SCENES: Final = {
 
 
 class Ends(NamedTuple):
-    """How many programs ended otherwise than they should, and what the first of them said."""
+    """How many programs did not end as they should, and what the first of them said."""
 
     signals: int
     codes: int
@@ -93,7 +93,7 @@ def end_often(endpoint: str, setup: str, ask: str, exits: int, at_once: int = 2)
 
 
 def main() -> int:
-    """Measure and print; 1 if any program ended otherwise than it should."""
+    """Measure and print; 1 if any program did not end as it should."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--exits", type=int, default=200)
     parser.add_argument("--scene", choices=SCENES, nargs="+", default=list(SCENES))

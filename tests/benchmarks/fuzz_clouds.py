@@ -33,7 +33,7 @@ from tests.support.cloud_bytes import random_ply
 from tests.support.fuzzing import fuzz_in_children, print_outcomes
 
 ALLOWED_BYTES = 200 << 20
-MOST_S = 10
+MAX_S = 10
 WORDS = [
     *(b"0", b"1", b"-1", b"255", b"4294967295", b"18446744073709551616", b"1e9", b"nan", b"inf", b"9" * 400),
     *(b"ply", b"format", b"element", b"vertex", b"property", b"list", b"comment", b"obj_info", b"end_header"),
@@ -80,7 +80,7 @@ def seeds(folder: Path) -> list[Seed]:
 
 
 def mutate(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
-    """Change a file in one to a few ways, its header more often than the rest."""
+    """Make one to a few changes in a file, more often in its header than in the rest."""
     out = bytearray(data)
     end = max(out.find(b"end_header") + 12, 60)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
@@ -140,7 +140,7 @@ def check(path: Path, data: bytes, rng: random.Random) -> str:
 def compare(data: bytes, columns: dict[str, np.ndarray]) -> str:
     """Compare with `plyfile`, which refuses more.
 
-    Not where the header's lines end in more than one way: `plyfile` ends a line only as the first one
+    Not where the header's line ends differ: `plyfile` ends a line only as the first one
     ends, so that a comment that ends otherwise hides the property after it.  PCL and rply end a line at
     each newline, as we do.
     """
@@ -182,7 +182,7 @@ def child(folder: Path, seed: int, seconds: float) -> int:
         started = time.monotonic()
         suffix, data = rng.choice(pool)
         path = folder / f"input{suffix}"
-        signal.alarm(MOST_S)
+        signal.alarm(MAX_S)
         outcome = check(path, mutate(data, rng, [one for kind, one in pool if kind == suffix]), rng)
         signal.alarm(0)
         path.unlink()

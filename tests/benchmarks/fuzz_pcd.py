@@ -35,20 +35,8 @@ WORDS = [
     *(b"0", b"1", b"-1", b"5", b"255", b"65536", b"4294967295", b"4294967296", b"18446744073709551616"),
     *(b"1e9", b"nan", b"inf", b"-inf", b"0x10", b"1_0", b"9" * 400, b"\xff", b"\x00", b"_", b"x", b"xyz"),
     *(b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"POINTS", b"VIEWPOINT", b"DATA", b"#"),
-    *(
-        b"ascii",
-        b"binary",
-        b"binary_compressed",
-        b"F",
-        b"U",
-        b"I",
-        b"2",
-        b"4",
-        b"8",
-        b"1000000",
-        b"\n",
-        b"\r",
-    ),
+    *(b"ascii", b"binary", b"binary_compressed"),
+    *(b"F", b"U", b"I", b"2", b"4", b"8", b"1000000", b"\n", b"\r"),
 ]
 
 
@@ -75,7 +63,7 @@ def seeds() -> list[bytes]:
 
 
 def mutate(data: bytes, rng: random.Random, pool: list[bytes]) -> bytes:
-    """Change a file in one to a few ways."""
+    """Make one to a few changes in a file."""
     out = bytearray(data)
     end = out.find(b"DATA ") + 24
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):

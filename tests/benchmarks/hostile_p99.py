@@ -14,7 +14,7 @@ compute.  The limit is at most 3.
 A scene does to the daemon what once held an earlier one up.  Beside it another client asks for warm cells
 every 5 ms, a third asks a bare ZeroMQ echo as often, and new clients come all the time.  Limits: the client's
 longest answer took at most 50 ms more than the echo's, the daemon's own memory grew by at most 100 MiB, and
-everybody got in.  Exit code 1 if a limit does not hold.
+every client got in.  Exit code 1 if a limit does not hold.
 
 On a machine that others use, too, a stall may be theirs: printed is how long the daemon's loop ran in the
 client's longest wait, and how long it waited for a processor.

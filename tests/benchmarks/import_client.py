@@ -24,7 +24,7 @@ _ENVIRONMENT = {
     **{
         name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
     },  # as installed
-    "OPENBLAS_NUM_THREADS": "1",  # numpy's threads, just started, spin as long as the process lives
+    "OPENBLAS_NUM_THREADS": "1",  # numpy's threads, just started, spin as long as the process runs
 }
 
 

@@ -61,7 +61,7 @@ class Interrupter:
             frame = frame.f_back
 
     def during(self, work: Callable[[], object], longest_s: float) -> None:
-        """Do something again and again until that is interrupted."""
+        """Repeat ``work`` until it is interrupted."""
         next_s = self._chance.choice((0.0, 1e-4, 3e-4))
         self._left = IN_A_ROW if next_s else 1
         try:

@@ -206,7 +206,7 @@ def measure(setting: str, scans: Sequence[Scan], peers: dict[str, OctoMap], roun
             for name, one in took.items():
                 seconds[name].append(one)
             if turn == 0:
-                good = tell_memory(setting, ours)
+                good = print_memory(setting, ours)
             ours.close()
     print(f"  points a second, millions, median of {rounds} rounds:")
     for name, values in seconds.items():
@@ -222,8 +222,8 @@ def measure(setting: str, scans: Sequence[Scan], peers: dict[str, OctoMap], roun
     return good
 
 
-def tell_memory(setting: str, ours: Ours) -> bool:
-    """Print it; whether it is within the limit."""
+def print_memory(setting: str, ours: Ours) -> bool:
+    """Print the map's memory; returns whether it is within the limit."""
     active, before = ours.active, ours.bytes()
     ours.read()
     after = ours.bytes()

@@ -46,7 +46,7 @@ LIMITS = {1: 20.0, 5: 40.0}
 
 
 def order(scans: list[Scan], count: int, stay: int) -> list[Scan]:
-    """So many scans, some from each place before the next copy's turn."""
+    """Take ``count`` scans, ``stay`` from each place before the next copy's turn."""
     found = []
     for number in range(count):
         stop, at = divmod(number, stay)

@@ -49,11 +49,11 @@ from tests.support.live_bench import MAP, RESOLUTION, percentiles
 from tests.support.raw_client import RawClient
 
 BUDGET = 4 << 20
-MOST = BUDGET + BUDGET // 10 + (1 << 20)
+MAX_BYTES = BUDGET + BUDGET // 10 + (1 << 20)
 CELLS = 16 << 20
 SIDE_M = 64 * RESOLUTION
 AHEAD = 16
-"""Chunks along the way that a scan changes, and across it a quarter of that."""
+"""Chunks along the path that a scan changes, and across it a quarter of that."""
 PERIOD_S = 0.1
 
 
@@ -158,7 +158,7 @@ while True:
 
 
 class Greedy:
-    """Keeps every chunk mapped; or touches all of it, again and again, and is ended by SIGBUS."""
+    """Keeps every chunk mapped; or touches all of it continuously, and is ended by SIGBUS."""
 
     def __init__(self, path: str, what: str) -> None:
         self._command = [sys.executable, "-c", GREEDY, path, what]
@@ -279,7 +279,7 @@ def named_after(one: DaemonProcess, pid: int) -> float:
 def scene_of_memory(args: argparse.Namespace) -> bool:
     """Bar: one bound, whatever readers do."""
     with ExitStack() as stack:
-        path = stack.enter_context(mounted(CELLS + MOST))
+        path = stack.enter_context(mounted(CELLS + MAX_BYTES))
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="live_readers.")))
         cells = make_map(folder / "map", columns=10, rows=10, points=2000)
         one = daemon(
@@ -311,9 +311,14 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
         looks, refused, wrong, signals = readers.end()
         peak = sampler.end()
     met = (
-        peak <= MOST and served == len(beside) and not wrong and not signals and named_s <= 5.0 and looks > 0
+        peak <= MAX_BYTES
+        and served == len(beside)
+        and not wrong
+        and not signals
+        and named_s <= 5.0
+        and looks > 0
     )
-    print(f"memory of the live map          {peak / 2**20:6.2f} MiB at most   limit {MOST / 2**20:.2f}")
+    print(f"memory of the live map          {peak / 2**20:6.2f} MiB at most   limit {MAX_BYTES / 2**20:.2f}")
     print(f"scans alone                     {percentiles(alone)}")
     print(f"scans beside readers            {percentiles(beside)}")
     print(f"point cells                     {served} of {len(beside)} requests served")
@@ -321,7 +326,7 @@ def scene_of_memory(args: argparse.Namespace) -> bool:
     print(
         f"readers ended by a signal       {signals or 'none'}; one that touches what it maps: {toucher.ends}"
     )
-    print(f"doctor names who keeps chunks   after {named_s:.1f} s   limit 5", *wrong[:3], sep="\n")
+    print(f"doctor names chunks' holders    after {named_s:.1f} s   limit 5", *wrong[:3], sep="\n")
     return bool(met)
 
 

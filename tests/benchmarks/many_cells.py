@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the number of cells costs the daemon and who asks it: maps of 10^5, 10^6 and 10^7 cells.
+"""What the number of cells costs the daemon and its clients: maps of 10^5, 10^6 and 10^7 cells.
 
     python -m tests.benchmarks.many_cells [--cells 100000 1000000 10000000] [--maps DIR] [--lift]
 
@@ -23,7 +23,7 @@ reload          until a change of ten cells is served
 turn in it      the longest turn then
 probe, echo     the longest that another client waited for warm cells then, and the client of a bare echo
 same work       most processor time that 0.4 ms of work, always the same, took in a process beside it then:
-                how much the machine itself slowed everybody
+                how much the machine itself slowed all processes
 daemon then     resident memory after the reload, with 2000 cells from everywhere in memory, and the most ever
 
 Exit code 1 if a limit does not hold; printed beside the table.

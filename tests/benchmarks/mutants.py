@@ -60,8 +60,8 @@ OWN: Final = "own"
 STAGES: Final = (OWN, "tests/unit", "tests/model", "tests/process", "tests/cpp tests/clients")
 """Tests in the order in which they are tried, the nearest first."""
 LIMIT_S: Final = 2400.0
-"""A stage that takes longer has caught its mutant: something waits for ever."""
-MOST_ALONE: Final = 20
+"""A stage that takes longer has caught its mutant: something waits without end."""
+MAX_ALONE: Final = 20
 """Failed tests that are run with each mutant of a group alone."""
 _TURNED: Final = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
 _OPERATORS: Final = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
@@ -344,7 +344,7 @@ def caught_together(
         found = {rest[0]: failed[0]} if failed and not named else {}
         for number in rest if named else ():
             with _broken(broken, [mutants[number]]):
-                alone = _first_failure(broken, " ".join(named[:MOST_ALONE]), limit_s)
+                alone = _first_failure(broken, " ".join(named[:MAX_ALONE]), limit_s)
             if alone and (" " in alone or not _first_failure(whole, alone, limit_s, "-n", "0")):
                 found[number] = alone
         if not found:

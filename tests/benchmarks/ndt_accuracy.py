@@ -64,9 +64,9 @@ def disturbance(rng: np.random.Generator, metres: float, degrees: float) -> Matr
 
 def planar(rng: np.random.Generator) -> Matrix:
     """0.3 m in a random direction of the plane, and a degree of yaw to either side."""
-    way = rng.uniform(0, 2 * np.pi)
+    direction = rng.uniform(0, 2 * np.pi)
     yaw = np.radians(rng.choice([-1.0, 1.0]))
-    return matrix_from_pose(np.array([0.3 * np.cos(way), 0.3 * np.sin(way), 0, 0, 0, yaw]))
+    return matrix_from_pose(np.array([0.3 * np.cos(direction), 0.3 * np.sin(direction), 0, 0, 0, yaw]))
 
 
 def within(rng: np.random.Generator) -> Matrix:
@@ -160,15 +160,15 @@ def main() -> None:
     args = parser.parse_args()
     names = tuple(DISTURBANCES) if args.disturbance == "all" else (args.disturbance,)
     starts = Starts(names, args.seeds, args.threads)
-    way = street()
-    source = "recorded" if way.recorded else "simulated"
+    street_data = street()
+    source = "recorded" if street_data.recorded else "simulated"
     print(f"load {os.getloadavg()[0]:.2f}; {args.seeds} seeds; {source} scans")
-    drive_map = VoxelMap({"map": voxel_cell(read_scan(way.thinned_map_file), 2.0)})
-    raw = [read_scan(path) for path in way.scans]
+    drive_map = VoxelMap({"map": voxel_cell(read_scan(street_data.thinned_map_file), 2.0)})
+    raw = [read_scan(path) for path in street_data.scans]
     dense = [sampled(scan, 0.5, 6000) for scan in raw]
-    drive(f"{source} scans, 0.5 m, 6000 points", drive_map, dense, way.T_map_scans, starts)
+    drive(f"{source} scans, 0.5 m, 6000 points", drive_map, dense, street_data.T_map_scans, starts)
     sparse = [sampled(scan, 3.0, 1500) for scan in raw]
-    drive(f"{source} scans, 3 m, 1500 points", drive_map, sparse, way.T_map_scans, starts)
+    drive(f"{source} scans, 3 m, 1500 points", drive_map, sparse, street_data.T_map_scans, starts)
 
     exact = data_dir() / "kitti0005_sim_scans"
     if exact.is_dir():

@@ -94,7 +94,7 @@ class Costs:
 
 
 def measure(memory: str, made: dict[str, VoxelCell], repeats: int) -> None:
-    """Print what a whole map, steps to and fro, and taking a map cost one way to read it."""
+    """Print what a whole map, steps to and fro, and taking a map cost with one kind of memory."""
     inside = list(made)[: _ACROSS * _ACROSS]
     here = VoxelMap({key: made[key] for key in inside})
     ahead = VoxelMap({key: made[key] for key in [*inside[_GONE:], *list(made)[len(inside) :][:_NEW]]})

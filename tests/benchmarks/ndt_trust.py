@@ -30,7 +30,7 @@ from shmmap_clients.ndt_scan_matcher import NdtMatcher, Settings, VoxelMap, matr
 from shmmap_clients.ndt_scan_matcher.drive.drive_summary import pose_errors
 from shmmap_clients.scans.scan_file import read_scan, thinned
 
-from shmmap.simulation.lidar_drive import LidarDrive
+from shmmap.simulation.lidar import LidarDrive
 from shmmap.simulation.town import Town
 from tests.benchmarks.street_data import SENSOR_HEIGHT_M, street
 
@@ -58,9 +58,9 @@ class Scene:
 
 def street_scene() -> Scene:
     """Return the street in the data directory."""
-    way = street()
-    scans = [read_scan(path) for path in way.scans]
-    return Scene(read_scan(way.thinned_map_file), scans, way.T_map_scans, SENSOR_HEIGHT_M)
+    drive = street()
+    scans = [read_scan(path) for path in drive.scans]
+    return Scene(read_scan(drive.thinned_map_file), scans, drive.T_map_scans, SENSOR_HEIGHT_M)
 
 
 def town_scene() -> Scene:
@@ -81,9 +81,9 @@ SCENES = {"street": street_scene, "town": town_scene}
 def start(T: Poses, index: int, seed: int) -> Poses:
     """Return a pose beside the true one, turned the more the farther it is."""
     rng = np.random.default_rng([index, seed])
-    way, away = rng.uniform(0, 2 * np.pi), AWAY_M[seed % len(AWAY_M)]
-    turn = rng.normal(0.0, 0.05 * (1 + away / 4))
-    off = matrix_from_pose(np.array([away * np.cos(way), away * np.sin(way), 0, 0, 0, turn]))
+    direction, away_m = rng.uniform(0, 2 * np.pi), AWAY_M[seed % len(AWAY_M)]
+    turn = rng.normal(0.0, 0.05 * (1 + away_m / 4))
+    off = matrix_from_pose(np.array([away_m * np.cos(direction), away_m * np.sin(direction), 0, 0, 0, turn]))
     return np.asarray(T @ off, np.float64)
 
 

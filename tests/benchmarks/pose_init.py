@@ -49,14 +49,14 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=4)
     parser.add_argument("--thin", type=float, default=1.0)
     args = parser.parse_args()
-    way = street()
-    truth = way.T_map_scans
-    scans = [thinned(read_scan(path), args.thin) for path in way.scans]
+    drive = street()
+    truth = drive.T_map_scans
+    scans = [thinned(read_scan(path), args.thin) for path in drive.scans]
     warmup_alignment()
     sys.addaudithook(watch)
     with tempfile.TemporaryDirectory() as scratch:
         made = tile_map(
-            way.thinned_map_file,
+            drive.thinned_map_file,
             Path(scratch) / "map",
             copies=args.copies,
             pitch=TILE_M,

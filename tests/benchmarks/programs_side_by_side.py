@@ -2,8 +2,8 @@
 """Localization, the compare filter and the elevation map side by side on one daemon, over a drive.
 
 Each is the real program in a process of its own.  Scans go to the first two over ZeroMQ; a few at a time
-are on their way, never more than both can take, so that a scan that is missing in the end was lost.  The
-third reads the whole map again and again.  Nothing here waits for a time to pass.
+are in flight, never more than both can take, so that a scan that is missing in the end was lost.  The
+third keeps reading the whole map.  Nothing here waits for a time to pass.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from shmmap.errors import InternalError
 
 __all__ = ["ProgramRun", "ThreePrograms", "run_three_programs", "table"]
 
-_ON_THEIR_WAY: Final = 6  # scans
+_IN_FLIGHT: Final = 6  # scans
 _ANSWER_S: Final = 120.0  # for an answer
 _LAST_RUN_S: Final = 900.0  # for a program's end: the elevation map may just have begun a large map
 _POLL_MS: Final = 1000
@@ -145,14 +145,14 @@ def run_three_programs(
     InternalError
         A program ended before its time, or did not answer.
     """
-    way = work / "odometry.txt"
-    way.write_text("\n".join(tum_line(stamp, T) for stamp, T in odometry) + "\n", encoding="utf-8")
+    odometry_file = work / "odometry.txt"
+    odometry_file.write_text("\n".join(tum_line(stamp, T) for stamp, T in odometry) + "\n", encoding="utf-8")
     result = ThreePrograms()
     address = {name: f"ipc://{work}/{name}" for name in ("to-ndt", "to-compare", "poses", "kept")}
     words = {
         "ndt": [
             "follow", "--scans", address["to-ndt"], "--publish", address["poses"],
-            "--odometry", str(way), "--plot", str(work / "ndt.svg"), *ndt,
+            "--odometry", str(odometry_file), "--plot", str(work / "ndt.svg"), *ndt,
         ],
         "compare": [
             "follow", "--scans", address["to-compare"], "--out", address["kept"], "--quiet", "--wait", "60",
@@ -175,7 +175,7 @@ def run_three_programs(
             if not output.wait_for_subscriber(_ANSWER_S):
                 raise InternalError(f"no program connects to {output.endpoint}")
         for scan in scans:
-            answers.wait(result.scans - _ON_THEIR_WAY, programs)
+            answers.wait(result.scans - _IN_FLIGHT, programs)
             for output in outputs:
                 output.send(scan)
             result.scans += 1

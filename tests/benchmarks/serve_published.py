@@ -31,7 +31,7 @@ import obstore
 from obstore.store import HTTPStore
 
 import shmmap
-from shmmap.daemon.loading.published_reader import AT_ONCE, PublishedReader
+from shmmap.daemon.loading.published_reader import CONCURRENT_FETCHES, PublishedReader
 from shmmap.layers.build import make_layer
 from shmmap.layers.sources import CellJob
 from shmmap.layers.spec import layer_spec
@@ -86,7 +86,7 @@ def bare(url: str, cells: list[tuple[ObjectName, CellIdentity]]) -> None:
         write_segment(unpack_frame(frame, name.raw, name="", exact=True), fd, identity, POINTS)
         os.close(fd)
 
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+    with ThreadPoolExecutor(CONCURRENT_FETCHES) as pool:
         list(pool.map(one, cells))
 
 
@@ -121,7 +121,7 @@ def window(root: Root, shards: list[Shard]) -> tuple[list[tuple[ObjectName, Cell
 def gets(url: str, names: list[ObjectName]) -> None:
     """Get objects, nothing else."""
     store = HTTPStore.from_url(url, client_options={"allow_http": True})
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+    with ThreadPoolExecutor(CONCURRENT_FETCHES) as pool:
         sizes = list(pool.map(lambda name: len(obstore.get(store, name.path).bytes()), names))
     assert sizes == [name.size for name in names]
 

@@ -211,7 +211,7 @@ def main() -> None:
     parser.add_argument("--only", choices=KINDS, help="one of the three")
     args = parser.parse_args()
     if args.seconds * args.speed > 4 * 2400.0:
-        parser.error("the way is 9.6 km long: drive for a shorter time, or slower")
+        parser.error("the path is 9.6 km long: drive for a shorter time, or slower")
     runs: dict[str, Run] = {}
     warnings.simplefilter("ignore", shmmap.ShmmapWarning)  # of points outside their cell, and of what is late
     print(f"load {os.getloadavg()[0]:.1f}", flush=True)

@@ -86,7 +86,7 @@ def town_drive(seed: int = 0, length_m: float = 8000.0, speed_mps: float = 12.0)
     """Through the generated town, at one speed."""
     path = town_path(seed, (32, 32), length_m, 1.0)[:, :2]
     travelled = travelled_m(path)
-    return Drive("town", travelled / speed_mps, _beside(path, seed), _told(path))
+    return Drive("town", travelled / speed_mps, _beside(path, seed), _route(path))
 
 
 def city_drive(seed: int = 0, length_m: float = 10_000.0, blocks: int = 20) -> Drive:
@@ -96,7 +96,7 @@ def city_drive(seed: int = 0, length_m: float = 10_000.0, blocks: int = 20) -> D
     red = [float(at) for at in np.arange(160.0, length_m, 160.0) if random.random() < 0.06]
     times = _times(path, red, random)
     # a stop is a time without a move: both ends of it are in the table
-    return Drive("city", times[0], _beside(path, seed)[times[1].astype(np.intp)], _told(path))
+    return Drive("city", times[0], _beside(path, seed)[times[1].astype(np.intp)], _route(path))
 
 
 def square_drive(side_m: float = 2400.0, speed_mps: float = 12.0, length_s: float = 600.0) -> Drive:
@@ -104,7 +104,7 @@ def square_drive(side_m: float = 2400.0, speed_mps: float = 12.0, length_s: floa
     corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)], dtype=np.float64) * side_m + (300.3, 300.9)
     path = rounded(corners, 12.0)
     path = path[travelled_m(path) <= length_s * speed_mps]
-    return Drive("square", travelled_m(path) / speed_mps, _beside(path, 0), _told(path))
+    return Drive("square", travelled_m(path) / speed_mps, _beside(path, 0), _route(path))
 
 
 def city_path(seed: int, length_m: float, blocks: int = 20) -> Floats:
@@ -131,7 +131,7 @@ def recorded_drive(file: Path) -> Drive:
     # the route is smoother than what was driven
     smooth = np.column_stack([np.convolve(column, np.ones(21) / 21, mode="valid") for column in places.T])
     route = np.concatenate([places[:1], smooth, places[-1:]])
-    return Drive(file.stem, times.astype(np.float64), np.ascontiguousarray(places), _told(route))
+    return Drive(file.stem, times.astype(np.float64), np.ascontiguousarray(places), _route(route))
 
 
 def dense_catalogue(drive: Drive, around_m: float = 500.0) -> Catalogue:
@@ -146,7 +146,7 @@ def dense_catalogue(drive: Drive, around_m: float = 500.0) -> Catalogue:
     )
 
 
-def _told(path: Floats) -> Floats:
+def _route(path: Floats) -> Floats:
     """Return a vertex every 3 m, its end included."""
     kept = np.flatnonzero(np.diff(np.floor(travelled_m(path) / 3.0), prepend=-1.0))
     return np.concatenate([path[kept], path[-1:]])
@@ -159,7 +159,7 @@ def travelled_m(path: Floats) -> Floats:
 
 
 def _beside(path: Floats, seed: int) -> Floats:
-    """Nobody drives in the very middle of a lane: slowly changing, up to half a metre to either side."""
+    """Shift a path slowly by up to half a metre to either side: no vehicle keeps the middle of its lane."""
     travelled = travelled_m(path)
     ahead = np.gradient(path, axis=0)
     ahead /= np.maximum(np.hypot(ahead[:, 0], ahead[:, 1]), 1e-9)[:, np.newaxis]
@@ -186,10 +186,10 @@ def _walk(random: np.random.Generator, side: int, steps: int) -> list[tuple[int,
 
 def rounded(nodes: Floats, radius_m: float) -> Floats:
     """Places about a metre apart, corners as arcs (of a parabola) that begin ``radius_m`` before them."""
-    ways = np.diff(nodes, axis=0)
-    ways /= np.hypot(ways[:, 0], ways[:, 1])[:, np.newaxis]
+    directions = np.diff(nodes, axis=0)
+    directions /= np.hypot(directions[:, 0], directions[:, 1])[:, np.newaxis]
     parts = [nodes[:1]]
-    for node, before, after in zip(nodes[1:-1], ways[:-1], ways[1:], strict=True):
+    for node, before, after in zip(nodes[1:-1], directions[:-1], directions[1:], strict=True):
         begin, end = node - radius_m * before, node + radius_m * after
         share = np.linspace(0.0, 1.0, 24)[:, np.newaxis]
         parts += [_line(parts[-1][-1], begin), (1 - share) ** 2 * begin + 2 * share * (1 - share) * node]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is fetched before anybody asks: nothing, a margin, what the daemon's policy says, or the truth."""
+"""What is fetched before it is asked for: nothing, a margin, what the daemon's policy says, or the truth."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class SlowOrigin:
     mean_s
         Mean time of a load, seconds.
     outages
-        A load that is under way or begun in one fails; it takes its time all the same.
+        A load that is running or begun in one fails; it takes its time all the same.
     """
 
     mean_s: float

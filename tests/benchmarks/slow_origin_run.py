@@ -31,7 +31,7 @@ __all__ = ["ROWS", "Setting", "simulate"]
 
 ROWS = ("none", "margin", "no route", "trajectory", "route", "oracle")
 """What is fetched ahead: nothing; 60 m more; along the motion learnt from poses; along 150 m of path, sent
-again each second; along the whole way; what will be asked for."""
+again each second; along the whole route; what will be asked for."""
 POSE_PERIOD_S = 1.0
 """How often a window sends its pose, and asks again for what it lacks."""
 TRAJECTORY_M = 150.0
@@ -41,7 +41,7 @@ EVICTED_AT_A_TIME = 32
 """Cells that are evicted at a time."""
 LONGEST_WARM_UP_S = 120.0
 WARM_UP_S = 30.0
-"""Of rows that look no way ahead."""
+"""Of rows that do not look ahead."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Setting:
     row
         One of `ROWS`.
     memory_cells
-        So many fit into memory.
+        Cells that fit into memory.
     share
         Part of them that may be there without having been asked for.
     """
@@ -130,7 +130,7 @@ class _Simulation:
         if self.setting.row in ("route", "oracle"):
             route = tuple(self.route)
         elif self.setting.row == "trajectory":
-            # along the way it is about as far as it has travelled
+            # its place on the route is about as far as it has travelled
             travelled = float(np.interp(self.now_s, self.drive.times_s, self.drive.travelled_m))
             share = travelled / float(self.drive.travelled_m[-1]) * float(self.route_m[-1])
             first, last = np.searchsorted(self.route_m, [share, share + TRAJECTORY_M])
@@ -215,7 +215,7 @@ class _Simulation:
         """Nothing is wished for: from now on it counts."""
         policy = self.setting.row not in ("none", "margin")
         if policy and self.counts.full_s == math.inf and self.present[self.inside].all() and self.now_s:
-            # what is under way is there soon
+            # loads that run are done soon
             self.counts.full_s = max([end_s for end_s, *_ in self.running], default=self.now_s)
 
     def begin(self, cell: int) -> None:
@@ -265,13 +265,13 @@ class _Simulation:
 
     def run(self) -> Counts:
         """Drive."""
-        ask_at, tell_s = 0, 0.0
+        ask_at, send_s = 0, 0.0
         if self.setting.row in ("none", "margin"):
             self.counts.full_s = WARM_UP_S
         while True:
             ask_s = self.asked_s[ask_at] if ask_at < len(self.asked_s) else math.inf
             end_s = self.running[0][0] if self.running else math.inf
-            self.now_s = min(ask_s, tell_s, end_s, self.wake_s if self.wake_s > self.now_s else math.inf)
+            self.now_s = min(ask_s, send_s, end_s, self.wake_s if self.wake_s > self.now_s else math.inf)
             if self.now_s >= self.drive.length_s:
                 break
             if self.now_s == end_s:
@@ -279,8 +279,8 @@ class _Simulation:
             elif self.now_s == ask_s:
                 ask_at += 1
                 self.ask()
-            elif self.now_s == tell_s:
-                tell_s += POSE_PERIOD_S
+            elif self.now_s == send_s:
+                send_s += POSE_PERIOD_S
                 self.send_pose()
                 self.ask_again()
             self.pump()

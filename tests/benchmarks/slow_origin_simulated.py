@@ -4,7 +4,7 @@
     python -m tests.benchmarks.slow_origin_simulated [--poses FILE]
 
 A vehicle asks for a circle of 200 m every 20 m; cells of 20 m are loaded by eight loaders, each load in a
-log-normal time, and fail in outages.  One row for each way of fetching ahead:
+log-normal time, and fail in outages.  One row for each policy of fetching ahead:
 
 none        what is asked for is loaded, and nothing else
 margin      60 m more, after all that is asked for
@@ -15,8 +15,8 @@ oracle      what will be asked for, known beforehand, as far ahead as the policy
 
 "warm" is the share of queries that lack nothing, "late" the number of cells that were not there when they
 were first asked for, "stall" how long a query waits for its last cell, "fetched" the cells loaded for each
-one that was asked for before it was evicted.  Counted from when the way ahead is in memory for the first time
-(the first two rows: from 30 s on).
+one that was asked for before it was evicted.  Counted from when the path ahead is first in memory (the first
+two rows: from 30 s on).
 
 Checked: with the route no cell is late, and at most 1.05 are fetched for one; without, at 400 ms and no
 outage, 98 % of queries are warm, and at most 1.25 are fetched.  Not judged are rows that need more cells a

@@ -203,8 +203,8 @@ class Soak:
             client.kill()
             client.wait()
         with shmmap.connect(self.one.endpoint, timeout=60.0, connect_timeout=60.0) as operator:
-            patience_s = time.monotonic() + 30
-            while self.one.segments() and time.monotonic() < patience_s:
+            until_s = time.monotonic() + 30
+            while self.one.segments() and time.monotonic() < until_s:
                 operator.evict()  # more than once: loads that the dead asked for go on
                 time.sleep(0.02)
         if self.one.segments():

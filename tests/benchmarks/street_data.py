@@ -36,12 +36,8 @@ class Street:
         PCD: the map as dense as it is (5 cm), and with one point per 10 cm.
     scan_folder, scan_poses_file
         Scans that are not part of the map, in the order of their names, and a TUM file of their poses.
-    T_map_frames
-        (F, 4, 4) pose of the sensor in every frame of the drive, 10 in a second.
     scans
         File of each scan.
-    scan_frames
-        The frame of each scan.
     """
 
     recorded: bool
@@ -49,9 +45,7 @@ class Street:
     thinned_map_file: Path
     scan_folder: Path
     scan_poses_file: Path
-    T_map_frames: NDArray[np.float64]
     scans: tuple[Path, ...]
-    scan_frames: tuple[int, ...]
 
     @property
     def T_map_scans(self) -> NDArray[np.float64]:
@@ -82,18 +76,16 @@ def street() -> Street:
         maps = folder / "kitti0005_map"
         map_file, thinned = maps / "map_static_v005.pcd", maps / "map_static_v010.pcd"
         scans = folder / "kitti0005_scans"
-        every, held_out = scans / "poses_all_tum.txt", scans / "poses_heldout_tum.txt"
+        held_out = scans / "poses_heldout_tum.txt"
     else:
         maps = folder / "street"
         map_file, thinned = maps / "map.pcd", maps / "map_thinned.pcd"
         scans = maps / "scans"
-        every, held_out = maps / "frame_poses.txt", maps / "scan_poses.txt"
+        held_out = maps / "scan_poses.txt"
     if not map_file.is_file():
         raise SystemExit(f"{folder} has neither a folder kitti0005_map nor a folder street with a map.pcd")
     files = tuple(sorted(scans.glob("scan_*.npz")))
-    frames = tuple(int(path.stem.rpartition("_")[2]) for path in files)
-    poses = read_trajectory(every).T_map_sensor
-    return Street(recorded, map_file, thinned, scans, held_out, poses, files, frames)
+    return Street(recorded, map_file, thinned, scans, held_out, files)
 
 
 def sampled(points: Points, edge: float, most: int | None = None, seed: int = 0) -> NDArray[np.float32]:

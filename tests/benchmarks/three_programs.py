@@ -62,8 +62,8 @@ def main() -> None:
     parser.add_argument("--budget-mib", type=int, default=300)
     parser.add_argument("--out", type=Path, help="where ndt.svg and compare.svg go")
     args = parser.parse_args()
-    way = street()
-    sequence = list(ScanSequence(way.scan_folder, read_trajectory(way.scan_poses_file)))
+    street_data = street()
+    sequence = list(ScanSequence(street_data.scan_folder, read_trajectory(street_data.scan_poses_file)))
     corners = tile_corners(args.tiles)
     end_s = 0.0
 
@@ -88,7 +88,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         written = tile_map(
-            way.map_file,
+            street_data.map_file,
             directory / "map",
             copies=args.tiles,
             pitch=TILE_M,

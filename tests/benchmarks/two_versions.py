@@ -220,6 +220,7 @@ class Measuring:
         self._process = subprocess.Popen(
             [python(checkout), "-c", program, *arguments],
             cwd=checkout, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": str(checkout), "OPENBLAS_NUM_THREADS": "1"},
         )  # fmt: skip
         assert self._say() == "up"
 
@@ -227,20 +228,25 @@ class Measuring:
         assert self._process.stdout is not None
         return self._process.stdout.readline().strip()
 
-    def measure(self, what: str) -> float:
-        """Return microseconds."""
+    def measure(self, what: str = "") -> str:
+        """Return what it found."""
         assert self._process.stdin is not None
         print(what, file=self._process.stdin, flush=True)
-        return float(self._say())
+        return self._say()
 
     def close(self) -> None:
         """End it."""
         self._process.communicate()
 
 
+def measured_us(program: Measuring, ask: str) -> float:
+    """Return what a program measured, microseconds."""
+    return float(program.measure(ask))
+
+
 def cpu_us(checkout: Path, *arguments: str) -> float:
     """CPU time of a Python program of a checkout, microseconds."""
-    # numpy's threads, just started, spin as long as the process lives
+    # numpy's threads, just started, spin as long as the process runs
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     pid = os.posix_spawn(
         python(checkout),
@@ -344,7 +350,7 @@ def main() -> None:
         this, other = (Measuring(checkout, program, *arguments) for checkout in checkouts)
         for name, ask in asks.items():
             how = compare_differences if ask.endswith("penalty") else compare
-            how(name, partial(this.measure, ask), partial(other.measure, ask), options.pairs)
+            how(name, partial(measured_us, this, ask), partial(measured_us, other, ask), options.pairs)
         this.close()
         other.close()
 

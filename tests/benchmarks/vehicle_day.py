@@ -12,7 +12,7 @@ sigma 0.8), all share 100 Mbit/s, and by chance, every four minutes on average, 
 
 The hour is driven in ``--minutes``: the vehicle is 60 / minutes times as fast, the link as much wider, and
 outages as much more frequent.  How long answers and outages take is not shortened, nor is anything in the
-daemon: an outage covers more of the way than in a real hour.  ``--minutes 60`` is a real hour.
+daemon: an outage covers more of the path than in a real hour.  ``--minutes 60`` is a real hour.
 
 misses          queries that lacked a cell, or did not know all cells; the first 30 s do not count
 longest wait    from when a cell was first needed until it was there
@@ -155,7 +155,7 @@ class SentRoute:
         self._route, self._along = drive.route, travelled_m(drive.route)
 
     def at(self, along_m: float) -> tuple[tuple[float, float], ...]:
-        """Return the stretch that is sent after ``along_m`` metres of the way."""
+        """Return the stretch that is sent after ``along_m`` metres of the path."""
         begin_m = max(0.0, along_m // STRETCH_M * STRETCH_M - STEP_M)
         marks = np.arange(begin_m, min(begin_m + STRETCH_M + AHEAD_M, self._along[-1]), VERTEX_M)
         x, y = (np.interp(marks, self._along, column).tolist() for column in self._route.T)
@@ -205,7 +205,7 @@ class Vehicle:
             self._lacking.setdefault(cell, (asked_s, query))
 
 
-def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> Day:
+def drive_day(drive: Drive, kind: str, args: argparse.Namespace, folder: Path) -> Day:
     """Run one daemon, its link and its vehicle."""
     factor, end_s = 60.0 / args.minutes, HOUR_S * args.hours
     day = Day(kind, outages(args.seed, factor, end_s / factor))
@@ -218,11 +218,11 @@ def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> 
         one = DaemonProcess(link.endpoint, *options, "--workers", "2", "--cache-dir", str(cache))
         stack.enter_context(one)
         client = stack.enter_context(shmmap.connect(one.endpoint))
-        vehicle = Vehicle(client, day, SentRoute(way) if kind == "route" else None)
-        times = way.times_each(STEP_M)
+        vehicle = Vehicle(client, day, SentRoute(drive) if kind == "route" else None)
+        times = drive.times_each(STEP_M)
         times = times[times < end_s]
         day.way_km = len(times) * STEP_M / 1e3
-        client.area(shmmap.Circle(*way.at(0.0), RADIUS_M), wait=300.0)
+        client.area(shmmap.Circle(*drive.at(0.0), RADIUS_M), wait=300.0)
         client.release()
         if args.lift:
             for pid in (one.pid, *one.loaders()):
@@ -232,7 +232,7 @@ def drive_day(way: Drive, kind: str, args: argparse.Namespace, folder: Path) -> 
         due = (begin_s + np.append(times, end_s) / factor).tolist()
         for number, real_s in enumerate(times.tolist()):
             time.sleep(max(0.0, due[number] - time.monotonic()))
-            vehicle.ask(*way.at(real_s), number * STEP_M, begin_s, due[number + 1])
+            vehicle.ask(*drive.at(real_s), number * STEP_M, begin_s, due[number + 1])
             counters = read_statistics(one.instance, one.shm_dir).counters
             now_s = time.monotonic() - begin_s
             day.samples.append(Sample(now_s, link.received_bytes(), counters["bytes_resident"]))
@@ -268,7 +268,7 @@ def main() -> None:
     parser.add_argument(
         "--mbit", type=float, default=100.0, help="of the link, Mbit/s; 0: any (default: 100)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the way, the link and its outages")
+    parser.add_argument("--seed", type=int, default=0, help="of the drive, the link and its outages")
     parser.add_argument("--only", choices=KINDS, help="one of the two")
     parser.add_argument("--at-once", action="store_true", help="both drives at the same time")
     parser.add_argument(
@@ -287,13 +287,13 @@ def main() -> None:
             "--minutes: 10 to 60; in less, the vehicle would be faster than the daemon takes one to be"
         )
     if not 0.0 < args.hours <= 1.0:
-        parser.error("--hours: the way takes one hour")
-    way = city_drive(args.seed, 45_000.0, BLOCKS)
+        parser.error("--hours: the drive takes one hour")
+    drive = city_drive(args.seed, 45_000.0, BLOCKS)
     kinds = [args.only] if args.only else list(KINDS)
     print(f"load {os.getloadavg()[0]:.1f}; an hour takes {args.minutes:g} minutes", flush=True)
     at_once = len(kinds) if args.at_once else 1
     with tempfile.TemporaryDirectory(dir=args.scratch) as folder, ThreadPoolExecutor(at_once) as pool:
-        days = list(pool.map(lambda kind: drive_day(way, kind, args, Path(folder)), kinds))
+        days = list(pool.map(lambda kind: drive_day(drive, kind, args, Path(folder)), kinds))
     for day in days:
         print(row(day))
     print(f"load {os.getloadavg()[0]:.1f}")

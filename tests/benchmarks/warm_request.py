@@ -104,7 +104,9 @@ class Warm:
         around = self.client.area(["box", x - 179.0, y - 179.0, x + 179.0, y + 179.0]).cells
         assert len(inside) == HELD
         outside = [h for h in around if h.id not in {i.id for i in inside}]
-        self._open = [os.open(self.client.path(handle), os.O_RDONLY) for handle in around]  # as who maps them
+        self._open = [
+            os.open(self.client.path(handle), os.O_RDONLY) for handle in around
+        ]  # as a client that maps them
         held = inside[:: HELD // NEW][:NEW]
         held = [h for h in inside if h not in held] + outside[:NEW]
         assert len(held) == HELD
@@ -124,7 +126,7 @@ class Warm:
             self.sizes[name] = (len(request), reply.wire_bytes)
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Release everything."""
         self.client.close()
         for fd in self._open:
             os.close(fd)

@@ -38,7 +38,7 @@ from tests.support.raw_client import RawClient
 __all__ = ["main"]
 
 LOADED = 60
-GIVING_WAY = 400
+EVICTED = 400
 STALL_US = 1000.0
 
 
@@ -110,7 +110,7 @@ class Meanwhile:
         )
 
     def until(self, other: Other, *, noted: bool = True) -> None:
-        """Until a client has an answer; the loads that it waits for are under way."""
+        """Until a client has an answer; the loads that it waits for are running."""
         while not other.answered():
             socket, request, times = next(self._in_turn)
             start = time.perf_counter()
@@ -143,7 +143,7 @@ def while_loading(
             other.ask("stats")  # a cell asked for again before it is freed is only put back in service
 
 
-def while_others_give_way(other: Other, meanwhile: Meanwhile, cells: Iterator[str], passes: int) -> int:
+def while_others_are_evicted(other: Other, meanwhile: Meanwhile, cells: Iterator[str], passes: int) -> int:
     """Time requests while cells are loaded for which others have to be evicted; returns their number."""
     before = other.ask("stats")[4]["evictions"]
     for _ in range(passes):
@@ -193,7 +193,7 @@ def main() -> None:
 
         made = make_map(Path(directory) / "map", columns=20, rows=20, points=30)
         heavy = heavy_cells(made, LOADED, 60_000, 0)
-        others = heavy_cells(made, GIVING_WAY, 10_000, 1000)
+        others = heavy_cells(made, EVICTED, 10_000, 1000)
         roomy, full = served(made.root, "--budget", "2G"), served(made.root, "--budget", "24M")
         of_roomy, of_full = Warm(roomy), Warm(full)
         echo = of_roomy.echo(roomy, "packed")
@@ -206,7 +206,7 @@ def main() -> None:
         meanwhile.print_times(f"while {LOADED} cells of 1 MB load", arguments.passes)
         meanwhile = Meanwhile(of_full, echo)
         cells = itertools.cycle(others)
-        evicted = while_others_give_way(others_of_full, meanwhile, cells, 2 * arguments.passes)
+        evicted = while_others_are_evicted(others_of_full, meanwhile, cells, 2 * arguments.passes)
         meanwhile.print_times(f"while {evicted} cells are evicted for others", 2 * arguments.passes)
         compared("a full cache against one with room", of_roomy, of_full, arguments.rounds)
 

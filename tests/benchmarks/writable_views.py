@@ -44,7 +44,7 @@ for i in range(int(sys.argv[4])):
 
 
 def main() -> int:
-    """Write and print; 1 if a process ended otherwise than by itself, or the cell changed."""
+    """Write and print; 1 if a process did not end by itself, or the cell changed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--processes", type=int, default=8)
     parser.add_argument("--writes", type=int, default=100)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The client in C++ beside the one in Python: the same bytes, whatever is damaged, and no byte beyond them.
 
-What both clients do in the same way is tested with both in ``tests/process``.
+What both clients do alike is tested with both in ``tests/process``.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import os
 import shutil
 import subprocess
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +39,6 @@ LAYERS = (
 QUICK_LAYERS = tuple(layer for layer in LAYERS if not layer.startswith(("denoise", "normals")))
 MUTATIONS = int(os.environ.get("SHMMAP_TEST_MUTATIONS", "50000"))
 """Mutated messages of each kind; a million takes some minutes."""
-
-
-@pytest.fixture
-def program(cpp_program: Path) -> Iterator[CppProgram]:
-    """Return a process that has not connected; nothing in it may leak or go wrong."""
-    one = CppProgram(cpp_program)
-    yield one
-    assert one.close() == 0
 
 
 def columns(cells: shmmap.CellSet) -> list[list[str]]:
@@ -96,7 +87,7 @@ def test_real_maps_too(daemon: DaemonFactory, cpp_program: Path, data_dir: Path)
     assert equal_bytes(cpp_program, one.endpoint, layers) > 1e6
 
 
-def test_what_it_lets_go_can_be_freed(
+def test_what_it_releases_can_be_freed(
     daemon: DaemonFactory, cpp_program: Path, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)

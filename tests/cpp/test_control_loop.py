@@ -42,7 +42,7 @@ def is_whole(loop: ControlLoop, daemon: DaemonProcess) -> None:
 def test_a_stopped_daemon_costs_no_call_anything(
     daemon: DaemonFactory, divided_map: DividedMap, loop_program: Path
 ) -> None:
-    """Not an error either, before `patience` is over; what was asked meanwhile is answered afterwards."""
+    """Not an error either, before `timeout` is over; what was asked meanwhile is answered afterwards."""
     one = daemon(divided_map.root)
     loop = ControlLoop(loop_program, one.endpoint, RADIUS, wait=LONG_S)
     loop.go(1)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import shmmap
-from shmmap.testing.environment import without_settings
+from shmmap.testing.daemon_process import without_settings
 from tests.cpp.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map

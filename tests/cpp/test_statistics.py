@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,14 +22,6 @@ LAYERS = ("points", "ndt(leaf=2.0)")
 STATES = ("resident", "stale", "zombie")
 
 
-@pytest.fixture
-def program(cpp_program: Path) -> Iterator[CppProgram]:
-    """Return a process that asks nobody; nothing in it may leak or go wrong."""
-    one = CppProgram(cpp_program)
-    yield one
-    assert one.close() == 0
-
-
 def rows(answer: list[list[str]], kind: str) -> list[list[str]]:
     """The words of the lines of a kind."""
     return [line[1:] for line in answer if line[0] == kind]
@@ -39,7 +30,7 @@ def rows(answer: list[list[str]], kind: str) -> list[list[str]]:
 def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_map: DividedMap) -> None:
     """Of a daemon that was stopped: nothing changes between the two readers."""
     one = daemon(divided_map.root)
-    with shmmap.connect(one.endpoint, name="somebody") as client:
+    with shmmap.connect(one.endpoint, name="python") as client:
         route = [(0.0, 0.0), (60.0, 0.0)]
         client.area(
             shmmap.Circle(0, 0, 30), LAYERS, wait=60.0, pose=(1.5, 2.0), velocity=(5.0, 0.0), route=route
@@ -94,7 +85,7 @@ def test_everything_in_it(daemon: DaemonFactory, program: CppProgram, divided_ma
             str(listed.uid),
             str(listed.cells),
             str(listed.bytes),
-            "somebody",
+            "python",
             listed.command,
             "1.5",
         ]

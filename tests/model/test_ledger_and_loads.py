@@ -375,9 +375,9 @@ class Machine(RuleBasedStateMachine):
             if shortage <= 0:
                 assert pages <= room
                 return
-            on_its_way = self.evictor.free(shortage, self.now_s)
+            will_come = self.evictor.free(shortage, self.now_s)
             self.follow()
-            if not on_its_way:
+            if not will_come:
                 assert pages > room
                 return
             self.wait_for_the_other_thread()

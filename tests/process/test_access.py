@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.process.conftest import DaemonFactory
-from tests.support.accounts import ATTEMPTS, DAEMON_UID, GROUP, MEMBER, STRANGER, as_user, python_for_others
+from tests.support.accounts import ATTEMPTS, DAEMON_UID, GROUP, MEMBER, OTHER_USER, as_user, python_for_others
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.mapping_process import MappingProcess
@@ -60,14 +60,14 @@ def test_members_of_the_group_read_and_change_nothing(service: DaemonProcess, co
 def test_others_are_refused_everything(service: DaemonProcess, connect: Connect) -> None:
     client = connect(service)
     path = client.path(client.selected(["0_0.pcd"]).cells[0])
-    found = attempts(path, STRANGER, STRANGER)
+    found = attempts(path, OTHER_USER, OTHER_USER)
     assert 0 not in found.values(), found
 
 
 CONNECT = "import socket, sys; socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
 
 
-@pytest.mark.parametrize(("uid", "gid", "works"), [(MEMBER, GROUP, True), (STRANGER, STRANGER, False)])
+@pytest.mark.parametrize(("uid", "gid", "works"), [(MEMBER, GROUP, True), (OTHER_USER, OTHER_USER, False)])
 def test_the_socket_and_the_statistics(service: DaemonProcess, uid: int, gid: int, works: bool) -> None:
     python = python_for_others()
     assert (as_user(uid, gid, python, "-I", "-c", CONNECT, service.endpoint).returncode == 0) == works
@@ -75,7 +75,7 @@ def test_the_socket_and_the_statistics(service: DaemonProcess, uid: int, gid: in
     assert (as_user(uid, gid, "cksum", statistics).returncode == 0) == works
 
 
-def test_without_a_group_nobody_else_reads(
+def test_without_a_group_no_other_account_reads(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
@@ -83,10 +83,10 @@ def test_without_a_group_nobody_else_reads(
     os.chmod(one.shm_dir, 0o1777)
     client = connect(one)
     path = client.path(client.area(circle(10, 10, 1)).cells[0])
-    found = attempts(path, STRANGER, STRANGER)
+    found = attempts(path, OTHER_USER, OTHER_USER)
     assert 0 not in found.values(), found
     python = python_for_others()
-    assert as_user(STRANGER, STRANGER, python, "-I", "-c", CONNECT, one.endpoint).returncode != 0
+    assert as_user(OTHER_USER, OTHER_USER, python, "-I", "-c", CONNECT, one.endpoint).returncode != 0
 
 
 @pytest.fixture

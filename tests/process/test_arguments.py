@@ -129,7 +129,7 @@ def test_an_instance_by_its_name(daemon: Factory, tmp_path: Path, monkeypatch: p
     for stream in (shmmap.events.EventStream(name), shmmap.events.EventStream(instance=name)):
         assert stream.path == one.endpoint
         stream.close()
-    monkeypatch.setenv("SHMMAP_ENDPOINT", "/nobody/is/here.sock")
+    monkeypatch.setenv("SHMMAP_ENDPOINT", "/no/such/directory/here.sock")
     with shmmap.connect(instance=name) as client:
         assert client.endpoint == one.endpoint, "what is said goes before what is set"
     monkeypatch.chdir(Path(one.endpoint).parent)

@@ -39,7 +39,7 @@ def test_the_page_names_every_benchmark_and_no_other() -> None:
 
 STARTS = """
 import contextlib, io, json, runpy, sys
-told = {}
+results = {}
 for line in sys.argv[1:]:
     module, *sys.argv[1:] = line.split()
     out, err, code = io.StringIO(), io.StringIO(), None
@@ -48,8 +48,8 @@ for line in sys.argv[1:]:
             runpy.run_module("tests.benchmarks." + module, run_name="__main__", alter_sys=True)
     except SystemExit as end:
         code = end.code
-    told[module] = code, out.getvalue(), err.getvalue()
-print(json.dumps(told))
+    results[module] = code, out.getvalue(), err.getvalue()
+print(json.dumps(results))
 """
 
 

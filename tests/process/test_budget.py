@@ -99,7 +99,7 @@ def test_never_exceeded_while_clients_wander(
         for holder in holders:
             holder.drop_all()
     assert one.log.count("cells evicted") >= min(evictions, 1)
-    assert one.log.count("evicted cell=") == 0, "each by itself is for who looks for a defect"
+    assert one.log.count("evicted cell=") == 0, "single evictions are logged only for debugging"
     assert 0 < watch.peak_bytes <= budget
     assert 0 < watch.peak_descriptors < 64  # of the daemon and of any loader, however many cells come and go
     assert evictions > 0 or watch.peak_bytes < budget
@@ -118,7 +118,7 @@ def test_a_full_budget_names_who_fills_it(
     holder.take(holder.client.selected(ids[:10]))
     assert len(holder.mapped) == 10
     strange = other.selected(ids[10:12]).cells
-    with MappingProcess([other.path(h) for h in strange]) as stranger:
+    with MappingProcess([other.path(h) for h in strange]) as other_process:
         other.release()
         reply = other.selected(ids[20:40], wait=10.0)
         assert reply.cells
@@ -131,7 +131,7 @@ def test_a_full_budget_names_who_fills_it(
         assert mine[5] == 10
         assert by_session[0][1] == 0  # a mapping without a known owner
         assert by_session[0][5] == 2
-        assert stranger.checksums()
+        assert other_process.checksums()
         holder.drop_all()
     done: set[str] = set()
     waiting = Deadline()

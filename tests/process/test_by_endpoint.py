@@ -27,7 +27,7 @@ def shmmap(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def other_name(daemon: DaemonFactory, divided_map: DividedMap) -> DaemonProcess:
-    """A daemon whose socket is named otherwise than its instance, and whose segments are elsewhere."""
+    """A daemon whose socket has another name than its instance, and whose segments are elsewhere."""
     one = daemon(divided_map.root, start=False)
     one.endpoint = f"{one.runtime_dir}/front.sock"
     one.arguments += ["--endpoint", one.endpoint]

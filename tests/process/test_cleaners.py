@@ -53,7 +53,7 @@ def test_removed_segments_cost_no_memory(daemon: DaemonFactory, divided_map: Div
             with connect(one.endpoint) as another:  # it has nothing mapped
                 again = another.selected(cells, wait=TIMEOUT_S)
             assert (len(again), again.failed, again.pending) == (36, (), ())
-        assert all(len(cell.xyz) == 700 for cell in held), "who maps them keeps them"
+        assert all(len(cell.xyz) == 700 for cell in held), "a process keeps what it maps"
         until(lambda: counters(one)["bytes_resident"] == nbytes, lambda: str(counters(one)))
         until(lambda: counters(one)["bytes_zombie"] == 0, lambda: str(counters(one)))
         if how.startswith("pinned"):

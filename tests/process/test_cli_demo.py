@@ -21,9 +21,7 @@ from shmmap.demo.consumer import Pose, StepReport
 from shmmap.demo.demo import run_demo
 from shmmap.demo.demo_town import DemoSettings
 from shmmap.demo.drive import Fleet, drive_through_outage
-from shmmap.demo.process_usage import cpu_seconds
-from shmmap.demo.program import Program
-from shmmap.demo.progress import Progress
+from shmmap.demo.program import Program, Progress, cpu_seconds
 from shmmap.errors import BadRequest, InternalError
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess, Deadline, processes_marked, wait_ended
@@ -142,8 +140,15 @@ def test_without_numba_the_demo_says_what_is_left_out(
     print_report(town_report(result), "town.svg", 1.0)
     lines = [line for line in capsys.readouterr().out.splitlines() if line[:1].islower() or line[:3] == "CPU"]
     assert [line.split("  ")[0] for line in lines] == [
-        "town", "memory", "one more", "waiting", "CPU", "kill -9", "position", "duration",
-    ]  # fmt: skip
+        "town",
+        "memory",
+        "one more",
+        "waiting",
+        "CPU",
+        "kill -9",
+        "position",
+        "duration",
+    ]
     assert "the package numba is not installed" in lines[6]
 
 

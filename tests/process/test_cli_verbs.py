@@ -153,7 +153,7 @@ def test_status_of_a_dead_daemon(shmmap: Shmmap) -> None:
     assert shmmap.run("query", "--circle", "0,0,5").returncode == 69
 
 
-def test_ls_tells_what_is_resident(shmmap: Shmmap, divided_map: DividedMap) -> None:
+def test_ls_lists_what_is_resident(shmmap: Shmmap, divided_map: DividedMap) -> None:
     handles = {cell["id"]: cell for cell in shmmap.json("query", "--circle", "0,0,25")["cells"]}
     listed: dict[str, Any] = {}
     while len(listed) < len(handles):  # the daemon writes its table a few times a second
@@ -178,10 +178,10 @@ def test_show_and_clients(shmmap: Shmmap, divided_map: DividedMap) -> None:
     z = divided_map.points("0_0.pcd")["z"]
     assert shown["z"] == [float(z.min()), float(z.max())]
     assert shmmap.run("show", "nowhere.pcd").returncode == 1
-    told = shmmap.json("clients")
-    me = [row for row in told["clients"] if row["client"] == "shmmap"]
+    found = shmmap.json("clients")
+    me = [row for row in found["clients"] if row["client"] == "shmmap"]
     assert [row["uid"] for row in me] == [os.getuid()]
-    assert (told["unknown_holders"], told["unknown_bytes"]) == (0, 0)
+    assert (found["unknown_holders"], found["unknown_bytes"]) == (0, 0)
 
 
 def test_reload_and_evict(shmmap: Shmmap, divided_map: DividedMap) -> None:
@@ -219,8 +219,8 @@ def test_export_merged_pcd(shmmap: Shmmap, divided_map: DividedMap) -> None:
     names = divided_map.in_circle(0, 0, 5)
     for encoding in ("ascii", "binary", "binary_compressed"):
         path = f"{encoding}.pcd"
-        told = shmmap.json("export", "--circle", "0,0,5", "-o", path, "--encoding", encoding)
-        (file,) = told["files"]
+        exported = shmmap.json("export", "--circle", "0,0,5", "-o", path, "--encoding", encoding)
+        (file,) = exported["files"]
         assert (file["path"], file["points"]) == (path, 500 * len(names))
         described = shmmap.json("inspect", path)
         assert (described["encoding"], described["points"], described["dropped"]) == (encoding, 2000, 0)
@@ -264,7 +264,7 @@ def test_export_never_overwrites_unasked_and_writes_all_or_nothing(
     assert len(read_pcd(target)["x"]) == 500
 
 
-def test_who_misspells_a_cell_is_told_which_there_are(shmmap: Shmmap) -> None:
+def test_a_misspelt_cell_is_answered_with_the_names_that_exist(shmmap: Shmmap) -> None:
     for words in (["show"], ["query", "--id"], ["pin"], ["unpin"], ["evict"]):
         done = shmmap.run(*words, "/elsewhere/20_0.pdc")
         assert done.returncode == 1, words

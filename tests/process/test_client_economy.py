@@ -32,7 +32,7 @@ def mapped(one: DaemonProcess) -> list[str]:
     return [line for line in maps if prefix in line and not line.endswith(".statistics")]
 
 
-# --- the short ways are taken -----------------------------------------------------------------------
+# --- the short paths are taken ----------------------------------------------------------------------
 
 
 def test_what_is_attached_is_not_opened_again(
@@ -52,19 +52,19 @@ def test_what_is_attached_is_not_opened_again(
 
 
 @pytest.mark.parametrize("background", [True, False])
-def test_a_window_tells_what_it_holds_by_versions_alone(
+def test_a_window_names_what_it_holds_by_versions_alone(
     daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, background: bool
 ) -> None:
-    """Eight bytes a cell: the daemon answers those requests the short way."""
+    """Eight bytes a cell: the daemon answers those requests on its short path."""
     asked: list[Differential] = []
     ask = Connection.ask
 
-    def ask_and_tell(connection: Connection, message: Any, kind: Any, **options: Any) -> Any:
+    def ask_and_record(connection: Connection, message: Any, kind: Any, **options: Any) -> Any:
         if isinstance(message, Differential):
             asked.append(message)
         return ask(connection, message, kind, **options)
 
-    monkeypatch.setattr(Connection, "ask", ask_and_tell)
+    monkeypatch.setattr(Connection, "ask", ask_and_record)
     one = daemon(divided_map.root)
     with shmmap.MapWindow(one.endpoint, 30, update_distance=0, background=background) as window:
         window.move_to(0, 0, wait=LONG_S)

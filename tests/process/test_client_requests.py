@@ -350,10 +350,10 @@ def test_a_handle_that_went_stale_is_asked_for_again(
 @BOTH
 @pytest.mark.root
 @pytest.mark.parametrize("kind", ["file", "pipe", "directory"])
-def test_a_name_that_somebody_else_took_meanwhile(
+def test_a_name_that_another_file_took_meanwhile(
     daemon: Factory, divided_map: DividedMap, late: Late, kind: str
 ) -> None:
-    """In /dev/shm everybody may make files: only what belongs to the daemon's user is its segment."""
+    """In /dev/shm every account may make files: only what belongs to the daemon's user is its segment."""
     one = daemon(divided_map.root)
     taken: list[Path] = []
 
@@ -422,14 +422,14 @@ def test_of_several_sockets_the_telling_one_is_named(
     for name in ("SHMMAP_ENDPOINT", "SHMMAP_RUNTIME_DIR", "SHMMAP_INSTANCE"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("SHMMAP_INSTANCE", "nobody")
+    monkeypatch.setenv("SHMMAP_INSTANCE", "unused")
     (tmp_path / "shmmap").mkdir()
     closed = os.path.isdir(SYSTEM_RUNTIME_DIR) and not os.access(SYSTEM_RUNTIME_DIR, os.X_OK)
     kind = SocketPermission if closed else NoSocket  # what root's daemon made there is closed to others
-    with pytest.raises(kind, match=r"nobody\.sock: (there is no socket|this user may not connect)"):
+    with pytest.raises(kind, match=r"unused\.sock: (there is no socket|this user may not connect)"):
         connect("")
     one.kill()
-    Path(one.endpoint).rename(tmp_path / "shmmap" / "nobody.sock")
+    Path(one.endpoint).rename(tmp_path / "shmmap" / "unused.sock")
     with pytest.raises(StaleSocket, match=f"{tmp_path}.*is gone"):
         connect("")
 
@@ -487,14 +487,14 @@ def test_a_request_in_flight_at_a_killed_daemon_is_answered_by_the_next(
     sent = threading.Event()
     send = Connection._send
 
-    def send_and_tell(connection: Connection, data: bytes) -> bool:
+    def send_and_record(connection: Connection, data: bytes) -> bool:
         done = send(connection, data)
         sent.set()
         return done
 
     with shmmap.connect(one.endpoint, timeout=60) as client, ThreadPoolExecutor(1) as pool:
         one.send(signal.SIGSTOP)
-        monkeypatch.setattr(Connection, "_send", send_and_tell)
+        monkeypatch.setattr(Connection, "_send", send_and_record)
         answer = pool.submit(client.around, 0, 0, 30)
         assert sent.wait(60)
         one.kill()
@@ -543,7 +543,7 @@ def test_another_major_version_is_refused(
 def test_a_request_that_no_daemon_takes_is_refused_before_it_is_sent(
     daemon: Factory, divided_map: DividedMap
 ) -> None:
-    """It would end the connection, again and again; the error names the limit, and the client goes on."""
+    """Each try would end the connection; the error names the limit, and the client goes on."""
     with shmmap.connect(daemon(divided_map.root).endpoint) as client:
         session = client.welcome.session
         for ids in (["x" * (5 << 20)], [f"{number:0100}.pcd" for number in range(45_000)]):
@@ -583,7 +583,7 @@ def test_closing_ends_the_session_unless_something_is_held(daemon: Factory, divi
         assert kept.complete
 
 
-def test_who_left_without_a_goodbye(daemon: Factory, divided_map: DividedMap) -> None:
+def test_a_client_that_left_without_a_goodbye(daemon: Factory, divided_map: DividedMap) -> None:
     """The daemon keeps no descriptor and no pose of it, and its name while the kernel says that it maps."""
     one = daemon(divided_map.root)
     with shmmap.connect(one.endpoint, name="watcher") as watcher:
@@ -605,7 +605,7 @@ def test_who_left_without_a_goodbye(daemon: Factory, divided_map: DividedMap) ->
             pass
 
 
-def test_a_client_that_nobody_closes_leaves_no_descriptor(daemon: Factory, divided_map: DividedMap) -> None:
+def test_an_unclosed_client_leaves_no_descriptor(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     before = set(open_files())
     for _ in range(3):

@@ -257,7 +257,7 @@ def test_a_jump_is_not_complete_before_it_is_answered(
         assert [window.error, window.stale_since] == [None, None]
 
 
-def test_a_vehicle_that_outruns_a_dead_daemon_is_told(daemon: Factory, divided_map: DividedMap) -> None:
+def test_a_vehicle_that_outruns_a_dead_daemon_gets_an_error(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     with shmmap.MapWindow(one.endpoint, 40, update_distance=10) as window:
         window.move_to(0, 0, wait=LONG_S)
@@ -406,7 +406,7 @@ def test_a_reload_finishes_in_a_budget_of_the_window_and_one_cell(
 # --- threads and system calls -----------------------------------------------------------------------
 
 
-def test_a_window_nobody_closes_ends_with_the_program(daemon: Factory, divided_map: DividedMap) -> None:
+def test_an_unclosed_window_ends_with_the_program(daemon: Factory, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     before = len(running)
     window = shmmap.MapWindow(one.endpoint, 30)

@@ -17,8 +17,7 @@ from shmmap_clients.scans.trajectory import matrix_of, read_trajectory
 
 import shmmap
 from shmmap.dividing.map_writer import MapWriter
-from shmmap.simulation.lidar import Lidar
-from shmmap.simulation.lidar_drive import Traffic
+from shmmap.simulation.lidar import Lidar, Traffic
 from shmmap.simulation.town import Town
 from tests.support.daemon_process import DaemonProcess
 

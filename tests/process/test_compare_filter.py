@@ -98,7 +98,7 @@ def test_a_window_gives_what_brute_force_gives(daemon: Factory, divided_map: Div
 
 
 class RestlessWindow(shmmap.MapWindow):
-    """Moves on as soon as it has answered: as one whose time has come to ask again."""
+    """Moves on as soon as it has answered, as a window does that is due to ask again."""
 
     def move_to(self, x: float, y: float, **options: Any) -> shmmap.WindowUpdate:
         update = super().move_to(x, y, **options)

@@ -99,7 +99,7 @@ def boxed_client(
 def test_a_client_in_a_container(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, tmp_path: Path
 ) -> None:
-    """It reads the same bytes, is known by the pid it has out here, and pins as anybody does."""
+    """It reads the same bytes, is known by its pid outside, and pins as any other client does."""
     one = daemon(divided_map.root)
     client = connect(one)
     with connect_client(one.endpoint) as outside:
@@ -120,7 +120,7 @@ def test_a_client_in_a_container(
             pass
 
 
-def test_a_container_that_lacks_the_segments_is_told(
+def test_a_container_that_lacks_the_segments_gets_an_error(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
 ) -> None:
     one = daemon(divided_map.root)
@@ -180,7 +180,7 @@ print(json.dumps(found))
 
 
 @pytest.mark.root
-def test_root_of_a_user_namespace_is_nobody_special(daemon: DaemonFactory, divided_map: DividedMap) -> None:
+def test_root_of_a_user_namespace_is_no_operator(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     uid, group = 61003, 61002
     one: DaemonProcess = daemon(divided_map.root, "--group", str(group), start=False)
     os.chmod(one.runtime_dir, 0o755)

@@ -36,7 +36,7 @@ CRASH = "SHMMAP_TEST_CRASH"
 
 
 class Keeper:
-    """Starts the daemon again when it was killed, as a service manager does; it then lives on."""
+    """Starts the daemon again when it was killed, as a service manager does."""
 
     def __init__(self, one: DaemonProcess) -> None:
         self.one = one

@@ -16,7 +16,7 @@ import pytest
 from shmmap import cli
 from shmmap.cli.screens import demo as demo_screen
 from shmmap.demo import live_drive
-from shmmap.demo.progress import Progress
+from shmmap.demo.program import Progress
 from tests.support.daemon_process import wait_ended
 from tests.support.demo_process import SMALL_LIVE, Demo, until
 
@@ -29,10 +29,28 @@ def test_nothing_is_lost(tmp_path: Path) -> None:
     assert (demo.process.returncode, err) == (0, "")
     report = json.loads(out)
     assert sorted(report) == [
-        "active", "active_bytes", "budget_bytes", "came_back", "chunks", "daemon_chunks", "daemon_down_s",
-        "daemon_killed_at", "differing", "evicted", "file_bytes", "length_m", "mapper_killed_at",
-        "mapper_resumed_at", "mapping_s", "max_bytes", "points", "scans", "seconds", "svg", "voxels",
-    ]  # fmt: skip
+        "active",
+        "active_bytes",
+        "budget_bytes",
+        "came_back",
+        "chunks",
+        "daemon_chunks",
+        "daemon_down_s",
+        "daemon_killed_at",
+        "differing",
+        "evicted",
+        "file_bytes",
+        "length_m",
+        "mapper_killed_at",
+        "mapper_resumed_at",
+        "mapping_s",
+        "max_bytes",
+        "points",
+        "scans",
+        "seconds",
+        "svg",
+        "voxels",
+    ]
     assert report["scans"] == 61
     assert report["differing"] == 0
     assert 0 < report["active"] < report["voxels"], "a part of the map is on disk alone"
@@ -42,7 +60,7 @@ def test_nothing_is_lost(tmp_path: Path) -> None:
     assert report["daemon_killed_at"] == 40
     assert report["daemon_chunks"] > 0, "those that were in memory"
     assert report["mapper_killed_at"] == 20
-    assert report["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been on their way"
+    assert report["mapper_resumed_at"] in (18, 19, 20, 21), "three scans may have been in flight"
     picture = ElementTree.parse(report["svg"]).getroot()
     text = " ".join(element.text or "" for element in picture.iter(f"{SVG}text"))
     for word in ("61 scans", "height", "on disk only", "sensor's path", "active cells"):
@@ -66,7 +84,7 @@ def test_an_interrupted_drive_leaves_nothing(tmp_path: Path, stage: str) -> None
     assert [path.name for path in tmp_path.iterdir()] == ["tmp"], "no picture of half a drive"
 
 
-def test_a_voxel_that_differs_is_told(
+def test_a_voxel_that_differs_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The mapping program gets another scan than the map without bounds had."""

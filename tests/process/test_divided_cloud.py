@@ -72,7 +72,7 @@ def frame(cell: Path) -> list[float]:
 
 
 def divisions(one: DaemonProcess) -> int:
-    """How often it divided a cloud, in all its lives."""
+    """Count how often the daemon divided a cloud, in all its runs."""
     return len(re.findall(r"dividing cloud=\S+ into=", one.log))
 
 

@@ -19,7 +19,7 @@ import pytest
 
 import shmmap
 from tests.process.conftest import DaemonFactory
-from tests.support.accounts import STRANGER
+from tests.support.accounts import OTHER_USER
 from tests.support.command_line import doctor, publish
 from tests.support.compiled_programs import built_preload
 from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
@@ -224,7 +224,7 @@ def test_no_other_address_is_asked(
 
 
 @pytest.mark.root
-def test_another_account_is_told_what_it_cannot_see(
+def test_another_account_learns_what_it_cannot_see(
     bucket: DaemonProcess, web: FaultyWeb, tmp_path: Path
 ) -> None:
     until_row(bucket, "versions", "is served")
@@ -238,15 +238,17 @@ def test_another_account_is_told_what_it_cannot_see(
         "import shmmap.cli.verbs.look.monitors, shmmap.doctor.checks, shmmap.client.client\n"
         "import shmmap.client.discovery\n"
         "import shmmap.client.event_stream, shmmap.daemon.config, msgspec, shmmap.service.program\n"
-        f"os.setgroups([]); os.setgid({STRANGER}); os.setuid({STRANGER})\n"
+        f"os.setgroups([]); os.setgid({OTHER_USER}); os.setuid({OTHER_USER})\n"
         "sys.exit(main(sys.argv[1:]))"
     )
     words = ["--instance", bucket.instance, "--runtime-dir", bucket.runtime_dir, "--shm-dir", bucket.shm_dir]
     done = subprocess.run(
         [sys.executable, "-c", program, "doctor", "--json", *words],
-        cwd="/", env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": "/nonexistent"},
-        capture_output=True, text=True,
-    )  # fmt: skip
+        cwd="/",
+        env={"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": "/nonexistent"},
+        capture_output=True,
+        text=True,
+    )
     assert done.stdout, done.stderr
     found = {one["name"]: one for one in json.loads(done.stdout)["findings"]}
     said = found["credentials"]["fact"] + found["link"]["fact"]

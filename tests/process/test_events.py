@@ -61,7 +61,7 @@ def kinds(found: list[Any]) -> list[str]:
     return [type(happening).__name__.lower() for happening in found]
 
 
-def test_what_happens_is_told_in_order(
+def test_events_come_in_order(
     daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
@@ -116,7 +116,7 @@ def test_retries_and_pressure(
     assert pressure.refused >= 1
 
 
-def test_the_stream_goes_on_in_the_next_life(
+def test_the_stream_goes_on_in_the_next_run(
     daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
@@ -178,7 +178,7 @@ sys.stdin.read()
 """
 
 
-def test_a_stopped_listener_delays_nobody(
+def test_a_stopped_listener_delays_no_other(
     daemon: DaemonFactory, connect: Connect, listen: Listen, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)

@@ -36,7 +36,7 @@ def test_a_program_ends_quietly(one: DaemonProcess, scene: str) -> None:
     assert end_often(one.endpoint, *SCENES[scene], EXITS) == Ends(0, 0, 0, "")
 
 
-def test_nobody_waits_for_the_answer_of_a_daemon_that_stands_still(one: DaemonProcess) -> None:
+def test_no_client_waits_for_the_answer_of_a_stopped_daemon(one: DaemonProcess) -> None:
     setup = (
         "import os, signal; client = shmmap.connect(endpoint, timeout=600)\n"
         "os.kill(client.welcome.pid, signal.SIGSTOP)"

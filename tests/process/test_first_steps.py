@@ -61,7 +61,7 @@ class Newcomer:
     ----------
     typed
         Commands that led here.
-    told
+    printed
         What the last of them printed.
     service
         What stands for ``/opt/shmmap``.

@@ -90,7 +90,7 @@ class Expected:
         return self._content[name]
 
     def change(self, seed: int, near: Pose) -> None:
-        """Change two cells, delete one and add one close to where everybody is."""
+        """Change two cells, delete one and add one close to all clients."""
         rng = np.random.default_rng(seed)
         around = self.made.in_circle(*near, 30.0)
         for name in around[:2]:
@@ -136,7 +136,7 @@ def follow(
             assert {row[0] for row in seen["held"]} == {made.id(name) for name in wanted}, step
             for cell_id, version, *content in seen["new"]:
                 assert tuple(content) == expected.content(cell_id.rsplit("/", 1)[1])
-                assert versions.setdefault(cell_id, version) == version  # the same for everybody
+                assert versions.setdefault(cell_id, version) == version  # the same for all clients
         held = wanted
     for client in clients:
         if isinstance(client, CppFollower):

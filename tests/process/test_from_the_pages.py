@@ -102,7 +102,7 @@ def test_a_path_too_long_for_a_socket() -> None:
         candidates("/" + "x" * int(most), {})
 
 
-def test_the_next_path_where_nobody_listens(served: DaemonProcess, plain: Plain, tmp_path: Path) -> None:
+def test_the_next_path_where_no_daemon_listens(served: DaemonProcess, plain: Plain, tmp_path: Path) -> None:
     ended = tmp_path / "ended.sock"
     code = "import socket, sys; socket.socket(socket.AF_UNIX).bind(sys.argv[1])"
     subprocess.run([sys.executable, "-c", code, str(ended)], check=True)
@@ -165,7 +165,7 @@ def test_ping(served: DaemonProcess, plain: Plain) -> None:
         pytest.param(b"\x04\x06\x05READY", id="a ready without a type"),
     ],
 )
-def test_who_breaks_the_rules_is_disconnected(served: DaemonProcess, wrong: bytes) -> None:
+def test_a_peer_that_breaks_the_rules_is_disconnected(served: DaemonProcess, wrong: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as one:
         one.settimeout(30.0)
         one.connect(served.endpoint)
@@ -423,7 +423,7 @@ def test_a_session_goes_on_after_a_restart(
     mapping.close()
 
 
-def test_bye_is_heard_before_the_connection_ends(served: DaemonProcess, plain: Plain) -> None:
+def test_bye_arrives_before_the_connection_ends(served: DaemonProcess, plain: Plain) -> None:
     one, watcher = plain(served), plain(served)
     session = one.session
     one.send("bye")
@@ -505,7 +505,7 @@ print(status, before > 0, one.ask("stats")[5][0][13])
 """
 
 
-def test_after_a_fork_both_have_it_until_both_let_go(served: DaemonProcess) -> None:
+def test_after_a_fork_both_hold_it_until_both_release_it(served: DaemonProcess) -> None:
     """Under the parent's session, as the kernel reports it."""
     done = subprocess.run(
         [sys.executable, "-c", FORKING, served.endpoint],

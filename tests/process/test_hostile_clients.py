@@ -79,9 +79,9 @@ def test_bytes_that_are_no_zeromq(daemon: DaemonFactory, connect: Connect, divid
     rng = random.Random(4)
     before = descriptors(one.pid)
     for _ in range(20):
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger:
-            stranger.connect(one.endpoint)
-            stranger.send(rng.randbytes(rng.randrange(1, 500)))
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+            other.connect(one.endpoint)
+            other.send(rng.randbytes(rng.randrange(1, 500)))
     for _ in range(50):
         assert len(client.area(circle(0, 0, 5)).cells) == 4
     waiting = Deadline()
@@ -353,7 +353,9 @@ done()
         pass
 
 
-def test_replies_that_nobody_reads(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_replies_that_are_never_read(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
     one = daemon(divided_map.root)
     client = connect(one)
     client.area(circle(0, 0, 500))
@@ -488,7 +490,7 @@ def member_with_locks(one: DaemonProcess) -> Iterator[dict[str, Any]]:
 
 
 @pytest.mark.root
-def test_locks_hold_nobody_up(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_locks_hold_up_no_client(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     one: DaemonProcess = daemon(divided_map.root, "--group", str(GROUP), start=False)
     os.chmod(one.runtime_dir, 0o755)
     os.chmod(one.shm_dir, 0o1777)

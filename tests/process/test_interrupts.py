@@ -112,7 +112,7 @@ def holdings(one: DaemonProcess) -> tuple[int, int, int]:
 
 
 def interrupted_everywhere(work: Callable[[], object], check: Callable[[int], None]) -> int:
-    """Do the work again and again, interrupted at one place more each time; returns how many there are."""
+    """Repeat the work, each time interrupted at the next place; returns the number of places."""
     number, tracing = 0, sys.gettrace()
     done = False
     while not done:
@@ -237,7 +237,7 @@ OPENS: dict[str, Callable[[str], Any]] = {
 
 
 @pytest.mark.parametrize("what", OPENS)
-def test_threads_that_begin_when_nobody_wants_them_any_more(
+def test_threads_that_begin_after_the_client_has_closed(
     daemon: Factory, divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """On a busy machine that may be after the next connection, and no other may come."""

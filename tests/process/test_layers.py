@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computed layers from a daemon: built once, of the right points, named in one way, in no other's way."""
+"""Computed layers from a daemon: built once, of the right points, under one name, without delay to others."""
 
 from __future__ import annotations
 

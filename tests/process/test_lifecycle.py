@@ -269,7 +269,7 @@ def test_a_stale_socket_is_no_hindrance(
     assert len(connect(one).area(circle(0, 0, 5)).cells) == 4
 
 
-def test_strangers_segments_are_left_alone(
+def test_foreign_segments_are_left_alone(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Leftovers of this instance go, damaged ones included; other files stay."""
@@ -292,7 +292,7 @@ def test_strangers_segments_are_left_alone(
 def test_directories_are_named_from_where_the_daemon_was_started(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path
 ) -> None:
-    """Its loaders and its clients, who are elsewhere, mean the same ones."""
+    """Its loaders and its clients, in other directories, mean the same ones."""
     one = daemon(divided_map.root, start=False, forked=False)
     one.command = ["env", "-C", str(tmp_path)]
     one.arguments = ["--shm-dir", os.path.relpath(one.shm_dir, tmp_path), "--cache-dir", "cache"]

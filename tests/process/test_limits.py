@@ -23,7 +23,7 @@ from shmmap.daemon.prerequisites import access_of_segments
 from shmmap.errors import ConfigError, LimitReached
 from shmmap.segment.process_limits import check_files, check_threads
 from shmmap.statistics.reader import read_statistics
-from shmmap.testing.environment import without_settings
+from shmmap.testing.daemon_process import without_settings
 from tests.process.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap, make_map, random_points
@@ -93,7 +93,7 @@ def test_a_segment_that_the_limit_on_files_forbids(daemon: Factory, divided_map:
         assert len(cells) == 4
 
 
-def test_statistics_that_cannot_be_written_end_nobody(
+def test_statistics_that_cannot_be_written_end_no_process(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """The limit lies before the counters and behind all that the log gets."""
@@ -370,7 +370,7 @@ def mapped(shm_dir):
 client = shmmap.connect(sys.argv[1], timeout=60)
 before = len(os.listdir("/proc/self/fd"))
 cells = client.area(shmmap.Box(-1e4, -1e4, 1e4, 1e4), wait=300)
-told = {
+found = {
     "complete": cells.complete,
     "cells": len(cells),
     "points": int(sum(len(cell.xyz) for cell in cells)),
@@ -378,7 +378,7 @@ told = {
     "more_files": len(os.listdir("/proc/self/fd")) - before,
     "mapped": mapped(client.welcome.shm_dir),
 }
-print(json.dumps(told), flush=True)
+print(json.dumps(found), flush=True)
 sys.stdin.readline()
 del cells
 gc.collect()

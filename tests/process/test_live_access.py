@@ -25,7 +25,7 @@ from tests.support.accounts import (
     DAEMON_UID,
     GROUP,
     MEMBER,
-    STRANGER,
+    OTHER_USER,
     as_user,
     python_for_others,
 )
@@ -127,23 +127,23 @@ def settled(live: LiveMap, scan: int) -> ChunkInfo:
 
 
 def test_members_of_the_mappers_group_map_and_readers_read(service: LiveService) -> None:
-    """Whatever a mapper's umask is, and with nobody being root but the daemon."""
+    """Whatever a mapper's umask is, and with no process but the daemon as root."""
     one = service()
     assert as_client(MEMBER, [MAPPERS, GROUP], one.endpoint, "map") == SCANS
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
         assert held(live) == reference(drive(SCANS))
         assert f"{MEMBER}/front" in live.status().mappers
-        assert as_client(STRANGER, [GROUP], one.endpoint, "map") == "not_permitted"
+        assert as_client(OTHER_USER, [GROUP], one.endpoint, "map") == "not_permitted"
         settled(live, 0)
         near = held(live, "memory")
         assert near
-        assert as_client(STRANGER, [GROUP], one.endpoint, "read") == [len(near), *[sum(near.values())] * 2]
-        assert isinstance(as_client(STRANGER, [STRANGER], one.endpoint, "read"), str), "an error"
-        assert held(live) == reference(drive(SCANS)), "nobody has changed anything"
+        assert as_client(OTHER_USER, [GROUP], one.endpoint, "read") == [len(near), *[sum(near.values())] * 2]
+        assert isinstance(as_client(OTHER_USER, [OTHER_USER], one.endpoint, "read"), str), "an error"
+        assert held(live) == reference(drive(SCANS)), "no client has changed anything"
 
 
-def test_nobody_else_changes_what_is_in_memory(service: LiveService) -> None:
+def test_no_other_account_changes_what_is_in_memory(service: LiveService) -> None:
     one = service()
     with shmmap.connect(one.endpoint) as client:
         live = client.live("lidar")
@@ -159,8 +159,8 @@ def test_nobody_else_changes_what_is_in_memory(service: LiveService) -> None:
         assert found.pop("read") == 0
         assert 0 not in found.values(), found
         for target, uid, gid in (
-            (path, STRANGER, STRANGER), (path, MEMBER, MAPPERS), (undo, MEMBER, GROUP),
-            (undo, MEMBER, MAPPERS), (undo, STRANGER, STRANGER),
+            (path, OTHER_USER, OTHER_USER), (path, MEMBER, MAPPERS), (undo, MEMBER, GROUP),
+            (undo, MEMBER, MAPPERS), (undo, OTHER_USER, OTHER_USER),
         ):  # fmt: skip
             found = attempts(target, uid, gid)
             assert 0 not in found.values(), (target, found)
@@ -175,17 +175,17 @@ def test_mappers_cannot_touch_each_other_s_marks(service: LiveService) -> None:
     assert make.returncode == 0, make.stderr
     path = f"{marks}/1a.5"
     assert os.stat(path).st_uid == MEMBER
-    found = attempts(path, STRANGER, MAPPERS)
+    found = attempts(path, OTHER_USER, MAPPERS)
     assert found.pop("read") == 0, "what they saw is no secret among mappers"
     assert 0 not in found.values(), found
-    assert 0 not in attempts(path, STRANGER, GROUP).values()
-    assert as_user(STRANGER, GROUP, "ls", marks).returncode != 0
-    assert as_user(STRANGER, GROUP, "touch", f"{marks}/1b.1").returncode != 0
+    assert 0 not in attempts(path, OTHER_USER, GROUP).values()
+    assert as_user(OTHER_USER, GROUP, "ls", marks).returncode != 0
+    assert as_user(OTHER_USER, GROUP, "touch", f"{marks}/1b.1").returncode != 0
     assert as_user(MEMBER, MAPPERS, "rmdir", marks).returncode != 0
     assert Path(path).read_text() == "mine\n"
 
 
-def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) -> None:
+def test_names_that_others_took_do_not_keep_a_daemon_from_starting(service: LiveService) -> None:
     """Where all may make files they may make any, before the daemon comes: those are left alone."""
     one = service()
     with shmmap.connect(one.endpoint) as client:
@@ -201,7 +201,7 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
     theirs = [f"{start}.0_0_0.99999999999", f"{start}.1_1_1.5", f"{start}.voxels.0123456789abcdef"]
     for path in theirs:
         Path(path).write_bytes(content)
-        os.chown(path, STRANGER, -1)
+        os.chown(path, OTHER_USER, -1)
     one.start()
     with shmmap.connect(one.endpoint) as client:
         assert held(client.live("lidar")) == before
@@ -213,11 +213,11 @@ def test_names_that_others_took_keep_nobody_from_starting(service: LiveService) 
         Path(path).unlink(missing_ok=True)
     undo = Path(f"{start}.undo")
     undo.write_bytes(bytes(1000))
-    os.chown(undo, STRANGER, -1)
+    os.chown(undo, OTHER_USER, -1)
     one.start()
     with shmmap.connect(one.endpoint) as client:
         (row,) = client.live_maps()
-        assert row.problem, "what it would be put back from is somebody else's"
+        assert row.problem, "the undo record belongs to another account"
         assert f"{undo} is not a file of this user" in row.problem or "Permission denied" in row.problem
         undo.unlink(missing_ok=True)  # root removes it itself
         waiting = Deadline()
@@ -268,6 +268,6 @@ def test_a_daemon_without_privileges_keeps_live_maps(service: LiveService) -> No
         pytest.skip("this Python and its packages cannot be read by other accounts")
     one = service(uid=DAEMON_UID)
     assert as_client(MEMBER, [MAPPERS, GROUP], one.endpoint, "map") == SCANS
-    assert as_client(STRANGER, [GROUP], one.endpoint, "map") == "not_permitted"
+    assert as_client(OTHER_USER, [GROUP], one.endpoint, "map") == "not_permitted"
     with shmmap.connect(one.endpoint) as client:
         assert held(client.live("lidar")) == reference(drive(SCANS))

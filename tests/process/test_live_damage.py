@@ -210,7 +210,7 @@ def hang() -> Iterator[Callable[[Path], HangingDirectory]]:
 
 
 @pytest.mark.root
-def test_a_directory_that_hangs_keeps_nobody_waiting(
+def test_a_directory_that_hangs_keeps_no_client_waiting(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, hang: Callable[[Path], HangingDirectory]
 ) -> None:
     """From the start on: points and other maps are served, the daemon ends, and it comes back by itself."""
@@ -319,7 +319,7 @@ def test_a_directory_that_is_moved_or_replaced(live_daemon: LiveDaemon, tmp_path
 
 
 def test_arguments_that_make_no_sense_end_no_mapper(live_daemon: LiveDaemon) -> None:
-    """Each is refused before anything is sent, with an error of ours; the mapper and the reader live on."""
+    """Each is refused before anything is sent, with an error of ours; the mapper and the reader go on."""
     one, scans = live_daemon(), drive(2)
     nan, nothing = float("nan"), cast("Any", None)
     with shmmap.connect(one.endpoint, timeout=60.0) as client:

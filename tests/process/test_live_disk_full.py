@@ -48,5 +48,5 @@ def test_a_disk_that_is_full(
         status = live.status()
         assert (status.problem, status.dirty, status.saving) == ("", 0, 0)
         assert held(live, "disk") == reference([*scans, scans[0]])
-    assert one.log.count("chunk not saved") < 20, "it is tried again and again, and logged once"
+    assert one.log.count("chunk not saved") < 20, "it is retried each second, and logged once"
     assert one.stop() == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mapper, worker and daemon are killed at random times, again and again: every scan is there, once.
+"""Mapper, worker and daemon are killed at random times, many times: every scan is there, once.
 
 ``SHMMAP_TEST_KILLS=150`` has them killed as often as that.  The same without the undo record:
 ``tests/unit/chunks/test_applying.py``.
@@ -35,18 +35,16 @@ LONGEST_S = 0.03
 
 
 class Mapper:
-    """The mapper's process, and what it said in all its lives."""
+    """The mapper's process, restarted after each kill, and what it has said."""
 
     def __init__(self, endpoint: str, last: int) -> None:
         self.endpoint, self.last = endpoint, last
         self.applied = 0
-        self.lives = 0
         self.done = False
         self.start()
 
     def start(self) -> None:
         """Begin with what has no answer."""
-        self.lives += 1
         self._process = subprocess.Popen(
             [
                 sys.executable, "-m", "tests.support.live_mapper", self.endpoint, str(self.applied + 1),
@@ -63,23 +61,23 @@ class Mapper:
         elif line:
             self.done = line == "done\n"
 
-    def hear(self, seconds: float) -> bool:
-        """Hear what it says for some time; whether it said anything."""
+    def listen(self, seconds: float) -> bool:
+        """Read what it says for ``seconds``; returns whether it said anything."""
         assert self._process.stdout is not None
-        heard, end_s = False, time.monotonic() + seconds
+        said, end_s = False, time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0 and not self.done:
             if select.select([self._process.stdout], [], [], left_s)[0]:
                 line = self._process.stdout.readline()
                 assert line, f"the mapper ended with {self._process.wait()}"
                 self._take(line)
-                heard = True
-        return heard
+                said = True
+        return said
 
     def until(self, number: int) -> None:
-        """Hear until that many scans are applied."""
+        """Listen until that many scans are applied."""
         waiting = Deadline()
         while waiting(self.applied < number and not self.done):
-            self.hear(0.05)
+            self.listen(0.05)
 
     def kill(self) -> None:
         """SIGKILL it; what it said before counts."""
@@ -127,24 +125,24 @@ def test_whoever_is_killed_whenever(keep: Callable[[], DaemonProcess]) -> None:
     order = [name for name in killed for _ in range(-(-KILLS // 3))]
     rng.shuffle(order)
     try:
-        for who in order[:KILLS]:
+        for name in order[:KILLS]:
             mapper.until(mapper.applied + rng.randint(1, SCANS_A_KILL // 2))
-            mapper.hear(rng.uniform(0.0, LONGEST_S))
+            mapper.listen(rng.uniform(0.0, LONGEST_S))
             if mapper.done:
                 break
-            if who == "mapper":
+            if name == "mapper":
                 mapper.kill()
                 if not mapper.done:
                     mapper.start()
-            elif who == "daemon":
+            elif name == "daemon":
                 one.kill()
                 one.start()
             elif (pid := worker_of(one)) is not None:
                 os.kill(pid, signal.SIGKILL)
-            killed[who] += 1
+            killed[name] += 1
         waiting = Deadline()
         while waiting(not mapper.done):
-            if mapper.hear(1.0):
+            if mapper.listen(1.0):
                 waiting = Deadline()
     finally:
         mapper.end()

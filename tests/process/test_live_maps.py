@@ -64,8 +64,8 @@ def test_a_drive_is_mapped_as_the_slow_reference_says(live_daemon: LiveDaemon) -
         ends = origin + np.random.default_rng(3).uniform(-8.0, 8.0, (200, 3))
         for end, distance in zip(ends, live.first_hits(origin, ends), strict=True):
             first, last = (tuple(np.floor(p * (1 / RESOLUTION)).astype(int).tolist()) for p in (origin, end))
-            way = [*walk(first, last), last]
-            hit = next((voxel for voxel in way if expected.get(voxel, 0) > 0), None)
+            path = [*walk(first, last), last]
+            hit = next((voxel for voxel in path if expected.get(voxel, 0) > 0), None)
             if hit is None:
                 assert distance == np.inf
             else:
@@ -174,7 +174,7 @@ def test_a_daemon_killed_again_and_again_loses_nothing(live_daemon: LiveDaemon) 
             assert held(live) == reference(scans)
 
 
-def test_a_killed_mapper_goes_on_with_numbers_that_nobody_had(live_daemon: LiveDaemon) -> None:
+def test_a_killed_mapper_goes_on_with_unused_numbers(live_daemon: LiveDaemon) -> None:
     one = live_daemon()
     scans = drive(4)
     with shmmap.connect(one.endpoint) as client:
@@ -307,7 +307,7 @@ def test_requests_that_wait_when_the_worker_dies_are_refused(live_daemon: LiveDa
             waiting = Deadline()
             while waiting(len([row for row in second.stats().sessions if row.requests > 1]) < 1):
                 pass
-            assert second.metadata() is not None  # nobody else waits for the worker
+            assert second.metadata() is not None  # no other client waits for the worker
         os.kill(worker, signal.SIGKILL)
         thread.join()
         assert len(refused) == 1

@@ -52,11 +52,11 @@ def until(stream: EventStream, wanted: Callable[[Any], bool]) -> Any:
             return happening
 
 
-def after(one: DaemonProcess, told: Callable[[LiveMapRow], bool]) -> LiveMapRow:
-    """Wait until the statistics tell this of the live map."""
+def after(one: DaemonProcess, wanted: Callable[[LiveMapRow], bool]) -> LiveMapRow:
+    """Wait until the live map's row in the statistics is as wanted."""
     waiting = Deadline()
     with StatisticsReader(one.instance, one.shm_dir) as reader:
-        while waiting(not (rows := reader.snapshot(cells=False).live) or not told(rows[0])):
+        while waiting(not (rows := reader.snapshot(cells=False).live) or not wanted(rows[0])):
             os.sched_yield()
     return rows[0]
 
@@ -82,9 +82,9 @@ def test_what_operators_see(live_daemon: LiveDaemon, tmp_path: Path) -> None:
         row = after(one, lambda row: row.durable == 3 and row.chunks > 0 and not row.unsaved + row.loading)
         assert (row.name, row.scans, row.mapper_count, row.budget_bytes) == ("lidar", 3, 1, 16 << 20)
         assert [name.partition("/")[2] for name in row.mappers] == ["front"]
-        (told,) = shmmap.json("status")["live"]
-        assert tuple(told) == row.__struct_fields__ == tuple(shmmap.json("top")["live"][0])
-        assert {name: told[name] for name in ("name", "scans", "problem")} == {
+        (found,) = shmmap.json("status")["live"]
+        assert tuple(found) == row.__struct_fields__ == tuple(shmmap.json("top")["live"][0])
+        assert {name: found[name] for name in ("name", "scans", "problem")} == {
             "name": "lidar", "scans": 3, "problem": "",
         }  # fmt: skip
         said = r"^live lidar +[\d,]+ chunks, .* of 16\.0 MiB, [\d,]+ known voxels, all saved$"
@@ -122,7 +122,7 @@ def test_without_live_maps_nothing_is_said(
         assert "live" not in shmmap(verb).split()
 
 
-def test_events_tell_of_changes_and_of_the_worker(
+def test_events_report_changes_and_the_worker_s_end(
     live_daemon: LiveDaemon, listen: Callable[[DaemonProcess], EventStream], tmp_path: Path
 ) -> None:
     one = live_daemon()

@@ -27,7 +27,7 @@ from tests.support.segment_reader import assert_same_points, read_segment
 Connect = Callable[..., RawClient]
 
 
-def test_one_load_for_many_who_ask(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_one_load_for_many_clients(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
     one = daemon(divided_map.root)
     clients = [connect(one) for _ in range(8)]
     requests = [client.send("area", circle(0, 0, 60), ["points"], 30.0) for client in clients]
@@ -40,7 +40,7 @@ def test_one_load_for_many_who_ask(daemon: DaemonFactory, connect: Connect, divi
     assert counters["loads_started"] == counters["loads_finished"] == len(wanted)
 
 
-def test_a_cold_request_delays_nobody_s_warm_one(
+def test_a_cold_request_delays_no_warm_one(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """The loaders stand still, so the cold request cannot be answered: warm ones are."""
@@ -58,8 +58,8 @@ def test_a_cold_request_delays_nobody_s_warm_one(
     assert len(cold.cells_reply(cold.wait_for(request)).cells) == 4
 
 
-def test_patience_ends(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    """Who waits for a while gets what there is by then."""
+def test_a_wait_ends_at_its_timeout(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+    """A client that waits for a while gets what is loaded by then."""
     one = daemon(divided_map.root, "--workers", "1")
     client = connect(one)
     client.area(circle(0, 0, 5))
@@ -147,7 +147,7 @@ def test_the_loaders_parent_is_killed(
 
 
 def test_a_pipe_instead_of_a_file(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
-    """Opening it would wait for ever."""
+    """Opening it would wait without bound."""
     one = daemon(divided_map.root, "--load-timeout", "4")
     path = divided_map.pcd_dir / "0_0.pcd"
     path.unlink()
@@ -247,7 +247,7 @@ def test_a_bad_file_is_reported_and_retried_when_it_is_whole(
     assert len(reply.cells) == 4
 
 
-# --- every odd or bad file as a cell of a served map: its own outcome, and no harm to anybody else ---
+# --- every odd or bad file as a cell of a served map: its own outcome, and no harm to other cells ----
 
 
 def serve(
@@ -367,7 +367,7 @@ def test_files_made_here(daemon: DaemonFactory, connect: Connect, tmp_path: Path
 
 @pytest.mark.parametrize("seed", range(3))
 def test_mutated_files(daemon: DaemonFactory, connect: Connect, tmp_path: Path, seed: int) -> None:
-    """Bytes changed, cut, repeated at random: a cell or a refusal, the daemon and its loader live."""
+    """Bytes changed, cut, repeated at random: a cell or a refusal, the daemon and its loader go on."""
     made = make_map(tmp_path / "map", columns=2, rows=2)
     rng = np.random.default_rng(seed)
     shutil.copy(made.pcd_dir / "0_0.pcd", tmp_path / "seed.pcd")
@@ -413,7 +413,7 @@ def test_names_that_no_client_could_say(daemon: DaemonFactory, connect: Connect,
     assert "Stra\\xdfe.pcd" in "\n".join(reloaded[6])
 
 
-# --- unexpected exceptions: the daemon goes on; if one comes again and again, its next run does
+# --- unexpected exceptions: the daemon goes on; if one comes repeatedly, its next run does
 
 
 def test_the_daemon_goes_on(

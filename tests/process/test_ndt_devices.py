@@ -49,28 +49,28 @@ def test_a_drive_is_followed_on_a_device_as_without(
     drive: TownDrive, daemon: DaemonFactory, tmp_path: Path
 ) -> None:
     one = daemon(drive.map_dir)
-    ways = {"numba": [], "copy": ["--memory", "copy"], "svm": ["--memory", "svm"]}
+    variants = {"numba": [], "copy": ["--memory", "copy"], "svm": ["--memory", "svm"]}
     found = {}
-    for way, options in ways.items():
-        backend = [] if way == "numba" else ["--backend", "opencl", *options]
-        lines = tmp_path / f"{way}.jsonl"
+    for variant, options in variants.items():
+        backend = [] if variant == "numba" else ["--backend", "opencl", *options]
+        lines = tmp_path / f"{variant}.jsonl"
         code, summary, err = run(*NDT, *follow(drive, one, lines), *backend)
         assert code == 0, err
         assert summary["trustworthy"] == 12
-        assert summary["backend"] == ("numba" if way == "numba" else "opencl")
+        assert summary["backend"] == ("numba" if variant == "numba" else "opencl")
         assert summary["fault"] is None
         assert summary["map_updates"] >= 1
         assert 0.0 < summary["map_prepare_ms"]["max"] <= summary["map_build_ms"]["max"]
-        if way == "copy":
+        if variant == "copy":
             # with --fine a map is prepared twice: with its cells, and with another kind of covariance
             assert summary["map_writes"] >= 2
             assert summary["map_written_bytes"] > 100_000
         else:
             assert summary["map_writes"] == summary["map_written_bytes"] == 0
         assert summary["map_laid_out_again"] == 0
-        found[way] = poses(lines)
-    for way in ("copy", "svm"):
-        np.testing.assert_allclose(found[way], found["numba"], atol=1e-9)
+        found[variant] = poses(lines)
+    for variant in ("copy", "svm"):
+        np.testing.assert_allclose(found[variant], found["numba"], atol=1e-9)
 
 
 def test_a_drive_goes_on_without_a_device_that_hangs(

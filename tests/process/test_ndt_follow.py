@@ -221,7 +221,7 @@ def test_a_map_that_is_long_in_coming_is_waited_for(drive: TownDrive, daemon: Da
 def test_the_daemon_fetches_what_lies_ahead(
     drive: TownDrive, daemon: DaemonFactory, route: tuple[tuple[float, float], ...], ahead_m: float
 ) -> None:
-    """Far along a route, a little way without one; also while the vehicle's map is only kept current."""
+    """Far along a route, a short distance without one; also while the vehicle's map is only kept current."""
     one = daemon(drive.map_dir)
     rules = MapRules(update_distance=10.0, map_radius=30.0, lidar_radius=15.0)
     x, y = 25.0, 125.0

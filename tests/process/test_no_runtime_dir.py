@@ -95,11 +95,11 @@ def test_what_is_not_one_s_own_is_refused(
     readable_map: DividedMap, tmp_path: Path, place: Path, what: str
 ) -> None:
     """By the daemon; clients pass it over, and `doctor` says what `serve` would say."""
-    aside = tmp_path / "aside"
-    aside.mkdir()
-    os.chown(aside, UID, UID)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    os.chown(elsewhere, UID, UID)
     if what == "a link":
-        place.symlink_to(aside)
+        place.symlink_to(elsewhere)
     elif what == "a file":
         place.touch()
     else:
@@ -111,7 +111,7 @@ def test_what_is_not_one_s_own_is_refused(
     assert done.returncode == 71, done.stderr
     assert f"runtime directory {place}: " in done.stderr
     assert "--runtime-dir" in done.stderr
-    assert list(aside.iterdir()) == []
+    assert list(elsewhere.iterdir()) == []
     done = ask(tmp_path, "doctor")
     assert f"{place}: " in done.stdout
     done = ask(tmp_path, "query", "--circle", "0,0,5")

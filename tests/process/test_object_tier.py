@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.accounts import MEMBER, STRANGER
+from tests.support.accounts import MEMBER, OTHER_USER
 from tests.support.daemon_process import ROOT
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
@@ -179,7 +179,7 @@ def test_two_accounts_do_not_share(tmp_path: Path) -> None:
 
     assert run(MEMBER) == ["False True True", ""]
     assert run(MEMBER) == ["True True True", ""]
-    found, why = run(STRANGER)
+    found, why = run(OTHER_USER)
     assert found == "False False False"
-    assert f"belongs to user {MEMBER}, not to user {STRANGER}" in why
+    assert f"belongs to user {MEMBER}, not to user {OTHER_USER}" in why
     assert run(MEMBER) == ["True True True", ""]

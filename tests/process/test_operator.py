@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Somebody who knows Linux, but not shmmap, finds out from the command line alone what they have to know."""
+"""An operator who knows Linux, but not shmmap, learns all they need from the command line alone."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from tests.support.divided_map import DividedMap, make_map
 DEADLINE_S = 60.0
 
 
-def after(shmmap: Shmmap, told: Callable[[dict[str, int]], bool]) -> dict[str, int]:
-    """Wait for a beat that tells this; returns its counters."""
+def after(shmmap: Shmmap, wanted: Callable[[dict[str, int]], bool]) -> dict[str, int]:
+    """Wait until the counters are as wanted; returns them."""
     waiting = Deadline()
     with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
-        while waiting(not told(reader.snapshot(tables=False).counters)):
+        while waiting(not wanted(reader.snapshot(tables=False).counters)):
             os.sched_yield()
         return reader.snapshot(tables=False).counters
 
 
 def until_shown(shmmap: Shmmap, count: int) -> None:
-    """Wait until the table of what is in memory has so many rows: it follows what happens a little later."""
+    """Wait until the table of resident cells has ``count`` rows: it lags a little behind."""
     waiting = Deadline()
     with StatisticsReader(shmmap.daemon.instance, shmmap.daemon.shm_dir) as reader:
         while waiting(len(reader.snapshot().cells) < count):
@@ -69,7 +69,7 @@ def test_six_questions(tight: Shmmap) -> None:
         held = client.around(0.0, 0.0, radius=25.0, wait=20.0)
         cells = len(held)
         assert cells
-        after(tight, lambda told: told["segments_pinned"] == cells and told["sessions"] == 1)
+        after(tight, lambda seen: seen["segments_pinned"] == cells and seen["sessions"] == 1)
 
         # is it healthy?
         assert tight("health").startswith("healthy: pid ")
@@ -83,7 +83,7 @@ def test_six_questions(tight: Shmmap) -> None:
         near = tight.json("query", "--circle", "5,5,1", "--wait", "none")
         assert [cell["box"] for cell in near["cells"]] == [[0.0, 0.0, 20.0, 20.0]]
 
-        # who holds memory?
+        # which client holds memory?
         (row,) = [line for line in tight("top").splitlines() if line.startswith("localization")]
         assert str(os.getpid()) in row
         assert re.search(r"\d+(\.\d)? KiB", row)
@@ -97,13 +97,13 @@ def test_six_questions(tight: Shmmap) -> None:
         assert "localization" in partial.stdout
 
         # what changed in the last minute?
-        told = tight("tail")
-        assert re.search(r"^\d\d:\d\d:\d\d\.\d{3}  joined    localization, pid ", told, re.MULTILINE)
-        assert re.search(r"loaded    0_0\.pcd points ", told)
-        assert re.search(r"pressure  [\d,]+ cells? refused, .* of 1\.0 MiB used, .* in use by clients", told)
+        tail = tight("tail")
+        assert re.search(r"^\d\d:\d\d:\d\d\.\d{3}  joined    localization, pid ", tail, re.MULTILINE)
+        assert re.search(r"loaded    0_0\.pcd points ", tail)
+        assert re.search(r"pressure  [\d,]+ cells? refused, .* of 1\.0 MiB used, .* in use by clients", tail)
 
         # is the cache too small?
-        after(tight, lambda told: told["refused_over_budget_10min"] > 0)
+        after(tight, lambda seen: seen["refused_over_budget_10min"] > 0)
         for verb in ("status", "top"):
             assert re.search(r"^cache +too small: [\d,]+ cells refused", tight(verb), re.MULTILINE | re.I)
         judged = tight.json("top")
@@ -125,10 +125,8 @@ def test_tail_in_json_and_what_it_leaves_out(shmmap: Shmmap, divided_map: Divide
     assert re.fullmatch(r"[0-9a-f]{16}", lines[2]["version"])
     assert lines[4] | {"id": "0_0.pcd", "how": "changed"} == lines[4]
     assert shmmap("tail", "--since", "0") == ""
-    told = shmmap("tail")
-    assert told.count("joined    shmmap tail") == told.count(
-        "left      shmmap tail"
-    )  # of itself it tells nothing
+    text = shmmap("tail")
+    assert text.count("joined    shmmap tail") == text.count("left      shmmap tail")  # it leaves out itself
 
 
 def test_tail_follows(shmmap: Shmmap, divided_map: DividedMap) -> None:
@@ -142,7 +140,7 @@ def test_tail_follows(shmmap: Shmmap, divided_map: DividedMap) -> None:
             seen: list[str] = []
             with client_library.connect(shmmap.daemon.endpoint, name="driver") as client:
                 while waiting("loaded" not in seen):
-                    # asked until it is told: the program may not be up yet
+                    # asked until it is printed: the program may not be up yet
                     client.evict([divided_map.id("0_0.pcd")])
                     client.selected([divided_map.id("0_0.pcd")], wait=20.0)
                     while select.select([tail.stdout], [], [], 0.1)[0]:
@@ -153,7 +151,7 @@ def test_tail_follows(shmmap: Shmmap, divided_map: DividedMap) -> None:
         assert tail.returncode == 130, complaint
 
 
-def test_a_client_cannot_write_to_the_terminal_of_who_looks(shmmap: Shmmap, divided_map: DividedMap) -> None:
+def test_a_client_cannot_write_to_an_operator_s_terminal(shmmap: Shmmap, divided_map: DividedMap) -> None:
     """Its name, and the name of a file of the map, hold codes that terminals obey."""
     hostile = "\x1b]0;owned\x07\x1b[2J\u202e"
     corner = divided_map.corners["0_0.pcd"]
@@ -166,7 +164,7 @@ def test_a_client_cannot_write_to_the_terminal_of_who_looks(shmmap: Shmmap, divi
     with client_library.connect(shmmap.daemon.endpoint, name=hostile) as client:
         held = client.around(5.0, 5.0, radius=1.0, wait=20.0)
         assert [Path(cell.id).name for cell in held] == ["0_0\x1b[31m.pcd"]
-        after(shmmap, lambda told: told["sessions"] == 1 and told["cells_resident"] == 1)
+        after(shmmap, lambda seen: seen["sessions"] == 1 and seen["cells_resident"] == 1)
         both = ("clients", "tail", "top", "ls", "status", "pin")
         verbs = [[verb] for verb in both] + [[verb, "--json"] for verb in both]
         verbs += [["query", "--circle", "5,5,1"], ["show", held[0].id], ["map"]]

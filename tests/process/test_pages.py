@@ -90,14 +90,14 @@ def exported(commands: list[str]) -> dict[str, str]:
 
 @pytest.fixture
 def user(tmp_path: Path) -> Iterator[Terminal]:
-    """A terminal of a reader who has the programs of this tree."""
+    """A terminal of a reader with the programs of this tree."""
     with reader_with_programs(tmp_path) as reader:
         yield reader.terminal()
 
 
 @pytest.fixture
 def publisher(tmp_path: Path, buckets: BucketServer) -> Iterator[Terminal]:
-    """A terminal of a reader who has a town and a bucket."""
+    """A terminal of a reader with a town and a bucket."""
     pytest.importorskip("zstandard", reason="zstandard is not installed")
     given = exported(PUBLISHING.commands("credentials"))
     assert given == exported(SLICES.commands("credentials"))

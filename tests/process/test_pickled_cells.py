@@ -137,7 +137,7 @@ def use(cell: shmmap.Cell) -> float:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_gone_is_an_error_of_its_user_and_nobody_waits(client: shmmap.Client, method: str) -> None:
+def test_what_is_gone_is_an_error_and_no_process_waits(client: shmmap.Client, method: str) -> None:
     data = evicted(client)
     gone: Any = [_Pickled(data)]
     with pytest.raises(StaleHandle, match=r"0_0\.pcd \(points\): the segment .* is gone .*cell\.copy\(\)"):

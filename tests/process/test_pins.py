@@ -23,7 +23,7 @@ from tests.support.raw_client import RawClient, circle
 Connect = Callable[..., RawClient]
 
 
-def test_evicting_everything_frees_what_nobody_maps(
+def test_evicting_everything_frees_what_is_not_mapped(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
@@ -52,7 +52,7 @@ def test_evicting_everything_frees_what_nobody_maps(
     one.until_segments(0, lambda: client.ask("stats"))
 
 
-def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unknown(
+def test_a_stopped_process_without_a_session_keeps_its_bytes_across_a_restart(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Plain open and mmap, SIGSTOP, a daemon that is killed and comes back: nothing gets lost."""
@@ -60,12 +60,12 @@ def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unk
     client = connect(one)
     handle = client.selected(["0_0.pcd"]).cells[0]
     expected = zlib.crc32(Path(client.path(handle)).read_bytes())
-    with MappingProcess([client.path(handle)]) as stranger:
-        os.kill(stranger.pid, signal.SIGSTOP)
+    with MappingProcess([client.path(handle)]) as process:
+        os.kill(process.pid, signal.SIGSTOP)
         one.kill()
         one.start()
         client.hello()
-        # while a loader compares it with its checksums, who else has it is not known
+        # while a loader compares it with its checksums, other holders are not known
         waiting = Deadline()
         while waiting((stats := client.ask("stats"))[6] == 0):
             pass
@@ -76,14 +76,16 @@ def test_a_stopped_stranger_keeps_its_bytes_across_a_restart_and_is_shown_as_unk
         while waiting((stats := client.ask("stats"))[6] == 0):
             pass
         assert (stats[6], stats[7] >= handle.bytes) == (1, True)
-        os.kill(stranger.pid, signal.SIGCONT)
-        assert stranger.checksums() == [expected]
+        os.kill(process.pid, signal.SIGCONT)
+        assert process.checksums() == [expected]
     one.until_segments(0, lambda: client.ask("stats"))
     stats = client.ask("stats")
     assert (stats[6], stats[7]) == (0, 0)
 
 
-def test_clients_that_die_let_go(daemon: DaemonFactory, connect: Connect, divided_map: DividedMap) -> None:
+def test_clients_that_die_release_their_cells(
+    daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
+) -> None:
     one = daemon(divided_map.root)
     client = connect(one)
     paths = [client.path(handle) for handle in client.area(circle(0, 0, 60)).cells]

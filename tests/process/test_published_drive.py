@@ -2,7 +2,7 @@
 """Clients drive over a published map of many shards: every reply is the set difference of what is known.
 
 Pages of the list of cells come as clients near them, and go again, for there is room for a part of them only;
-on the way another version is published, and the link is lost and found.
+during the drive another version is published, and the link is lost and found.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def test_a_half_written_file_leaves_the_old_version_in_service(
     assert [f.code for f in reply.failed] == ["load_failed"]
     assert [(h.segment, h.version, h.stale) for h in reply.cells] == [(old.segment, old.version, True)]
     for rows, packed in (([["0_0.pcd", old.version]], []), ([], [old.version])):
-        kept = client.differential(circle(10, 10, 1), rows, packed=packed)  # who has it keeps it
+        kept = client.differential(circle(10, 10, 1), rows, packed=packed)  # a client that has it keeps it
         assert (kept.cells, kept.removed, kept.removed_versions) == ([], [], [])
         assert [f.code for f in kept.failed] == ["load_failed"]
     divided_map.change("0_0.pcd", 6)
@@ -144,7 +144,7 @@ def test_a_broken_catalogue_changes_nothing(
     assert client.ask("reload")[3:6] == [0, 0, 0]
 
 
-def test_old_versions_stay_while_somebody_maps_them(
+def test_old_versions_stay_while_a_process_maps_them(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)

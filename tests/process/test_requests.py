@@ -46,7 +46,7 @@ def test_heights_leave_out_cells_once_they_are_known(
 def test_differential_is_the_set_difference_at_every_step(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
-    """A drive across the map, three ways of saying what is held."""
+    """A drive across the map; what is held is named in three forms."""
     client = connect(daemon(divided_map.root))
     held: dict[str, int] = {}
     rows: list[list[Any]]
@@ -124,7 +124,7 @@ NONSENSE: list[list[Any]] = [
 ]
 
 
-def test_nonsense_is_refused_and_harms_nobody(
+def test_nonsense_is_refused_and_harms_no_client(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     client = connect(daemon(divided_map.root))

@@ -315,7 +315,7 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
             for number, scan in enumerate(scans):
                 if number == 5:
                     waiting = Deadline()
-                    while waiting(scans_of(one) < number):  # more on their way, and it would wait for them
+                    while waiting(scans_of(one) < number):  # with more in flight it would wait for them
                         pass
                     one.kill()
                 publisher.send(scan)
@@ -335,7 +335,7 @@ def test_scans_of_a_publisher_while_the_daemon_is_killed(
 
 
 @pytest.mark.root
-def test_what_did_not_get_to_the_disk_is_told(
+def test_scans_that_did_not_get_to_the_disk_are_reported(
     live_daemon: LiveDaemon, words: Words, private_tmpfs: Callable[[str], str], tmp_path: Path
 ) -> None:
     disk = Path(private_tmpfs("4m"), "lidar")

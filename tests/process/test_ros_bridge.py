@@ -144,7 +144,7 @@ def test_points_have_the_fields_of_the_file(
     assert [cell.shape[3] for cell in found.cells] == [12, 17]
 
 
-def test_a_changed_cell_is_sent_again_to_who_has_the_old_one(
+def test_a_changed_cell_is_sent_again_to_a_client_with_the_old_one(
     bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
 ) -> None:
     first, second = (peer.client(NAMES["differential"], DIFFERENTIAL) for _ in range(2))
@@ -160,7 +160,7 @@ def test_a_changed_cell_is_sent_again_to_who_has_the_old_one(
     assert from_message(second.call(area=area, cached_ids=ids)).ids == ids[:1]
 
 
-def test_a_cell_that_cannot_be_loaded_is_left_out_and_told(
+def test_a_cell_that_cannot_be_loaded_is_left_out_and_logged(
     bridge: BridgeProcess, peer: RosPeer, divided_map: DividedMap
 ) -> None:
     Path(divided_map.id("0_0.pcd")).write_bytes(b"this is no cloud")

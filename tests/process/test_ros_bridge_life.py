@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ros-bridge`` while daemons, bridges and clients die, and among strangers."""
+"""``shmmap-ros-bridge`` while daemons, bridges and clients die, and among incompatible peers."""
 
 from __future__ import annotations
 
@@ -105,10 +105,10 @@ def test_clients_that_come_and_go_leave_nothing(bridge: BridgeProcess, peer: Ros
     assert threads_and_files(bridge.pid) == before
 
 
-# --- strangers ----------------------------------------------------------------------------------------
+# --- incompatible peers -------------------------------------------------------------------------------
 
 
-def test_nonsense_harms_nobody(bridge: BridgeProcess, dds: int, peer: RosPeer, tmp_path: Path) -> None:
+def test_nonsense_harms_no_client(bridge: BridgeProcess, dds: int, peer: RosPeer, tmp_path: Path) -> None:
     """What is no request, has lengths beyond its end, or texts that are none."""
     program = built_fast_peer(tmp_path)
     if program is None:
@@ -138,7 +138,7 @@ def test_nonsense_harms_nobody(bridge: BridgeProcess, dds: int, peer: RosPeer, t
     assert len(asked(peer, "partial", area=(0, 0, 5)).cells) == 4
 
 
-def test_a_flood_of_requests_keeps_nobody_out(bridge: BridgeProcess, peer: RosPeer) -> None:
+def test_a_flood_of_requests_keeps_no_client_out(bridge: BridgeProcess, peer: RosPeer) -> None:
     flood = peer.client(NAMES["partial"], PARTIAL)
     flood.wait_for_service()
     for _ in range(300):
@@ -165,7 +165,7 @@ def test_what_is_more_than_the_daemon_takes_at_once(bridge: BridgeProcess, peer:
     assert asked(peer, "partial", area=(0, 0, 5)).ids == near, "while its sender still waits"
 
 
-def test_a_request_whose_cells_do_not_come_holds_up_nobody(
+def test_a_request_whose_cells_do_not_come_holds_up_no_other(
     bridge: BridgeProcess, served: DaemonProcess, peer: RosPeer, divided_map: DividedMap
 ) -> None:
     """Its loaders stand still: requests for what is in memory are answered meanwhile."""
@@ -182,7 +182,7 @@ def test_a_request_whose_cells_do_not_come_holds_up_nobody(
     assert from_message(slow.receive(number)).ids
 
 
-def test_a_client_that_has_stopped_holds_up_nobody(
+def test_a_client_that_has_stopped_holds_up_no_other(
     daemon: DaemonFactory, dds: int, peer: RosPeer, tmp_path: Path
 ) -> None:
     """All clients of a service read the same replies; one that has stopped acknowledges none of them."""
@@ -204,7 +204,7 @@ def test_a_client_that_has_stopped_holds_up_nobody(
                 listener.communicate()
 
 
-def test_strangers_are_told_once_and_named_by_doctor(
+def test_incompatible_peers_are_logged_once_and_named_by_doctor(
     bridge: BridgeProcess, served: DaemonProcess, dds: int, peer: RosPeer, tmp_path: Path
 ) -> None:
     program = built_fast_peer(tmp_path)
@@ -221,19 +221,19 @@ def test_strangers_are_told_once_and_named_by_doctor(
         return dict(found)
 
     assert finding()["state"] == "ok"
-    words = [str(program), str(dds), "stranger", NAMES["partial"]]
+    words = [str(program), str(dds), "incompatible", NAMES["partial"]]
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, env=bridge_environment()) as stranger:
-        assert stranger.stdout is not None
-        assert stranger.stdout.readline() == "matched\n"
-        bridge.wait_status(strangers=[{"service": NAMES["partial"], "vendor": "Fast DDS"}])
+    with subprocess.Popen(words, stdin=pipe, stdout=pipe, text=True, env=bridge_environment()) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "matched\n"
+        bridge.wait_status(incompatible=[{"service": NAMES["partial"], "vendor": "Fast DDS"}])
         found = finding()
         assert found["state"] == "warn"
         assert f"1 client of {NAMES['partial']}, of Fast DDS" in found["fact"]
         assert "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp" in found["advice"]
         assert len(asked(peer, "partial", area=(0, 0, 5)).cells) == 4
-        stranger.communicate()
-    bridge.wait_status(strangers=[])
+        other.communicate()
+    bridge.wait_status(incompatible=[])
     assert bridge.log.count("is no node of rmw_cyclonedds_cpp") == 1
     assert finding()["state"] == "ok"
     bridge.kill()

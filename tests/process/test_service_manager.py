@@ -57,7 +57,7 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
     one.close()
 
 
-def test_a_whole_life(
+def test_from_start_to_stop(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, manager: Manager
 ) -> None:
     """Ready, fed watchdog, status, reload, failed reload, stop: in words that systemd understands."""

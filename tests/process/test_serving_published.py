@@ -329,7 +329,7 @@ def test_a_body_that_stalls_is_gone_on_with(daemon: DaemonFactory, web: FaultyWe
     assert 206 in {status for _path, status in web.requests()}
 
 
-def test_what_was_damaged_on_its_way_once_is_fetched_again(daemon: DaemonFactory, web: FaultyWeb) -> None:
+def test_what_was_damaged_once_in_transit_is_fetched_again(daemon: DaemonFactory, web: FaultyWeb) -> None:
     one = daemon(web.url)
     seen: set[str] = set()
 
@@ -409,7 +409,7 @@ def test_a_version_never_goes_back(
     assert health(one)[0] == 0
 
 
-def test_a_link_lost_half_way_keeps_the_old_version_whole(
+def test_a_link_lost_during_a_switch_keeps_the_old_version_whole(
     daemon: DaemonFactory, web: FaultyWeb, publish_change: Callable[[], None]
 ) -> None:
     one = daemon(web.url, "--poll", "0")

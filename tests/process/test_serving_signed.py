@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import shmmap
-from shmmap.doctor.signed_map import trust_problems
+from shmmap.doctor.verdicts import trust_problems
 from shmmap.errors import Offline, ShmmapError
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Verbs as Verbs

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shmmap import connect
-from shmmap.testing.process_watch import wait_ended
+from shmmap.testing.daemon_process import wait_ended
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import Shmmap
 from tests.support.daemon_process import counters, until
@@ -95,14 +95,14 @@ def test_a_socket_whose_directory_cannot_be_made(
 ) -> None:
     """Told by `health`; it comes back as soon as that is possible."""
     one = daemon(divided_map.root)
-    aside = one.runtime_dir + "-aside"
-    os.rename(one.runtime_dir, aside)
+    moved_away = one.runtime_dir + "-moved-away"
+    os.rename(one.runtime_dir, moved_away)
     try:
         Path(one.runtime_dir).write_text("in the way")
-        until(lambda: counters(one)["sockets_missing"] == 2, lambda: Path(aside, "log.txt").read_text())
+        until(lambda: counters(one)["sockets_missing"] == 2, lambda: Path(moved_away, "log.txt").read_text())
         assert Shmmap(one, tmp_path)("health", code=1).startswith("unreachable")
         os.unlink(one.runtime_dir)
-        until(lambda: os.path.exists(one.endpoint), lambda: Path(aside, "log.txt").read_text())
-        until(lambda: counters(one)["sockets_missing"] == 0, lambda: Path(aside, "log.txt").read_text())
+        until(lambda: os.path.exists(one.endpoint), lambda: Path(moved_away, "log.txt").read_text())
+        until(lambda: counters(one)["sockets_missing"] == 0, lambda: Path(moved_away, "log.txt").read_text())
     finally:
-        shutil.rmtree(aside)
+        shutil.rmtree(moved_away)

@@ -46,7 +46,7 @@ def test_a_file_system_that_is_not_mounted_yet(
 
 
 def test_a_name_that_is_squatted(daemon: DaemonFactory, divided_map: DividedMap) -> None:
-    """A directory stands for a stranger's file: not even root replaces it by renaming."""
+    """A directory stands for another account's file: not even root replaces it by renaming."""
     one = daemon(divided_map.root, start=False, forked=False)
     place = Path(one.shm_dir, f"shmmap.{one.instance}.statistics")
     place.mkdir()
@@ -68,7 +68,7 @@ def test_a_second_daemon_with_another_runtime_directory(
     one.arguments = ["--runtime-dir", str(place)]
     assert one.run_to_end() == 75
     assert f"another daemon (pid {one.pid}, listening at {one.endpoint})" in one.log
-    os.kill(one.pid, signal.SIGSTOP)  # however it is: it has them while it lives
+    os.kill(one.pid, signal.SIGSTOP)  # a process keeps its locks while it exists
     assert one.run_to_end() == 75
     os.kill(one.pid, signal.SIGCONT)
     assert (one.segments(), os.listdir(place)) == (segments, [])

@@ -62,7 +62,7 @@ def test_it_ends_with_its_terminal(daemon: DaemonFactory, divided_map: DividedMa
 
 
 @pytest.mark.parametrize("how", ["nohup", "service manager", "started elsewhere"])
-def test_who_is_kept_reads_the_map_again(
+def test_a_kept_client_reads_the_map_again(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, how: str
 ) -> None:
     one = daemon(divided_map.root, start=False, forked=False)

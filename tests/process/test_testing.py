@@ -42,8 +42,10 @@ def test_the_fixture_for_pytest(divided_map: DividedMap, tmp_path: Path) -> None
     (tmp_path / "test_mine.py").write_text(TESTS.format(map=str(divided_map.root)), encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", tmp_path, tmp_path],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert re.search("3 passed, .*2 errors", done.stdout), done.stdout + done.stderr
     errors = [line for line in done.stdout.splitlines() if line.startswith("ERROR")]
     assert ["test_leaves_a_file_open" in errors[0], "test_leaves_a_segment" in errors[1]] == [True, True]
@@ -60,7 +62,7 @@ def test_no_pytest_is_needed() -> None:
 
 
 def test_a_daemon_without_a_framework(divided_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SHMMAP_INSTANCE", "somebody-else")
+    monkeypatch.setenv("SHMMAP_INSTANCE", "another-daemon")
     with DaemonProcess(divided_map.root) as daemon:
         with shmmap.connect(daemon.endpoint) as client:
             assert len(client.around(0.0, 0.0, 100.0)) == len(divided_map.corners)
@@ -107,7 +109,7 @@ def test_a_stopped_daemon_is_not_ready(divided_map: DividedMap) -> None:
         assert daemon.wait_ready()
 
 
-def test_directories_go_with_an_object_that_nobody_disposes_of(divided_map: DividedMap) -> None:
+def test_directories_go_with_an_object_that_is_never_disposed_of(divided_map: DividedMap) -> None:
     daemon = DaemonProcess(divided_map.root)
     directories = (daemon.runtime_dir, daemon.shm_dir, daemon.scratch_dir)
     assert all(os.path.isdir(path) for path in directories)

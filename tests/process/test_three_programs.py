@@ -45,7 +45,7 @@ def test_three_programs_on_one_map(daemon: Factory, tmp_path: Path) -> None:
     )  # fmt: skip
     assert result.scans == 60
     ndt, compare, elevation = (result.programs[name] for name in ("ndt", "compare", "elevation"))
-    # nothing was lost on the way
+    # nothing was lost between the programs
     assert ndt.document["frames"] == ndt.document["trustworthy"] == 60
     assert compare.document["scans"] == 60
     assert compare.document["incomplete_scans"] == 0

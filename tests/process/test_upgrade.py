@@ -36,7 +36,7 @@ def renamed(package: Path) -> None:
 
 
 def half_installed(package: Path) -> None:
-    """An upgrade that is under way: the loader program is there, and needs what is not."""
+    """An unfinished upgrade: the loader program is there, and needs what is not."""
     (package / LOADER).write_text("from shmmap.daemon import not_there_yet\n")
 
 

@@ -111,7 +111,7 @@ def test_a_stop_that_comes_first_stays_a_stop(
     assert one.leftovers() == []
 
 
-def test_a_waiting_request_is_answered_by_the_next_life(
+def test_a_waiting_request_is_answered_by_the_next_run(
     daemon: DaemonFactory, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root, "--workers", "1")
@@ -158,7 +158,7 @@ def test_a_damaged_leftover_is_never_served(
     one.until_segments(1, lambda: client.ask("stats"))
 
 
-def test_a_damaged_leftover_that_somebody_maps_is_known_until_it_is_let_go(
+def test_a_damaged_leftover_is_known_until_it_is_no_longer_mapped(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     one = daemon(divided_map.root)
@@ -179,7 +179,7 @@ def test_a_damaged_leftover_that_somebody_maps_is_known_until_it_is_let_go(
     one.until_segments(1, lambda: client.ask("stats"))
 
 
-def test_what_changed_while_nobody_looked_is_loaded_anew(
+def test_what_changed_between_two_runs_is_loaded_again(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Changed, removed and moved cells of the map; the old state of one is still mapped and shows."""
@@ -208,7 +208,7 @@ def test_what_changed_while_nobody_looked_is_loaded_anew(
     one.until_segments(35, lambda: client.ask("stats"))
 
 
-def test_names_that_are_no_segments_hinder_nobody(
+def test_names_that_are_no_segments_do_not_matter(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """A pipe, a link to another segment, a directory: not waited for, not followed, not served."""
@@ -229,7 +229,7 @@ def test_names_that_are_no_segments_hinder_nobody(
 
 
 @pytest.mark.root
-def test_a_stranger_s_file_under_our_name_is_refused(
+def test_a_foreign_file_under_our_name_is_refused(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """A perfect copy, but of another owner: the owner of a file can change it under its readers."""
@@ -303,7 +303,7 @@ def test_who_holds_what_is_known_across_a_restart(daemon: DaemonFactory, divided
             client.show("nowhere.pcd")
 
 
-def test_a_name_that_somebody_else_took(
+def test_a_name_that_a_foreign_file_took(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """What has to retire does so under another name; its reader and the next run are not disturbed."""
@@ -311,7 +311,7 @@ def test_a_name_that_somebody_else_took(
     client = connect(one)
     (handle,) = client.selected(["0_0.pcd"]).cells
     place = Path(f"{one.shm_dir}{handle.segment}.zombie")
-    place.mkdir()  # as a stranger's file in a sticky directory, it cannot be replaced
+    place.mkdir()  # as another account's file in a sticky directory, it cannot be replaced
     with MappingProcess([f"{one.shm_dir}{handle.segment}"]) as reader:
         (checksum,) = reader.checksums()
         one.kill()
@@ -328,7 +328,7 @@ def test_a_name_that_somebody_else_took(
 
 @pytest.mark.root
 @pytest.mark.parametrize("pins", ["leases", "locks"])
-def test_a_stranger_s_file_takes_no_budget(
+def test_a_foreign_file_takes_no_budget(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap, pins: str
 ) -> None:
     """However much it is in use: a process that has no segment of ours open keeps none of ours."""

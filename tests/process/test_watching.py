@@ -21,7 +21,7 @@ from tests.support.divided_map import DividedMap, make_map, random_points
 def next_reload(stream: EventStream) -> e.Reloaded:
     while True:
         happening = stream.next(60.0)
-        assert happening is not None, "no reload was told of"
+        assert happening is not None, "no reload was reported"
         if isinstance(happening, e.Reloaded):
             return happening
 
@@ -31,8 +31,8 @@ def test_what_is_written_is_served(daemon: DaemonFactory, divided_map: DividedMa
     with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
         old = client.selected([divided_map.id("0_0.pcd")], wait=30.0)[0].version
         divided_map.change("0_0.pcd", 5)
-        told = next_reload(stream)
-        assert (told.changed, told.added, told.removed, told.error) == (1, 0, 0, "")
+        reloaded = next_reload(stream)
+        assert (reloaded.changed, reloaded.added, reloaded.removed, reloaded.error) == (1, 0, 0, "")
         newer = client.selected([divided_map.id("0_0.pcd")], wait=30.0)[0]
         assert newer.version != old
         assert len(newer.xyz) == 700
@@ -42,9 +42,9 @@ def test_what_is_written_is_served(daemon: DaemonFactory, divided_map: DividedMa
         divided_map.remove_cell("0_-20.pcd")
         divided_map.write_metadata()
         added = removed = 0
-        while (added, removed) != (1, 1):  # the machine may be so slow that it is told in parts
-            told = next_reload(stream)
-            added, removed = added + told.added, removed + told.removed
+        while (added, removed) != (1, 1):  # a slow machine may report it in parts
+            reloaded = next_reload(stream)
+            added, removed = added + reloaded.added, removed + reloaded.removed
         assert client.selected([divided_map.id("60_0.pcd")], wait=30.0)
 
 
@@ -52,14 +52,14 @@ def test_a_map_that_is_away_for_a_while(daemon: DaemonFactory, divided_map: Divi
     """Until another one is in its place the old one is served; then that one, and its changes too."""
     one = daemon(divided_map.root, "--watch")
     with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
-        aside = divided_map.root.with_name("aside")
-        divided_map.root.rename(aside)
+        moved_away = divided_map.root.with_name("moved_away")
+        divided_map.root.rename(moved_away)
         assert "no map" in next_reload(stream).error
         assert client.selected(["0_0.pcd"], wait=None).failed == ()
         next_map = make_map(divided_map.root.with_name("next"), columns=2, rows=2, seed=5)
         next_map.root.rename(divided_map.root)
-        told = next_reload(stream)
-        assert (told.error, told.removed) == ("", 32)
+        reloaded = next_reload(stream)
+        assert (reloaded.error, reloaded.removed) == ("", 32)
         next_map.root = divided_map.root
         next_map.change("0_0.pcd", 7)
         assert next_reload(stream).changed == 1
@@ -173,7 +173,7 @@ def removed(root: Path) -> tuple[Path, Callable[[], object]]:
     return root / "current", go_on
 
 
-WAYS = [map_itself, parent, two_links, cells_alone, kubernetes, flat_kubernetes, renamed, removed]
+EXCHANGES = [map_itself, parent, two_links, cells_alone, kubernetes, flat_kubernetes, renamed, removed]
 
 
 def sizes(cells: CellSet) -> set[int]:
@@ -182,29 +182,35 @@ def sizes(cells: CellSet) -> set[int]:
 
 
 @pytest.mark.parametrize(
-    ("way", "watch"),
-    [*((way, False) for way in WAYS), *((way, True) for way in (map_itself, parent, kubernetes, removed))],
+    ("exchange", "watch"),
+    [
+        *((exchange, False) for exchange in EXCHANGES),
+        *((exchange, True) for exchange in (map_itself, parent, kubernetes, removed)),
+    ],
 )
 def test_a_link_that_leads_to_another_map(
-    daemon: DaemonFactory, tmp_path: Path, way: Callable[..., tuple[Path, Callable[[], object]]], watch: bool
+    daemon: DaemonFactory,
+    tmp_path: Path,
+    exchange: Callable[..., tuple[Path, Callable[[], object]]],
+    watch: bool,
 ) -> None:
     """One map after the other, never a mixture of both; ids stay the paths as given."""
     names = sorted(make_map(tmp_path / "v1", points=OLD).corners)
     make_map(tmp_path / "v2", points=NEW, seed=2)
-    path, change = way(tmp_path)
+    path, change = exchange(tmp_path)
     one = daemon(path, *(["--watch"] if watch else []))
     with connect(one.endpoint) as client, EventStream(one.endpoint, timeout=30.0) as stream:
         assert sizes(client.selected(names[:12], wait=30.0)) == {OLD}
         assert client.welcome.id_prefix.startswith(f"{path}/")
         change()
-        if not watch and way is not removed:
+        if not watch and exchange is not removed:
             cells = client.selected(names, wait=30.0)  # most of them have not been read yet
             assert (len(cells), sizes(cells)) == (36, {OLD})
         if not watch:
             client.reload()
-        while (told := next_reload(stream)).error:
+        while (reloaded := next_reload(stream)).error:
             pass  # it was looked for in between
-        assert (told.changed, told.added, told.removed) == (36, 0, 0)
+        assert (reloaded.changed, reloaded.added, reloaded.removed) == (36, 0, 0)
         cells = client.selected(names, wait=30.0)
         assert (len(cells), sizes(cells)) == (36, {NEW})
         assert all(cell.id.startswith(f"{path}/") for cell in cells)

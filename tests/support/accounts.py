@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.daemon_process import ROOT
 
-DAEMON_UID, GROUP, MEMBER, STRANGER, ADMINS = 61001, 61002, 61003, 61004, 61005
+DAEMON_UID, GROUP, MEMBER, OTHER_USER, ADMINS = 61001, 61002, 61003, 61004, 61005
 
 
 def as_user(uid: int, gid: int, *command: str) -> subprocess.CompletedProcess[str]:
@@ -31,7 +31,7 @@ def python_for_others() -> str:
     for python in (own, "/usr/bin/python3"):
         if (
             os.path.exists(python)
-            and not as_user(STRANGER, STRANGER, python, "-I", "-c", "import json").returncode
+            and not as_user(OTHER_USER, OTHER_USER, python, "-I", "-c", "import json").returncode
         ):
             return python
     pytest.skip("this Python cannot be started by other accounts")

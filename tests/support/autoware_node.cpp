@@ -2,7 +2,7 @@
 // What Autoware's scan matcher does with its `PcdLoaderFunction`, a line at a time; words are separated by
 // tabs.
 //
-//   loader ENDPOINT WAIT PATIENCE     a new PcdLoader, a new NdtLeaves, and a node that holds nothing
+//   loader ENDPOINT WAIT TIMEOUT     a new PcdLoader, a new NdtLeaves, and a node that holds nothing
 //   update X Y RADIUS                 as the node's `update_ndt`: ids held, then add, then remove
 //   ask X Y RADIUS IDS                with these ids, separated by ";"; what comes is not taken over
 //   const X Y RADIUS                  as `update`, by a function that returns a pointer to const

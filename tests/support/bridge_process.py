@@ -134,9 +134,6 @@ class BridgeProcess:
 _DOMAINS: Final = range(1, 100)  # the ports of higher ones are given out for any port
 _LOCKS: Final = Path("/tmp")
 
-FIRST_PORT: Final = 7400
-"""Of domain 0; each domain has 250 (DDSI-RTPS, 9.6.1)."""
-
 URI: Final = (
     "<CycloneDDS><Domain Id='any'>"
     "<General><Interfaces><NetworkInterface name='lo'/></Interfaces>"

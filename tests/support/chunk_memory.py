@@ -1,15 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chunks in plain memory, and marks applied to them: what the daemon's worker does, without the worker."""
+"""Chunks in plain memory, and marks applied to them: what the daemon's worker does, without the worker.
+
+    python -m tests.support.chunk_memory FILE BRICKS
+
+fills a chunk's file with one number after the other: a copy with two of them is torn.  It prints ``ready``,
+and goes on until it is killed.
+"""
 
 from __future__ import annotations
+
+import os
+import sys
+import time
 
 import numpy as np
 
 from shmmap.chunks.applying import UNDO_BYTES, ChunkWriter, UndoRecord
+from shmmap.chunks.applying_kernels import begin_writing, end_writing
 from shmmap.chunks.layout import ChunkIdentity, ChunkView, check_consistent, chunk_bytes, new_header
 from shmmap.chunks.marks import Marks
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey, voxels_of
+from shmmap.daemon.live.chunk_memory import map_chunk, view_at
 
 MAP_ID = bytes(range(16))
 
@@ -70,3 +82,33 @@ class ChunkMemory:
             for voxel, value in zip(voxels_of(key, places).tolist(), dense[places].tolist(), strict=True):
                 found[voxel[0], voxel[1], voxel[2]] = value
         return found
+
+
+BETWEEN_S = 50e-6
+"""About as long as from one scan to the next, seen from a chunk that is copied in 5 us."""
+
+
+def main() -> None:
+    """Write until the end."""
+    path, bricks = sys.argv[1], int(sys.argv[2])
+    fd = os.open(path, os.O_RDWR)
+    view = view_at(map_chunk(fd, path), chunk_bytes(bricks))
+    sequence = view.state["sequence"].reshape(1)
+    number = 0
+    begin_writing(sequence)
+    end_writing(sequence)
+    print("ready", flush=True)
+    while True:
+        number = number % 1000 + 1
+        begin_writing(sequence)
+        view.state["version"] += 1
+        for brick in view.bricks:
+            brick[:] = number
+        end_writing(sequence)
+        end_s = time.perf_counter() + BETWEEN_S
+        while time.perf_counter() < end_s:
+            pass
+
+
+if __name__ == "__main__":
+    main()

@@ -168,7 +168,7 @@ void print_statistics(const std::string& instance, const std::string& shm_dir) {
 }
 
 void print(const shmmap::Happening& happening) {
-  if (const auto* missed = std::get_if<shmmap::Missed>(&happening)) {
+  if (const auto* missed = std::get_if<shmmap::MissedEvents>(&happening)) {
     std::cout << "missed\t" << missed->epoch << "\t" << missed->first << "\t" << missed->last << "\n";
     return;
   }
@@ -181,7 +181,7 @@ void print(const shmmap::Happening& happening) {
   std::cout << "\n";
 }
 
-/// Mutate a message again and again; whatever comes of it is an answer or an error.
+/// Mutate a message many times; each must give an answer or an error.
 void fuzz(unsigned seed, int count, const std::string& hex) {
   std::string message;
   for (std::size_t at = 0; at + 1 < hex.size(); at += 2)

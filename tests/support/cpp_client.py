@@ -527,7 +527,7 @@ class CppEventStream:
 
     @property
     def epoch(self) -> int:
-        """The daemon's present life."""
+        """Number of the daemon's run."""
         return int(self._program.call("epoch")[0][1])
 
     def next(self, timeout: float | None = None) -> events.Event | shmmap.events.MissedEvents | None:

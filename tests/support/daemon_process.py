@@ -15,8 +15,14 @@ from shmmap.events import EventStream
 from shmmap.protocol import events as e
 from shmmap.statistics.reader import read_statistics
 from shmmap.testing import daemon_process
-from shmmap.testing.daemon_process import READY_S, STOP_S
-from shmmap.testing.process_watch import open_files, processes_marked, wait_ended, wait_readable
+from shmmap.testing.daemon_process import (
+    READY_S,
+    STOP_S,
+    open_files,
+    processes_marked,
+    wait_ended,
+    wait_readable,
+)
 from tests.support.forked_programs import ROOT, fork_program
 
 __all__ = [

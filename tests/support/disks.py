@@ -141,7 +141,7 @@ def _apply(change: dict[str, _File | None], names: dict[str, _File]) -> None:
             names[name] = file
 
 
-# A file system that never answers, as a network's whose server is away: FUSE without a program behind it
+# A file system that never answers, as of a server that is away: FUSE without a program behind it
 
 
 _DETACH = 2

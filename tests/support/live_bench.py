@@ -58,7 +58,7 @@ def percentiles(seconds: list[float]) -> str:
 
 
 class Beside:
-    """A process that does something again and again until it is stopped.
+    """A process that repeats something until it is stopped.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ SCANS = 24
 
 
 def drive(scans: int = SCANS) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Points and poses along a way that crosses chunks, comes back, and jumps."""
+    """Points and poses along a path that crosses chunks, comes back, and jumps."""
     rng = np.random.default_rng(8)
     found = []
     for number in range(scans):

@@ -3,8 +3,8 @@
 
     python -m tests.support.live_mapper ENDPOINT FIRST LAST
 
-It sends the scans of `tests.support.live_drive` again and again, the N-th under the number N whichever
-process sent it before, and prints ``applied N`` for each, in the end ``done``: then all of them are durable.
+It sends the scans of `tests.support.live_drive` in rounds, the N-th under the number N whichever process
+sent it before, and prints ``applied N`` for each, in the end ``done``: then all of them are durable.
 """
 
 from __future__ import annotations

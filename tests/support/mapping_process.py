@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A process that maps segments the plain way, and prints the checksums of what it maps.
+"""A process that maps segments with plain ``open`` and ``mmap``, and prints the checksums of what it maps.
 
 As a program: ``python mapping_process.py PATH...`` maps each file, closes its descriptors, prints
 ``mapped``; for every line it reads it prints the CRC-32 of each mapping.

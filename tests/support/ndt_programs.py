@@ -33,7 +33,7 @@ from shmmap_clients.scans.scan_sequence import Scan
 from shmmap_clients.scans.scan_stream import ScanPublisher
 from shmmap_clients.scans.trajectory import read_trajectory, tum_line
 
-from shmmap.demo.process_usage import process_memory
+from shmmap.demo.program import process_memory
 from shmmap.simulation.lidar import Lidar
 from shmmap.simulation.town import Town
 

@@ -2,7 +2,7 @@
 """An OpenCL device: the machine's, used as a processor or as a GPU, or one whose program never ends.
 
 ``python -m tests.support.opencl_device align DEADLINE [FALLBACK]`` aligns a street twice on a device that
-never ends, and prints what came of it; the process then has to end although the device is busy for ever.
+never ends, and prints what came of it; the process then has to end although the device stays busy.
 ``... program WORDS...`` is shmmap-ndt on such a device.
 """
 

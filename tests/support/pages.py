@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from shmmap.testing.environment import without_settings
+from shmmap.testing.daemon_process import without_settings
 from tests.support.daemon_process import ROOT, Deadline, processes_marked, wait_ended, wait_readable
 
 _BLOCK = re.compile(r"^<!-- ([\w-]+) -->\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -179,7 +179,7 @@ class Terminal:
 
 
 class Reader:
-    """A reader to whom nothing is configured.
+    """A reader with nothing configured.
 
     Parameters
     ----------

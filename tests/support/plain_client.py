@@ -94,7 +94,7 @@ class PlainClient:
         self.connection = connect_first([path] if isinstance(path, str) else path)
         self.connection.settimeout(timeout_s)
         self.connection.sendall(documented_bytes("greeting") + documented_bytes(ready))
-        self._heard = b""
+        self._received = b""
         self._request = 0
         self._replies: dict[int, list[Any]] = {}
         self.commands: list[bytes] = []
@@ -111,12 +111,12 @@ class PlainClient:
     # --- frames -----------------------------------------------------------------------------------
 
     def _take(self, count: int) -> bytes:
-        while len(self._heard) < count:
+        while len(self._received) < count:
             part = self.connection.recv(1 << 16)
             if not part:
                 raise ConnectionError("the daemon closed the connection")
-            self._heard += part
-        taken, self._heard = self._heard[:count], self._heard[count:]
+            self._received += part
+        taken, self._received = self._received[:count], self._received[count:]
         return taken
 
     def send_frame(self, body: bytes, flags: int = 0) -> None:
@@ -133,7 +133,7 @@ class PlainClient:
         return flags, self._take(size)
 
     def message(self) -> Any:
-        """Return the next message; commands on the way are noted."""
+        """Return the next message; commands in between are noted."""
         while True:
             flags, body = self.frame()
             if flags & _COMMAND:
@@ -153,7 +153,7 @@ class PlainClient:
         return self._request
 
     def reply_to(self, request: int) -> list[Any]:
-        """Return the reply to a request; `Refused` if it is an error.  Others are kept for who asks."""
+        """Return the reply to a request; `Refused` if it is an error.  Other replies are kept for later."""
         while request not in self._replies:
             reply = self.message()
             self._replies[reply[1]] = reply
@@ -178,7 +178,7 @@ class PlainClient:
     # --- attaching --------------------------------------------------------------------------------
 
     def attach(self, handle: list[Any]) -> tuple[SegmentBytes, mmap.mmap]:
-        """Map what a handle names, as LAYOUT.md has it; it is in use as long as the mapping lives."""
+        """Map what a handle names, as LAYOUT.md has it; it is in use as long as the mapping exists."""
         path = self.shm_dir + self.segment_prefix + handle[3]
         offset, nbytes = handle[4:6]
         end_s = time.monotonic() + 0.2

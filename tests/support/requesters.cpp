@@ -40,7 +40,7 @@ int main(int count, char** words) {
   options.keep_waiting = [&life] { return --life > 0; };
   shmmap_example::Requesters<Service> requesters(options);
   const int threads = std::stoi(words[4]);
-  std::vector<std::string> told(static_cast<std::size_t>(threads));
+  std::vector<std::string> results(static_cast<std::size_t>(threads));
   std::vector<std::thread> running;
   for (int number = 0; number < threads; ++number) {
     running.emplace_back([&, number] {
@@ -55,16 +55,16 @@ int main(int count, char** words) {
       for (int time = 0; time < 2; ++time) {
         Service::Response response;
         if (!requesters.answer(name, request, response)) {
-          told[static_cast<std::size_t>(number)] += "none ";
+          results[static_cast<std::size_t>(number)] += "none ";
           continue;
         }
         for (const auto& cell : response.new_pointcloud_with_ids) request.cached_ids.push_back(cell.cell_id);
-        told[static_cast<std::size_t>(number)] +=
+        results[static_cast<std::size_t>(number)] +=
             std::to_string(response.new_pointcloud_with_ids.size()) + " " + response.header.frame_id + " ";
       }
     });
   }
   for (auto& one : running) one.join();
-  for (const auto& one : told) std::printf("%s\n", one.c_str());
+  for (const auto& one : results) std::printf("%s\n", one.c_str());
   std::printf("%zu\n", requesters.size());
 }

@@ -132,11 +132,6 @@ class RosClient:
         self.wait_for_service(within_s)
         return self.receive(self.send(**fields), within_s)
 
-    def raw_request(self, body: bytes, number: int | None = None) -> bytes:
-        """A request as bytes, whatever the body."""
-        number = next(self._numbers) if number is None else number
-        return b"\0\1\0\0" + struct.pack("<Qq", self._guid, number) + body
-
 
 def _messages(participant: DomainParticipant, reader: DataReader, within_s: float) -> Iterator[Any]:
     condition = ReadCondition(reader, ViewState.Any | SampleState.NotRead | InstanceState.Any)

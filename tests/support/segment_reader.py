@@ -92,9 +92,9 @@ def parse(data: bytes | mmap.mmap) -> SegmentBytes:
 
 
 def map_segment(path: str | Path, session: int | None = None) -> mmap.mmap:
-    """Map a segment the way any other program would: plain open and mmap.
+    """Map a segment as any other program would: plain open and mmap.
 
-    With a session, take its lock as the document says; it lives as long as the mapping.
+    With a session, take its lock as the document says; it lasts as long as the mapping.
     """
     fd = os.open(path, os.O_RDONLY)
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segments as the daemon makes them, of any columns, and ways to spoil what a killed daemon left."""
+"""Segments as the daemon makes them, of any columns, and damage of the kinds a killed daemon leaves."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write_segment(
     box: Box = (0.0, 0.0, 20.0, 20.0),
     **source_facts: Any,
 ) -> SegmentHeader:
-    """Write a segment into an empty file; ``told`` replaces what its header says of the source."""
+    """Write a segment into an empty file; ``source_facts`` replace what its header says of the source."""
     rows = len(next(iter(columns.values())))
     specs = [
         ColumnSpec(name, values.dtype, 1 if values.ndim == 1 else values.shape[1], "m" * (name == "xyz"))

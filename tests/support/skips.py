@@ -3,7 +3,7 @@
 
 The latter where ``SHMMAP_TEST_ALLOWED_SKIPS`` names that list: one pattern a line (``*`` and ``?`` as in a
 shell) for the test's id, then blanks and why it may be skipped; ``#`` starts a comment.
-What needs root may be skipped by everybody else: it is marked so, and `.ci/run` runs exactly that as root.
+Any other account may skip what needs root: it is marked so, and `.ci/run` runs exactly that as root.
 """
 
 from __future__ import annotations

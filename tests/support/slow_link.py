@@ -47,7 +47,7 @@ class Plan(NamedTuple):
     mbit_s
         Bandwidth of each direction, 10^6 bits a second; 0: any.
     delay_s
-        How long a byte is on its way; a new connection takes two of these more.
+        How long a byte takes; a new connection takes two of these more.
     mean_s
         Mean of a log-normal delay of each answer, seconds; 0: none.
     seed
@@ -150,7 +150,7 @@ class _Connection:
             server[1].close()
 
     async def _take_up(self, client: asyncio.StreamReader, queue: _Queue) -> None:
-        """Read requests until the client closes; answers still on their way are then lost."""
+        """Read requests until the client closes; answers still in transit are then lost."""
         while data := await client.read(CHUNK_BYTES):
             entered_s = self._up.pass_through(len(data), time.monotonic())
             if not self._is_asked:  # the first bytes of a request: no client here sends the next one before

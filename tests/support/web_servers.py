@@ -49,7 +49,7 @@ class _Server(http.server.ThreadingHTTPServer):
         return connection, address
 
     def handle_error(self, *_: object) -> None:
-        """A client that has gone, or whose connection was ended: that is meant."""
+        """Ignore a client that has gone, or a connection that was ended: that is intended."""
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):

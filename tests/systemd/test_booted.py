@@ -81,7 +81,7 @@ def segments(machine: BootedSystemd, instance: str = "default", *, at: str = "/d
     return {name: inode for inode, name in lines if published.fullmatch(name)}
 
 
-def test_it_serves_the_members_of_the_group_and_nobody_else(fresh: BootedSystemd) -> None:
+def test_it_serves_the_members_of_the_group_and_no_other_user(fresh: BootedSystemd) -> None:
     said = fresh.run("systemd-analyze", "verify", "--man=no", "shmmapd.service", "shmmapd.socket")
     assert (said.stdout, said.stderr) == ("", "")  # as installed, drop-ins included
     fresh.run("systemctl", "start", "shmmapd")
@@ -158,7 +158,7 @@ def test_a_reload_shows_what_changed(fresh: BootedSystemd, the_map: DividedMap) 
         points = the_map.points("0_0.pcd")
         the_map.write_cell("0_0.pcd", (0, 0), {name: values[:7] for name, values in points.items()})
         fresh.run("systemctl", "reload", "shmmapd")
-        # systemd 252 may count the reload as done just before it hears that it began
+        # systemd 252 may count the reload as done just before it learns that it began
         waiting = Deadline()
         while waiting((after := alice.ask()) == before):
             pass
@@ -211,8 +211,8 @@ def test_a_restart_keeps_the_cells_and_a_stop_does_not(fresh: BootedSystemd) -> 
 
 def test_the_first_client_starts_it(fresh: BootedSystemd) -> None:
     fresh.run("systemctl", "start", "shmmapd.socket")
-    told = shmmap(fresh, "doctor", user="alice").stdout
-    assert "waits for the first client" in told
+    text = shmmap(fresh, "doctor", user="alice").stdout
+    assert "waits for the first client" in text
     assert fresh.properties("shmmapd")["ActiveState"] == "inactive"
     made = fresh.shell("stat -c '%i %a %U:%G' /run/shmmap/default.sock")
     assert made.split()[1:] == ["660", "shmmap:shmmap"]
@@ -306,7 +306,10 @@ def test_administrators_reload_and_stop(fresh: BootedSystemd) -> None:
     waiting = Deadline()
     while waiting((unit := fresh.properties("shmmapd"))["ActiveState"] != "inactive"):
         pass
-    assert (unit["Result"], unit["NRestarts"]) == ("success", "0")  # it was meant: nobody starts it again
+    assert (unit["Result"], unit["NRestarts"]) == (
+        "success",
+        "0",
+    )  # it was intended: systemd does not start it again
 
 
 @pytest.mark.parametrize(
@@ -398,20 +401,20 @@ def test_a_client_that_waits_does_not_start_for_ever_what_stays_down(fresh: Boot
         fresh.run("systemctl", "start", "shmmapd.socket", check=False)
 
 
-def test_the_doctor_tells_each_user_what_is_wrong(fresh: BootedSystemd) -> None:
+def test_the_doctor_says_to_each_user_what_is_wrong(fresh: BootedSystemd) -> None:
     def findings(user: str = "") -> dict[str, str]:
-        told = json.loads(shmmap(fresh, "doctor", "--json", user=user).stdout)
-        return {one["name"]: f"{one['state']}: {one['fact']} {one['advice']}" for one in told["findings"]}
+        report = json.loads(shmmap(fresh, "doctor", "--json", user=user).stdout)
+        return {one["name"]: f"{one['state']}: {one['fact']} {one['advice']}" for one in report["findings"]}
 
     fresh.run("systemctl", "start", "shmmapd")
     well = findings("alice")
     assert {name for name, text in well.items() if text.startswith("fail")} == set(), well
     assert well["group"].startswith("ok: alice is a member of shmmap")
     assert well["open files"].startswith("ok: limit of the daemon")
-    stranger = findings("mallory")
-    assert stranger["group"].startswith("fail: mallory is not a member of shmmap")
-    assert "usermod -aG shmmap mallory" in stranger["group"]
-    assert stranger["socket"].startswith("fail")
+    outsider = findings("mallory")
+    assert outsider["group"].startswith("fail: mallory is not a member of shmmap")
+    assert "usermod -aG shmmap mallory" in outsider["group"]
+    assert outsider["socket"].startswith("fail")
     fresh.run("systemctl", "stop", "shmmapd")
     asleep = findings()
     assert asleep["map"].startswith("ok: /home/alice/autoware_map can be read by shmmap")
@@ -438,10 +441,10 @@ def test_segments_on_huge_pages(fresh: BootedSystemd) -> None:
         assert fresh.run("ls", "/run/shmmap_huge", user="mallory", check=False).returncode != 0
         options = fresh.shell("grep ' /run/shmmap_huge ' /proc/mounts").split()[3].split(",")
         assert {"huge=within_size", "mode=750", "nosuid", "nodev", "noexec"} <= set(options)
-        # who asks nobody finds it, too
+        # a program that asks no daemon finds it, too
         assert "/run/shmmap_huge" in shmmap(fresh, "status", user="alice").stdout
-        told = json.loads(shmmap(fresh, "doctor", "--json", user="alice").stdout)
-        (about,) = [one for one in told["findings"] if one["name"] == "huge pages"]
+        report = json.loads(shmmap(fresh, "doctor", "--json", user="alice").stdout)
+        (about,) = [one for one in report["findings"] if one["name"] == "huge pages"]
         assert about["fact"].startswith("on: /run/shmmap_huge has huge=within_size")
         again = shmmap(fresh, "unit", "install").stdout.splitlines()
         kept = [line.split()[1] for line in again if line.startswith("same ")]

@@ -28,7 +28,6 @@ from shmmap.errors import (
 from tests.support.daemon_process import ROOT
 
 UNITS = ROOT / "systemd"
-SYSTEM = sorted(path.name for path in (UNITS / "system").iterdir())
 USER = sorted(path.name for path in (UNITS / "user").iterdir())
 
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tree of errors: codes, what else an error is, and one clear line for a package that is missing."""
+"""The tree of errors: codes, what else an error is, and a clear line for a missing package or a bad file."""
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import subprocess
 import sys
@@ -14,8 +16,10 @@ import pytest
 import shmmap
 from shmmap import errors
 from shmmap.errors import (
+    CannotWrite,
     ConnectionLost,
     DaemonUnreachable,
+    MapDataError,
     NoAnswer,
     NoColumn,
     PackageMissing,
@@ -23,6 +27,7 @@ from shmmap.errors import (
     ShmmapWarning,
     error_from_wire,
 )
+from shmmap.formats.durable_file import writing_errors
 from shmmap.lazy_imports import needed_packages
 
 
@@ -155,11 +160,18 @@ def test_build_layer_is_one_of_those() -> None:
     ],
 )
 def test_what_loads_a_package_only_when_it_is_called_says_so_too(call: str, what: str) -> None:
-    code = CLIENT_ONLY.format(packages={"numba"}, code=f"__import__('shmmap') and {call}")
+    code = CLIENT_ONLY.format(packages={"numba"}, code=call)
     done = subprocess.run(
         [sys.executable, "-c", "import numpy\n" + code], capture_output=True, text=True, check=True
     )
     assert re.match(f"package_missing {what} needs the package numba", done.stdout), done.stdout
+
+
+def test_a_client_only_install_reads_live_maps_and_says_what_mapping_needs() -> None:
+    call = "shmmap.live.Voxels and shmmap.live.ScanFilter and shmmap.live.LiveMap.mapper(None, 'front')"
+    code = CLIENT_ONLY.format(packages={"numba", "xxhash", "zstandard"}, code=call)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("package_missing mapping needs the package numba"), done.stdout
 
 
 def test_all_public_errors_are_of_the_tree() -> None:
@@ -174,3 +186,29 @@ def test_no_other_public_name_is_that_of_a_module() -> None:
     here = Path(shmmap.__file__).parent
     modules = {path.stem for path in here.iterdir() if path.is_dir() or path.suffix == ".py"}
     assert modules & set(dir(shmmap)) == {"errors", "events", "layers", "live"}
+
+
+# --- files that cannot be written -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        NoAnswer("no map within 60 s", hint="`shmmap status` says more"),
+        ConnectionLost("the daemon ended"),
+        MapDataError("no cloud"),
+        PackageMissing("no package"),
+    ],
+)
+def test_our_own_errors_go_through(error: ShmmapError) -> None:
+    """Also those that are an OSError as well: a daemon that does not answer says nothing about a file."""
+    with pytest.raises(type(error)) as caught, writing_errors("out.json"):
+        raise error
+    assert caught.value is error
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EACCES, errno.EIO])
+def test_what_the_system_refuses_names_the_file(number: int) -> None:
+    with pytest.raises(CannotWrite) as caught, writing_errors("out.json"):
+        raise OSError(number, os.strerror(number))
+    assert caught.value.message == f"cannot write out.json: {os.strerror(number)}"

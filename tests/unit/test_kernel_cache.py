@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled kernels on disk: whatever is wrong with them they are compiled, and only trusted ones are run."""
+"""Compiled kernels on disk: damaged ones are compiled again, and only trusted ones are run."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import importlib.util
 import logging
@@ -20,6 +21,7 @@ from typing import Any
 import pytest
 
 from shmmap import kernel_cache
+from shmmap.layers import build
 
 pytest.importorskip("numba", reason="needs the package numba")
 
@@ -369,3 +371,34 @@ def test_kernels_that_came_with_an_image_are_used(
     kernel.directory.chmod(0o500)
     assert kernel.hits() == 1
     assert not warnings(caplog)
+
+
+# --- kernels are compiled by one process at a time, and what is compiled is marked ------------------------
+
+
+pytest.importorskip("numba", reason="needs the package numba")
+
+
+@pytest.fixture
+def mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    path = tmp_path / "layers.compiled"
+    monkeypatch.setattr(build, "compiled_mark", lambda: path)
+    return path
+
+
+def test_what_is_compiled_is_marked(mark: Path) -> None:
+    build.compile_kernels()
+    assert mark.exists()
+
+
+def test_another_process_is_left_at_it(mark: Path) -> None:
+    with mark.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        build.compile_kernels(wait=False)
+    assert not mark.exists()
+
+
+def test_where_nothing_can_be_kept_nothing_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "compiled_mark", lambda: None)
+    build.compile_kernels()
+    assert not list(tmp_path.iterdir())

@@ -20,7 +20,7 @@ else:
     import tomli as tomllib
 
 PAGES = all_pages()
-GUIDES = [name for name in PAGES if name != "CHANGELOG.md"]  # which tells of the past
+GUIDES = [name for name in PAGES if name != "CHANGELOG.md"]  # which is about the past
 
 
 def options(parser: argparse.ArgumentParser) -> set[str]:

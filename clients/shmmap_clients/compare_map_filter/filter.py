@@ -51,7 +51,7 @@ class Comparison:
         return np.flatnonzero(self.kept)
 
     def select(self, columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The kept rows of all columns of the scan."""
+        """Return the kept rows of all columns of the scan."""
         return {name: values[self.kept] for name, values in columns.items()}
 
 

@@ -68,7 +68,7 @@ _SIGNATURES: Final = [types.void(read_only(t, 2), *_ARGUMENTS) for t in (types.f
 
 
 @compiled(*_SIGNATURES)
-def explain(
+def explain(  # noqa: C901  its parts would take a dozen arguments each
     points: Any,
     T: Any,
     mode: Any,

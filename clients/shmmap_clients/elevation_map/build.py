@@ -382,7 +382,7 @@ def _build(
 def _load(
     client: Client, info: CellInfo, layer: str, wait_s: float, failed: list[CellError], map_version: int
 ) -> Cell | None:
-    """The cell in the state of the map that was listed; None if it cannot be loaded, which is remembered."""
+    """Load a cell as of the map version that was listed; None, and a row in ``failed``, if that fails."""
     answer = client.selected((info.id,), layer, wait=wait_s, strict=None)
     if answer.failed:
         failed += answer.failed

@@ -100,7 +100,7 @@ def write_hillshade(path: Path, grid: ElevationGrid, fill_radius: float) -> None
 
 @contextlib.contextmanager
 def _interim(path: Path) -> Iterator[Path]:
-    """A name to write to; what is there in the end takes the place of ``path``."""
+    """Yield a name to write to; what is there in the end takes the place of ``path``."""
     interim = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield interim

@@ -26,7 +26,7 @@ class ColumnBox(NamedTuple):
     j1: int
 
     def common(self, other: ColumnBox) -> ColumnBox:
-        """What both have; they must have something."""
+        """Intersect two boxes that overlap."""
         return ColumnBox(
             max(self.i0, other.i0), max(self.j0, other.j0), min(self.i1, other.i1), min(self.j1, other.j1)
         )
@@ -38,7 +38,7 @@ class ColumnBox(NamedTuple):
 
 
 def column_boxes(boxes: NDArray[np.float64], resolution: float) -> NDArray[np.int64]:
-    """The columns that cells touch, (N, 4) int64, each row a `ColumnBox`; ``boxes`` (N, 4), metres."""
+    """Return the columns that cells touch, (N, 4) int64, rows as `ColumnBox`; ``boxes`` (N, 4), metres."""
     margin = _MARGIN + _ROUNDING * np.abs(boxes).max(axis=1, keepdims=True)
     low = np.floor((boxes[:, :2] - margin) / resolution)
     high = np.floor((boxes[:, 2:] + margin) / resolution) + 1
@@ -57,7 +57,7 @@ class Columns:
         return len(self.i)
 
     def where(self, chosen: NDArray[np.bool_]) -> Columns:
-        """The chosen rows."""
+        """Select rows by a mask, (N,)."""
         return Columns(self.i[chosen], self.j[chosen], self.values[chosen])
 
     def inside(self, box: ColumnBox) -> NDArray[np.bool_]:
@@ -66,7 +66,7 @@ class Columns:
 
     @classmethod
     def joined(cls, parts: Sequence[Columns]) -> Columns:
-        """One after the other; there must be one."""
+        """Return these columns, one after the other; there must be one."""
         return cls(
             np.concatenate([part.i for part in parts]),
             np.concatenate([part.j for part in parts]),
@@ -96,7 +96,7 @@ class Seams:
         self._tallest = int((boxes[:, 3] - boxes[:, 1]).max(initial=0))
 
     def _near(self, number: int, box: ColumnBox) -> list[tuple[int, ColumnBox]]:
-        """The other cells that share columns with a cell, and which columns."""
+        """Find the other cells that share columns with a cell, and which columns."""
         begin, end = np.searchsorted(self._rows, (box.j0 - self._tallest, box.j1))
         some = self._by_row[begin:end]
         i0, j0, i1, j1 = self._boxes[some].T

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from shmmap.compiling import compiled
+from shmmap.compiling import compiled, inlined
 from shmmap_clients.elevation_map.heights import ElevationRule
 
 __all__ = ["surface_heights"]
@@ -46,12 +45,35 @@ def surface_heights(
     return columns, heights
 
 
-@numba.njit(inline="always")
+@inlined
 def _root(parent: Any, member: Any) -> Any:
     while parent[member] != member:
         parent[member] = parent[parent[member]]  # halves the path for the next lookup
         member = parent[member]
     return member
+
+
+@inlined
+def _join(xyz: Any, first: Any, size: Any, tolerance: Any, parent: Any) -> None:
+    """Join points of a column into clusters: ``parent`` leads from each to its cluster's lowest."""
+    squared = tolerance * tolerance
+    for k in range(size):
+        parent[k] = k
+        x, y, z = xyz[first + k, 0], xyz[first + k, 1], xyz[first + k, 2]
+        own = k
+        for other in range(k - 1, -1, -1):
+            d_z = z - xyz[first + other, 2]
+            if d_z > tolerance:
+                break
+            root = _root(parent, other)
+            if root == own:
+                continue
+            d_x, d_y = x - xyz[first + other, 0], y - xyz[first + other, 1]
+            if d_x * d_x + d_y * d_y + d_z * d_z <= squared:
+                # the older root stays: own may be it already
+                low, high = min(root, own), max(root, own)
+                parent[high] = low
+                own = low
 
 
 @compiled(
@@ -67,29 +89,12 @@ def _surface(xyz: Any, bounds: Any, tolerance: Any, height_range: Any, min_point
     parent = np.empty(largest, np.int64)
     count = np.empty(largest, np.int64)
     total = np.empty(largest, np.float64)
-    squared = tolerance * tolerance
     for n in range(heights.shape[0]):
         first, size = bounds[n], bounds[n + 1] - bounds[n]
         heights[n] = np.nan
         if size < min_points:
             continue
-        for k in range(size):
-            parent[k] = k
-            x, y, z = xyz[first + k, 0], xyz[first + k, 1], xyz[first + k, 2]
-            own = k
-            for other in range(k - 1, -1, -1):
-                d_z = z - xyz[first + other, 2]
-                if d_z > tolerance:
-                    break
-                root = _root(parent, other)
-                if root == own:
-                    continue
-                d_x, d_y = x - xyz[first + other, 0], y - xyz[first + other, 1]
-                if d_x * d_x + d_y * d_y + d_z * d_z <= squared:
-                    # the older root stays: own may be it already
-                    low, high = min(root, own), max(root, own)
-                    parent[high] = low
-                    own = low
+        _join(xyz, first, size, tolerance, parent)
         base = xyz[first, 2]
         for k in range(size):
             count[k] = 0

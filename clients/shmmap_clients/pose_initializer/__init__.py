@@ -25,13 +25,6 @@ if TYPE_CHECKING:
         Relocalizer,
     )
 
-__all__ = [
-    "Alternative",
-    "InitialPose",
-    "InitializerRules",
-    "PoseInitializer",
-    "Relocalizer",
-    "RoughPose",
-]
+__all__ = ["Alternative", "InitialPose", "InitializerRules", "PoseInitializer", "Relocalizer", "RoughPose"]
 
 __getattr__ = lazy_names(__name__)

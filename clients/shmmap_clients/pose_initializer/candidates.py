@@ -16,7 +16,7 @@ __all__ = ["ParzenEstimator", "RoughPose"]
 
 _UNKNOWN_YAW: Final = math.pi / math.sqrt(3.0)  # standard deviation of a uniform heading
 _DRAWS: Final = 100
-_MOST_GOOD: Final = 10
+_MAX_GOOD: Final = 10
 _REST_WEIGHT: Final = 5.0
 _KERNEL: Final = np.array([0.25, 0.25, math.radians(2.5)])
 
@@ -113,7 +113,7 @@ class ParzenEstimator:
     def next(self, count: int) -> NDArray[np.float64]:
         """Return (count, 3) candidates where good ones are expected."""
         drawn = self._draw(count * _DRAWS)
-        good = min(_MOST_GOOD, len(self._scores) // 10)
+        good = min(_MAX_GOOD, len(self._scores) // 10)
         if not good:
             return drawn[:count]
         order = np.argsort(-self._scores, kind="stable")
@@ -122,7 +122,7 @@ class ParzenEstimator:
         return np.asarray(drawn[chosen], np.float64)
 
     def learn(self, candidates: NDArray[np.float64], scores: NDArray[np.float64]) -> None:
-        """Add what candidates were worth; more is better."""
+        """Add candidates and their scores; a greater score is better."""
         self._tried = np.concatenate([self._tried, candidates])
         self._scores = np.concatenate([self._scores, scores])
 

@@ -334,7 +334,7 @@ class PoseInitializer:
                 VoxelMap(
                     kept,
                     max_voxels=limits.voxels,
-                    max_bytes=limits.most_map_bytes,
+                    max_bytes=limits.max_map_bytes,
                     centre=(rough.x, rough.y),
                     previous=self._map,
                 )

@@ -236,7 +236,7 @@ def _run(args: argparse.Namespace) -> int:
             _leave_out_mapped(args, drive, mapper)
         statistics = DriveStatistics(live if shown.usage else None)
         drive.run(lambda scan: map_scan(scan, mapper), statistics)
-        code = _settled(args, drive, mapper, statistics)
+        code = _wait_until_saved(args, drive, mapper, statistics)
         if args.picture:
             _draw(args, live, shown, statistics)
         _report(args, live, mapper, statistics)
@@ -268,7 +268,7 @@ def _frame(args: argparse.Namespace, parameters: Parameters | None) -> str:
     return ""
 
 
-def _settled(
+def _wait_until_saved(
     args: argparse.Namespace, drive: ScanDrive, mapper: LiveMapper, statistics: DriveStatistics
 ) -> int:
     """Wait until everything is in memory and on the disk; returns the exit code."""

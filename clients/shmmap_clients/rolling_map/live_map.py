@@ -141,14 +141,14 @@ class DriveStatistics:
 
 
 def usage_text(usage: LiveMapRow) -> str:
-    """What a map takes, in words: 1 234 567 active cells, 12.3 MB, 27 chunks."""
+    """Say how large a map is: 1 234 567 active cells, 12.3 MB, 27 chunks."""
     waiting = f", {usage.waiting_bytes / 1e6:.1f} MB waiting" if usage.waiting_bytes else ""
     active = f"{usage.active:,}".replace(",", " ")
     return f"{active} active cells, {usage.bytes / 1e6:.1f} MB, {usage.chunks} chunks{waiting}"
 
 
 def _usage_now(live: LiveMap) -> str:
-    """What the map takes; a daemon that is away keeps no scan from being read."""
+    """Say how large the map is now; a daemon that is away keeps no scan from being read."""
     try:
         return usage_text(live.status())
     except (DaemonUnreachable, LiveInterrupted):
@@ -205,7 +205,7 @@ def all_voxels(live: LiveMap, kind: str, scope: str = "memory") -> NDArray[np.fl
 
 
 def _box(low: NDArray[np.int64], high: NDArray[np.int64], resolution: float) -> Box:
-    """The box of voxels from ``low`` to below ``high``: no voxel has its middle on its faces."""
+    """Return the box of voxels from ``low`` to below ``high``: no voxel has its middle on its faces."""
     (x0, y0, z0), (x1, y1, z1) = (low * resolution).tolist(), (high * resolution).tolist()
     return Box(x0, y0, x1, y1, (z0, z1))
 

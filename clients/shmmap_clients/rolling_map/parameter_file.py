@@ -22,7 +22,7 @@ Value: TypeAlias = bool | float | str | None
 
 _ROS: Final = "ros__parameters"
 _DEEPEST: Final = 16
-_MOST_BYTES: Final = 1 << 20  # a parameter file has a few hundred
+_MAX_BYTES: Final = 1 << 20  # a parameter file has a few hundred
 _TRUE: Final = frozenset({"true", "yes", "on", "y"})
 _FALSE: Final = frozenset({"false", "no", "off", "n"})
 
@@ -58,12 +58,12 @@ def read_parameter_file(path: str | os.PathLike[str]) -> dict[str, Entry]:
     name = os.fspath(path)
     try:
         with Path(name).open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
+            data = file.read(_MAX_BYTES + 1)
     except FileNotFoundError:
         raise MapMissing(f"there is no file {name}") from None
     except OSError as error:
         raise ConfigError(f"{name}: {error.strerror}", origin=name) from error
-    if len(data) > _MOST_BYTES:
+    if len(data) > _MAX_BYTES:
         raise ConfigError(f"{name}: larger than a parameter file ever is", origin=name)
     try:
         text = data.decode("utf-8")
@@ -101,7 +101,7 @@ def _check_shape(text: str, name: str) -> None:
 
 
 def _parameters(root: yaml.Node, name: str) -> yaml.Node:
-    """What holds the parameters: the whole file, or what a node's ``ros__parameters`` is."""
+    """Find the mapping of parameters: the whole file, or the ``ros__parameters`` of a node."""
     if not isinstance(root, yaml.MappingNode):
         raise ConfigError(f"{name}: no parameters: need lines such as m_resolution: 0.05", origin=name)
     nodes: dict[str, yaml.Node] = {
@@ -141,7 +141,7 @@ def _named(node: yaml.Node, name: str, prefix: str) -> Iterator[tuple[str, yaml.
 
 
 def _value(node: yaml.Node) -> tuple[Value, str]:
-    """A value as ROS 2 understands it, which takes 1e-1 for a number; PyYAML does not."""
+    """Read a value as ROS 2 does, which takes 1e-1 for a number; PyYAML does not."""
     if not isinstance(node, yaml.ScalarNode):
         return None, ""
     text = str(node.value)

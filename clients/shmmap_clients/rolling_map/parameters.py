@@ -227,7 +227,7 @@ class Parameters(msgspec.Struct, frozen=True):
         )
 
     def check_map(self, live: LiveMap) -> None:
-        """Refuse a live map that is not as the file has it; what the file leaves out may be anything.
+        """Refuse a live map that differs from the file; what the file leaves out may be anything.
 
         Raises
         ------
@@ -249,7 +249,7 @@ class Parameters(msgspec.Struct, frozen=True):
                     f"{origin}: {key} is {value}, but the live map {live.name} has {has[key]}",
                     key=key,
                     origin=origin,
-                    hint="`shmmap-rolling config` says how the daemon makes a map as the file has it",
+                    hint="`shmmap-rolling config` says how the daemon makes a map as in the file",
                 )
 
 
@@ -329,7 +329,7 @@ def _made(
     entries: Mapping[str, Entry],
     **others: Any,
 ) -> Any:
-    """Make a structure of the values; what it refuses is named as in the file, with the line."""
+    """Make a structure of the values; an error uses the file's name for the value, and its line."""
     given = {ours: values[name] for name, ours in names.items() if name in values}
     try:
         return kind(**given, **others)

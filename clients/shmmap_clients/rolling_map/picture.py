@@ -45,11 +45,11 @@ class _Look(NamedTuple):
     text: str
 
     def area(self) -> dict[str, str | float | None]:
-        """Attributes of a square's area, which lies below voxels."""
+        """Return attributes of a square's area, which is drawn below the voxels."""
         return {"fill": self.colour, "fill_opacity": self.opacity}
 
     def outline(self) -> dict[str, str | float | None]:
-        """Attributes of a square's outline, which lies above them."""
+        """Return attributes of a square's outline, which is drawn above the voxels."""
         return {"stroke": self.colour, "stroke_opacity": 0.8, "stroke_width": 1.2 if self.opacity else 0.8}
 
 

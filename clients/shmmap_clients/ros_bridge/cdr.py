@@ -11,9 +11,9 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import Final
 
-__all__ = ["MOST_BYTES", "CdrWriter", "Content"]
+__all__ = ["MAX_BYTES", "CdrWriter", "Content"]
 
-MOST_BYTES: Final = 2**31 - 1
+MAX_BYTES: Final = 2**31 - 1
 """Largest sample that CycloneDDS sends (``Internal/MaxSampleSize``), 2 GiB: lengths in it are of 32 bits."""
 
 _ENCAPSULATION: Final = b"\x00\x01\x00\x00"  # CDR_LE, no options
@@ -124,8 +124,8 @@ class CdrWriter:
             It has more bytes than DDS can send.
         """
         size = len(_ENCAPSULATION) + self.size
-        if size > MOST_BYTES:
-            raise ValueError(f"{size} bytes, of at most {MOST_BYTES}")
+        if size > MAX_BYTES:
+            raise ValueError(f"{size} bytes, of at most {MAX_BYTES}")
         made = Content() if over is None else over
         nbytes = size + -size % 4
         if len(made) < nbytes:

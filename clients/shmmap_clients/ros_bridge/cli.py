@@ -26,7 +26,7 @@ __all__ = ["main"]
 
 _NAME: Final = "shmmap-ros-bridge"
 _GB: Final = 10**9
-_MOST_GB: Final = (2**31 - 1) / _GB
+_MAX_GB: Final = (2**31 - 1) / _GB
 _NAMES: Final = ("partial", "differential", "selected", "metadata", "whole", "live")
 _EPILOG: Final = """\
 Names, in the namespace unless they begin with a slash; --name WHAT=NAME changes one:
@@ -98,7 +98,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--whole-map-limit",
         type=positive,
-        default=_MOST_GB,
+        default=_MAX_GB,
         metavar="GB",
         help="refuse to if it takes more (default and most: 2.147, the largest message of CycloneDDS)",
     )

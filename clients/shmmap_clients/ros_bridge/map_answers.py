@@ -30,14 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shmmap import AutowareSquare, Cell, CellInfo, CellSet, Client
-from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
+from shmmap_clients.ros_bridge.cdr import MAX_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.messages import GetDifferentialRequest, GetPartialRequest
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, write_cloud
 from shmmap_clients.ros_bridge.worker import StillLoading, TooLarge, no_followup
 
-__all__ = ["MOST_REQUESTERS", "Catalogue", "MapAnswers", "RecentCells", "Requesters", "sensible", "touches"]
+__all__ = ["MAX_REQUESTERS", "Catalogue", "MapAnswers", "RecentCells", "Requesters", "sensible", "touches"]
 
-MOST_REQUESTERS: Final = 256
+MAX_REQUESTERS: Final = 256
 """Clients that are remembered; beyond that, the one with the oldest request is forgotten."""
 
 
@@ -104,7 +104,7 @@ class Requesters:
         How many clients are remembered.
     """
 
-    def __init__(self, most: int = MOST_REQUESTERS) -> None:
+    def __init__(self, most: int = MAX_REQUESTERS) -> None:
         self._most = most
         self._versions: OrderedDict[str, dict[str, int]] = OrderedDict()
 
@@ -167,8 +167,8 @@ _TURN_S: Final = 1.0
 """How long others wait for cells that one client's request has loaded."""
 _SLICE_CELLS: Final = 10_000
 _SLICE_BYTES: Final = 1 << 20
-"""Of one request to the daemon: it refuses those for more than 20 000 cells, or of more than 4 MiB."""
-_MOST_CELLS: Final = 100_000
+"""Cells and bytes of one request to the daemon, which accepts at most 20 000 cells and 4 MiB."""
+_MAX_CELLS: Final = 100_000
 """Of one answer, repetitions included."""
 _NAMED: Final = 3
 _REUSED_BYTES: Final = 16 << 20
@@ -204,10 +204,10 @@ def touches(area: Any, boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 class RecentCells:
-    """At most 64 MiB of cells that were answered with a moment ago.
+    """Cells of recent answers, at most 64 MiB.
 
-    Mapping a cell takes as long as sending it, and other clients ask for the same one.  Cells are kept until
-    there was no request for two seconds; then the daemon may evict them.
+    Mapping a cell takes as long as sending it, and other clients often ask for the same one.  After two
+    seconds without a request all are dropped, so that the daemon may evict them.
     """
 
     def __init__(self) -> None:
@@ -343,7 +343,7 @@ class MapAnswers:
         return [one for one, take in zip(self._catalogue.cells, inside, strict=True) if take]
 
     def _known(self, ids: Sequence[str]) -> Sequence[str]:
-        """These ids, of very many those that the map has: the others are left out of answers anyway."""
+        """Return the ids; of very many only those of the map: answers leave out the others anyway."""
         if _is_one_slice(ids):
             return ids
         self._catalogue.refresh(self._client)
@@ -351,8 +351,8 @@ class MapAnswers:
         return [one for one in ids if one in known]
 
     def _selected(self, ids: Sequence[str]) -> Sequence[Cell]:
-        if len(ids) > _MOST_CELLS:
-            raise TooLarge(f"{len(ids):,} cells in one request", hint=f"ask for at most {_MOST_CELLS:,}")
+        if len(ids) > _MAX_CELLS:
+            raise TooLarge(f"{len(ids):,} cells in one request", hint=f"ask for at most {_MAX_CELLS:,}")
         found: list[Cell] = []
         for some in _slices(ids):
             found += self._all(lambda wait, some=some: self._client.selected(some, wait=wait, strict=None))  # type: ignore[misc]
@@ -410,9 +410,9 @@ class MapAnswers:
             writer.text(cell.id)
             write_cloud(writer, columns, cell.origin, layout)
             writer.float32(*cell.box)
-            if writer.size > MOST_BYTES:  # repetitions of a large cell: thousands more would take long
+            if writer.size > MAX_BYTES:  # repetitions of a large cell: thousands more would take long
                 raise TooLarge(
-                    f"an answer of more than {MOST_BYTES} bytes", hint="ask for fewer cells at once"
+                    f"an answer of more than {MAX_BYTES} bytes", hint="ask for fewer cells at once"
                 )
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 from cyclonedds.pub import DataWriter
 
 from shmmap import BadRequest, CellInfo, Client, LoadFailed
-from shmmap_clients.ros_bridge.cdr import MOST_BYTES, CdrWriter, Content
+from shmmap_clients.ros_bridge.cdr import MAX_BYTES, CdrWriter, Content
 from shmmap_clients.ros_bridge.map_answers import Catalogue, MapAnswers, Requesters
 from shmmap_clients.ros_bridge.messages import MapMetaData, PointCloud2, ready_made
 from shmmap_clients.ros_bridge.point_cloud import CloudLayout, cloud_layout, fill_rows, write_cloud_head
@@ -25,7 +25,7 @@ _EVERY_S: Final = 1.0
 
 
 def _whole_map(
-    client: Client, cells: Collection[CellInfo], stamp_ns: int, *, most_bytes: int = MOST_BYTES, wait_s: float
+    client: Client, cells: Collection[CellInfo], stamp_ns: int, *, max_bytes: int = MAX_BYTES, wait_s: float
 ) -> Content:
     """Return all points of the map as a ``PointCloud2`` in the map's frame, for ``/map/pointcloud_map``.
 
@@ -44,7 +44,7 @@ def _whole_map(
         All of the map, in the order in which their points come.
     stamp_ns
         Time in the header.
-    most_bytes
+    max_bytes
         Size of the message at most.
     wait_s
         How long a cell may take to load.
@@ -58,7 +58,7 @@ def _whole_map(
     """
     layout: CloudLayout | None = None
     points, data = 0, bytearray()
-    most = min(most_bytes, MOST_BYTES) - _HEAD_BYTES
+    most = min(max_bytes, MAX_BYTES) - _HEAD_BYTES
     read_bytes = 0
     for info in cells:
         found = client.selected([info.id], wait=wait_s, strict=None).raise_for_failures()
@@ -75,7 +75,7 @@ def _whole_map(
             whole_bytes = (place + nbytes) / max(read_bytes, 1) * sum(one.source_bytes for one in cells)
             raise BadRequest(
                 f"the whole map takes about {whole_bytes / 1e9:.3g} GB as a PointCloud2, and"
-                f" {most_bytes / 1e9:.3g} GB is the most",
+                f" {max_bytes / 1e9:.3g} GB is the most",
                 hint="leave out --whole-map: clients get the cells that they need from the services",
             )
         data.extend(bytes(nbytes))
@@ -192,7 +192,7 @@ class MapWorker(Worker):
                 self._client,
                 self._catalogue.cells.values(),
                 now_ns,
-                most_bytes=self._whole_bytes,
+                max_bytes=self._whole_bytes,
                 wait_s=self._wait_s,
             )
             self._whole.write(ready_made(PointCloud2, cloud))

@@ -225,7 +225,7 @@ class MapMetaData(IdlStruct, typename="autoware_map_msgs::msg::dds_::PointCloudM
 @dataclass
 @sample
 class GetPartialRequest(IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Request_"):
-    """Which cells touch an area?"""
+    """A request for the cells that touch an area."""
 
     client: uint64
     number: int64
@@ -237,7 +237,7 @@ class GetPartialRequest(IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPa
 class GetPartialResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetPartialPointCloudMap_Response_"
 ):
-    """Those cells, in the order of their ids."""
+    """The cells that touch the area, in the order of their ids."""
 
     client: uint64
     number: int64
@@ -250,7 +250,7 @@ class GetPartialResponse(
 class GetDifferentialRequest(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Request_"
 ):
-    """Which cells touch an area, beside those that the client has?"""
+    """A request for the cells that touch an area, without those that the client has."""
 
     client: uint64
     number: int64
@@ -263,7 +263,7 @@ class GetDifferentialRequest(
 class GetDifferentialResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetDifferentialPointCloudMap_Response_"
 ):
-    """Those cells, and which ids the client may drop."""
+    """The cells that are new to the client, and the ids that it may drop."""
 
     client: uint64
     number: int64
@@ -277,7 +277,7 @@ class GetDifferentialResponse(
 class GetSelectedRequest(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Request_"
 ):
-    """Which cells have these ids?"""
+    """A request for the cells with these ids."""
 
     client: uint64
     number: int64
@@ -289,7 +289,7 @@ class GetSelectedRequest(
 class GetSelectedResponse(
     IdlStruct, typename="autoware_map_msgs::srv::dds_::GetSelectedPointCloudMap_Response_"
 ):
-    """Those cells, in the order asked for."""
+    """The cells, in the order asked for."""
 
     client: uint64
     number: int64
@@ -342,7 +342,7 @@ class GetOccupiedRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupie
 @dataclass
 @sample
 class GetOccupiedResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetOccupiedVoxels_Response_"):
-    """Those voxels; the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
+    """The voxels; the map's counts; ``occupancy_ratio`` is occupied / (occupied + free)."""
 
     client: uint64
     number: int64
@@ -367,7 +367,7 @@ class GetFreeRequest(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_
 @dataclass
 @sample
 class GetFreeResponse(IdlStruct, typename="bonxai_msgs::srv::dds_::GetFreeVoxels_Response_"):
-    """Those voxels, as in `GetOccupiedResponse`."""
+    """The voxels, as in `GetOccupiedResponse`."""
 
     client: uint64
     number: int64

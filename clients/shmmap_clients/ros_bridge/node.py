@@ -22,7 +22,7 @@ from cyclonedds.topic import Topic
 
 from shmmap import Client
 from shmmap.live import LiveMap
-from shmmap_clients.ros_bridge.cdr import MOST_BYTES
+from shmmap_clients.ros_bridge.cdr import MAX_BYTES
 from shmmap_clients.ros_bridge.live_worker import LIVE_SERVICES, LiveWorker
 from shmmap_clients.ros_bridge.map_worker import MapWorker
 from shmmap_clients.ros_bridge.messages import (
@@ -90,7 +90,7 @@ class BridgeSettings(msgspec.Struct, frozen=True):
     names: Mapping[str, str] = {}
     wait_s: float = 30.0
     whole_map: bool = False
-    whole_bytes: int = MOST_BYTES
+    whole_bytes: int = MAX_BYTES
     voxels_every_s: float = 1.0
 
     def name(self, what: str) -> str:
@@ -292,7 +292,7 @@ class RosBridge:
                 "node": resolved(self._settings.node, self._settings.namespace),
                 "clients": clients,
                 "remembered": self._map.requesters,
-                "strangers": self._incompatible.now,
+                "incompatible": self._incompatible.now,
             }
         )
 

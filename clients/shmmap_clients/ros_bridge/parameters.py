@@ -117,7 +117,7 @@ class ListParametersResult(IdlStruct, typename="rcl_interfaces::msg::dds_::ListP
 @dataclass
 @sample
 class GetParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameters_Request_"):
-    """Values of these parameters?"""
+    """A request for the values of parameters."""
 
     client: uint64
     number: int64
@@ -137,7 +137,7 @@ class GetParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::GetP
 @dataclass
 @sample
 class GetParameterTypesRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::GetParameterTypes_Request_"):
-    """Types of these parameters?"""
+    """A request for the types of parameters."""
 
     client: uint64
     number: int64
@@ -201,7 +201,7 @@ class SetParametersAtomicallyResponse(
 @dataclass
 @sample
 class ListParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Request_"):
-    """Which parameters are there below these prefixes, ``depth`` levels down (0: all)?"""
+    """A request for the names of parameters below prefixes, ``depth`` levels down (0: all)."""
 
     client: uint64
     number: int64
@@ -212,7 +212,7 @@ class ListParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::List
 @dataclass
 @sample
 class ListParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::ListParameters_Response_"):
-    """Their names and prefixes."""
+    """The names and prefixes."""
 
     client: uint64
     number: int64
@@ -222,7 +222,7 @@ class ListParametersResponse(IdlStruct, typename="rcl_interfaces::srv::dds_::Lis
 @dataclass
 @sample
 class DescribeParametersRequest(IdlStruct, typename="rcl_interfaces::srv::dds_::DescribeParameters_Request_"):
-    """What are these parameters?"""
+    """A request for descriptions of parameters."""
 
     client: uint64
     number: int64
@@ -307,7 +307,7 @@ class Parameters:
         return {"result": SetParametersResult(not names, reason)}
 
     def _known(self, names: Sequence[str]) -> Sequence[str]:
-        """The names; none of them where one is unknown, for which rclcpp gives an empty answer."""
+        """Return the names, or none where one is unknown: then rclcpp gives an empty answer."""
         return names if all(name in self._values for name in names) else ()
 
     def _value(self, name: str) -> ParameterValue:

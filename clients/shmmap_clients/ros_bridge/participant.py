@@ -24,7 +24,7 @@ from shmmap import BadRequest
 from shmmap.errors import CannotStart
 
 __all__ = [
-    "MOST_DOMAIN",
+    "MAX_DOMAIN",
     "close",
     "endpoint_qos",
     "node_name",
@@ -38,7 +38,7 @@ __all__ = [
 
 _NAME: Final = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _MOST: Final = 200  # DDS allows 255, with a prefix, a suffix and the parameter services' own part
-MOST_DOMAIN: Final = 232
+MAX_DOMAIN: Final = 232
 """Highest number of a domain: those above have no UDP ports."""
 _LOCALHOST: Final = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
@@ -114,8 +114,8 @@ def open_participant(domain: int) -> tuple[Domain, DomainParticipant]:
     BadRequest
         There is no such domain.
     """
-    if not 0 <= domain <= MOST_DOMAIN:
-        raise BadRequest(f"there is no domain {domain}", hint=f"it is 0 to {MOST_DOMAIN}")
+    if not 0 <= domain <= MAX_DOMAIN:
+        raise BadRequest(f"there is no domain {domain}", hint=f"it is 0 to {MAX_DOMAIN}")
     try:
         joined = Domain(domain, settings())
     except DDSException as error:

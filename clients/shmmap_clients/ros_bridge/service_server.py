@@ -84,7 +84,7 @@ class Tries:
     ----------
     begun_s
         When the first time that the daemon was there, on the clock of `time.monotonic`; 0: not yet.
-    again
+    was_requeued
         It has been put back: its client may have gone.
     failed
         How often it failed although the daemon answered something else in between.
@@ -93,7 +93,7 @@ class Tries:
     """
 
     begun_s: float = 0.0
-    again: bool = False
+    was_requeued: bool = False
     failed: int = 0
     answers: int = -1
 

@@ -22,8 +22,8 @@ from shmmap_clients.ros_bridge.cdr import Content
 from shmmap_clients.ros_bridge.service_server import Listening, Request, Tries
 
 __all__ = [
-    "MOST_OF_ONE",
-    "MOST_WAITING",
+    "MAX_PER_CLIENT",
+    "MAX_WAITING",
     "StillLoading",
     "TooLarge",
     "WaitingRequests",
@@ -31,13 +31,13 @@ __all__ = [
     "no_followup",
 ]
 
-MOST_OF_ONE: Final = 4
+MAX_PER_CLIENT: Final = 4
 """Of one client: rclcpp nodes have one under way."""
-MOST_WAITING: Final = 1024
+MAX_WAITING: Final = 1024
 LATER: Final = (DaemonUnreachable, NoSession, Busy, LiveInterrupted, StaleHandle)
 """Errors that pass by themselves."""
 _AGAIN_S: Final = 0.2
-_MOST_FAILED: Final = 5
+_MAX_FAILED: Final = 5
 """Tries of one request that fail while the daemon answers others."""
 Answer = tuple[Content, Callable[[], None]]
 
@@ -56,15 +56,15 @@ class WaitingRequests:
     def put(self, request: Request) -> bool:
         """Append a request; False if there are too many.  Of one client's the oldest then makes room."""
         mine = self._of.get(request.requester.name, ())
-        if len(mine) >= MOST_OF_ONE:
+        if len(mine) >= MAX_PER_CLIENT:
             self._forget(mine[0])
-        if len(self._queue) >= MOST_WAITING:
+        if len(self._queue) >= MAX_WAITING:
             return False
         last = self._queue[mine[-1]][0] + 1 if mine else self._round
         self._append(max(last, self._round), request)
         return True
 
-    def again(self, request: Request) -> None:
+    def requeue(self, request: Request) -> None:
         """Put back what could not be answered yet: every other client comes first."""
         self._append(self._round + 1, request)
 
@@ -128,7 +128,7 @@ class Worker(ABC):
 
     @abstractmethod
     def answer(self, message: Any, request: Request) -> Answer:
-        """Return a reply, and what to call when it was sent."""
+        """Return a reply, and a function to call once the reply has been sent."""
 
     @abstractmethod
     def empty(self, message: Any) -> Content:
@@ -156,7 +156,7 @@ class Worker(ABC):
 
     def _serve(self, request: Request) -> None:
         server, tries = request.server, request.tries
-        if tries.again and server.gone(request):
+        if tries.was_requeued and server.gone(request):
             return
         tries.begun_s = tries.begun_s or time.monotonic()
         try:
@@ -189,15 +189,15 @@ class Worker(ABC):
                 done()
 
     def _try_again(self, request: Request) -> None:
-        request.tries.again = True
-        self._waiting.again(request)
+        request.tries.was_requeued = True
+        self._waiting.requeue(request)
 
     def _has_failed(self, tries: Tries) -> bool:
         """Whether it is this request that fails, and not the daemon that is away."""
         if self._answered > tries.answers:
             tries.answers = self._answered
             tries.failed += 1
-        return tries.failed >= _MOST_FAILED
+        return tries.failed >= _MAX_FAILED
 
     def _guarded_tick(self) -> None:
         try:

@@ -245,7 +245,7 @@ def _no_coordinates(xyz: NDArray[Any]) -> str:
 
 
 def _no_intensity(values: NDArray[Any]) -> str:
-    """Say why numbers are no intensity; empty where they may be."""
+    """Return why numbers cannot be intensities, or an empty text if they can."""
     finite = values[np.isfinite(values)]
     good = (finite >= 0) & (finite <= _LARGEST_INTENSITY)
     if not _too_many(~good):

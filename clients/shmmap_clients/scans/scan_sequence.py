@@ -70,9 +70,9 @@ class Scan:
 
 
 class ScanSequence:
-    """The scans in a directory (PCD, NPZ or ``.bin``), by name, ``s_9`` before ``s_10``; read when
-    their turn comes.
+    """The scans in a directory (PCD, NPZ or ``.bin``), by name, ``s_9`` before ``s_10``.
 
+    They are read when their turn comes.
     See `pair_with_poses` for which scan has which pose, and for their order then.
 
     Parameters

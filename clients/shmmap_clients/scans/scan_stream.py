@@ -5,7 +5,7 @@ A message has a first frame in msgpack, ``{"shmmap_scan": 1, "name", "stamp_s", 
 and one frame of plain bytes for each column.  ``pose`` is null or 16 numbers, the rows of
 T_map_sensor; ``columns`` are ``[name, dtype, shape]`` with numpy's dtype strings (``"<f4"``), in the
 order of the frames.  ``"no_map": true`` comes with a filtered scan that had no map around it.
-``"last": true`` (without columns) says that no more scans come; it may come again and again until its reader
+``"last": true`` (without columns) says that no more scans come; it may be repeated until its reader
 unsubscribes.
 """
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from shmmap.cli.screens.output import Column, format_bytes, format_duration, print_line, print_table
-from shmmap.demo.progress import Progress
+from shmmap.demo.program import Progress
 
 if TYPE_CHECKING:
     from rich.live import Live

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How verbs print: lines, aligned text, a table on a terminal, or JSON.
+r"""How verbs print: lines, aligned text, a table on a terminal, or JSON.
 
 Everything a verb prints leaves through here.  Names of clients, processes, files and cells were chosen by
 others: a name may hold the codes that move a terminal's cursor or rename its window.  So whatever cannot be
-printed is shown escaped (``\\x1b``), in this one place.
+printed is shown escaped (``\x1b``), in this one place.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class Column(NamedTuple):
 
 
 def printable(text: str) -> str:
-    """Return ``text`` with everything that no terminal should be sent written as Python writes it.
+    r"""Return ``text`` with unprintable characters replaced by Python escapes, such as ``\x1b``.
 
-    That is control and format characters, line breaks, and the bytes of a file's name that are no text.
+    These are control and format characters, line breaks, and bytes of a file name that are no text.
     """
     if text.isprintable():
         return text

@@ -92,7 +92,7 @@ def top_view_svg(
     others: Sequence[Vehicle] = (),
     windows: Sequence[tuple[BoxTuple, str]] = (),
 ) -> str:
-    """Return the picture.
+    """Draw the map from above; return the SVG text.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def top_view_svg(
     driven
         The route behind the vehicle, (x, y) each, metres.
     vehicle, others
-        The one that drove the route, and more.
+        The vehicle that drove the route, and further ones.
     windows
         Rectangles that clients follow, metres, and their tooltips.
     """

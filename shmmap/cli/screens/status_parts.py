@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
-from shmmap.doctor.signed_map import signature_lines, trust_problems
+from shmmap.doctor.verdicts import signature_lines, trust_problems
 from shmmap.quantities import counted, format_bytes, format_duration, format_utc
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ STATE_STYLES: Final = {
 
 
 def live_problems(row: LiveMapRow) -> list[str]:
-    """What is wrong with a live map, a line each."""
+    """List what is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
     if row.damaged_count:
         found.append(f"damaged files, missing chunks: {row.damaged_count:,}; `shmmap live ls` names them")

@@ -227,7 +227,7 @@ def _quantiles(histogram: Histogram) -> str:
 
 
 def _longest_turns(counters: dict[str, int]) -> list[Line]:
-    """What others have waited for at most, longest first: some that took over a millisecond, else one."""
+    """Show the turns that others waited for longest: some that took over a millisecond, else one."""
     longest = {kind: counters.get(f"longest_turn_{kind}_ns", 0) for kind in TURN_KINDS}
     shown = sorted(longest, key=lambda kind: -longest[kind])
     named = [kind for kind in shown if longest[kind] >= WORTH_SHOWING_NS][:3] or shown[:1]

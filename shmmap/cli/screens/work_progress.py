@@ -56,7 +56,7 @@ class StageProgress:
         self._stage_s = self._shown_s = self._began_s
 
     def stage(self, name: str, total: int) -> None:
-        """A stage begins."""
+        """Begin a stage."""
         self._end_line()
         self._name, self._total, self._points, self._counted_from = name, total, 0, -1
         self._unit, self._scale, self._digits = self._units[total >= self._units[1][1]]
@@ -82,7 +82,7 @@ class StageProgress:
         self._total = 0
 
     def text(self, now: float) -> str:
-        """The line as it would be shown at ``now``, `time.monotonic`."""
+        """Return the line as it would be shown at ``now``, `time.monotonic`."""
         part = f"{self._points / self._total:4.0%}  " if self._total else ""
         text = f"{self._name}  {part}{self._number(self._points)} of {self._number(self._total)} {self._unit}"
         spent = now - self._stage_s

@@ -213,9 +213,9 @@ class ChunkReader:
         count = int(steps.max(initial=0)) + 1
         at = np.minimum(np.arange(count), steps[:, None])
         delta = last.astype(np.int64) - first
-        way = np.abs(delta)[:, None, :] * at[:, :, None]
+        travelled = np.abs(delta)[:, None, :] * at[:, :, None]
         whole = np.maximum(steps, 1)[:, None, None]
-        moved = np.sign(delta)[:, None, :] * ((2 * way + whole) // (2 * whole))
+        moved = np.sign(delta)[:, None, :] * ((2 * travelled + whole) // (2 * whole))
         voxels = (first[:, None, :] + moved).astype(np.int32)
         hit = self._look_up(voxels.reshape(-1, 3)).reshape(len(first), count) > self._place().occupied_above
         which = hit.argmax(axis=1)

@@ -78,7 +78,7 @@ class Voxels:
 
     @property
     def xyz(self) -> NDArray[np.float64]:
-        """Their centres, (N, 3) metres in the map's frame."""
+        """The voxels' centres, (N, 3) metres in the map's frame."""
         return voxel_centers(self.indices, self.resolution)
 
     @property

@@ -71,7 +71,7 @@ class _Sender:
     error
         Why a scan, and all after it, did not get into the map.
     trouble
-        Why the next one is not in the map yet: it is sent again and again.
+        Why the next one is not in the map yet: it is sent until it is.
     changed
         Notified when one of these changes.
     """
@@ -126,7 +126,7 @@ class _Sender:
         self._thread.join(timeout_s)
 
     def save(self, timeout_s: float) -> int:
-        """Have everything saved, when all is applied; return the number up to which scans are durable."""
+        """Save everything, when all is applied; return the number up to which scans are durable."""
         reply = until_served(
             lambda: self._connection.ask(
                 messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
@@ -318,7 +318,7 @@ class LiveMapper:
         return sender.applied
 
     def wait_durable(self, timeout_s: float = 300.0) -> int:
-        """Have everything saved; return the number up to which all scans are on the disk.
+        """Save everything; return the number up to which all scans are on the disk.
 
         Raises as `wait_applied`.
         """

@@ -162,7 +162,7 @@ class WindowFollower:
                 self._over.get(timeout=_OVER_S)
 
     def request_stop(self) -> None:
-        """Have the thread end."""
+        """Ask the thread to end."""
         self._stopping = True
         self._mailbox.put(None)
 

@@ -229,7 +229,7 @@ class MapWindow:
     def wait_until_current(self, timeout: float) -> bool:
         """Wait until the window answers the latest pose and nothing is being loaded.
 
-        Cells that cannot be had (see `WindowUpdate.failed`) do not hold it up, except those that wait for
+        Cells that cannot be loaded (see `WindowUpdate.failed`) do not hold it up, except those that wait for
         memory, or for an origin that cannot be reached.
 
         Returns
@@ -267,9 +267,9 @@ class MapWindow:
     def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
         """Whether all that the map has within a circle is in the window, in all its layers.
 
-        False where the circle reaches beyond what was last answered, where it touches a cell that has
-        failed, while any cell of the window is being loaded, of which no older version is attached, and while
-        the daemon does not know all that the map has in the window.
+        It is False if the circle reaches beyond the last answer or touches a cell that has failed; while a
+        cell of the window is being loaded and has no older version attached; and while the daemon does not
+        know all cells in the window.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ class MapWindow:
         return dict(self._follower.state.versions)
 
     def points_around(self, x: float, y: float, radius: float, *, layer: str | None = None) -> PointsAround:
-        """Views of the window's cells that touch a circle; nothing is copied.
+        """Return views of the window's cells that touch a circle; nothing is copied.
 
         `PointsAround.covered` says whether they are all that the map has there: a pose that has jumped, or
         outrun a daemon that died, is not to be mistaken for an empty place.

@@ -115,7 +115,7 @@ class WindowRefresher:
             del first
         now_s = time.monotonic()
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
-            # what is kept beyond the window may be outdated, or in the way of what is in it
+            # what is kept beyond the window may be outdated, or take the memory that cells in it need
             self.retained.clear()
         progress = bool(answer.cells or answer.removed)
         if not progress:

@@ -42,7 +42,7 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
     pending : tuple of PendingLayer
         Cells still being loaded.
     failed : tuple of CellError
-        Cells that cannot be had at present.
+        Cells that cannot be loaded at present.
     current : bool
         Whether the window answers the pose just given.  In the background mode it may still answer an
         earlier one.

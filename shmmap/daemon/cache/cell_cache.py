@@ -65,7 +65,7 @@ class CellCache:
     evictor, reclaimer
         Make room; give memory back.
     holders, survey
-        Who maps a segment; who maps how much in all.
+        Which processes map a segment, and how much each maps in all.
     events
         Reports what happens to cells.
     warm

@@ -90,7 +90,7 @@ class _Sorted:
             del self._blocks[at], self._lasts[at]
 
     def greatest(self, count: int) -> list[_Entry]:
-        """The greatest entries, greatest first."""
+        """Return the greatest entries, greatest first."""
         found: list[_Entry] = []
         for block in reversed(self._blocks):
             found += block[: -1 - (count - len(found)) : -1]
@@ -121,7 +121,7 @@ class Deferred:
             heapq.heappush(self._heap, (until_s, self._number, resident))
 
     def take(self, resident: Resident) -> bool:
-        """Remove a segment; whether it was there."""
+        """Remove a segment, and return whether it was there."""
         return self._until_s.pop(resident, None) is not None
 
     def first(self) -> tuple[float, Resident] | None:
@@ -238,7 +238,7 @@ class EvictionOrder:
         return [entry.resident for entry in front]
 
     @property
-    def settled(self) -> bool:
+    def all_scored(self) -> bool:
         """Whether all have been scored."""
         return not self.new
 

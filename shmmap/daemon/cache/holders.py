@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who maps which segments, and how much memory that is: asked of the kernel, a turn's worth at a time.
+"""Which processes map which segments, and how much memory that is: asked of the kernel, some in each turn.
 
 One look at a segment takes about 30 us, and there may be thousands.  One walk over all of them keeps the
 gauges of the statistics up to date, a turn a beat.  For a session that asks, a new walk begins and takes one
@@ -45,7 +45,7 @@ MAX_ASKED: Final = 16
 
 @dataclass(eq=False, slots=True)
 class Holders:
-    """Finds who has segments locked, and which sessions these are."""
+    """Finds which processes have segments locked, and which sessions these are."""
 
     reclaimer: Reclaimer
 
@@ -83,11 +83,11 @@ class Holders:
         return known
 
     def of(self, resident: Resident) -> tuple[Holder, ...]:
-        """Return who keeps a segment; session 0 is "unknown": a pin without our lock."""
+        """Return the holders of a segment; session 0 is "unknown": a pin without our lock."""
         return tuple(self._as_holders({slot: [resident.nbytes, 1] for slot in self._users_of(resident)}))
 
     def look(self, found: list[Holder]) -> Iterator[None]:
-        """Find who keeps most memory, a segment a step, and add them to ``found`` in the end, largest first.
+        """Find the holders of most memory, a segment a step; at the end ``found`` has them, largest first.
 
         The number of segments is bounded, and so is the time that they take.
         """
@@ -183,7 +183,7 @@ class Survey:
         return float("inf") if self.idle else self._rests_until_s
 
     def ask(self, session: Session, answer: Answer) -> None:
-        """Have ``answer`` called with the result of a walk that begins after now.
+        """Call ``answer`` later with the result of a walk that begins after now.
 
         Raises
         ------
@@ -246,7 +246,7 @@ class Survey:
         return self._walk
 
     def _slots_of(self, resident: Resident) -> list[int]:
-        """Return who has a segment locked, as far as there is time to ask: else its pin counts as unknown."""
+        """Return the slots that have a segment locked; none, so that its pin is unknown, if time is up."""
         if self._asking_s > ASKING_S:
             return []
         begin_s = time.thread_time()

@@ -69,7 +69,7 @@ class Closer:
         return self._waiting >= MAX_WAITING
 
     def close(self, fd: int, nbytes: int) -> None:
-        """Have a descriptor closed whose segment takes ``nbytes``."""
+        """Close a descriptor, whose segment takes ``nbytes``, in the thread."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
             before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
@@ -225,7 +225,7 @@ class Reclaimer:
         self._look_at(retired, retired.tick_over_s)
 
     def _look_at(self, retired: Retired, when_s: float) -> None:
-        """Have a retired segment looked at then."""
+        """Schedule a look at a retired segment."""
         retired.probe_after_s = when_s = max(when_s, retired.tick_over_s)
         self._number += 1
         heapq.heappush(self._due, (when_s, self._number, retired))
@@ -321,7 +321,7 @@ class Reclaimer:
         return retired.probe_after_s if retired is not None else math.inf
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Have segments looked at that a client has dropped: what no other has is freed soon."""
+        """Schedule a look at segments that a client has dropped: what no other has is freed soon."""
         for resident in residents:
             retired = self.ledger.retired.get(resident.name)
             if retired is None:
@@ -373,7 +373,7 @@ class Reclaimer:
         return max(RETIRED_INTERVAL_S, SHARE_S * len(self.ledger.retired))
 
     def on_closes(self, now_s: float) -> bool:
-        """Have segments looked at that processes have closed; whether anything may fit that did not."""
+        """Schedule a look at segments that processes have closed; whether anything may fit that did not."""
         names = self.pins.closed()
         if names is None:
             self.ledger.order.reconsider_all()

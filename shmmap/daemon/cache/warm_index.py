@@ -176,5 +176,5 @@ class WarmIndex:
             self.tables.pop(layer, None)
 
     def successor(self) -> WarmIndex:
-        """Return an empty one, for indices that mean other cells; versions are of the same as before."""
+        """Return an empty index for a catalogue that numbers cells differently; known versions stay."""
         return WarmIndex(of_version=self.of_version, retired=self.retired)

@@ -120,7 +120,7 @@ MAX_EVENTS_PER_TURN: Final = 16
 """Clients looked at in one turn: many of them must not drive all else out of the log."""
 MAX_MISSED_CELLS: Final = 1 << 12
 MAX_WAITING_CLIENTS: Final = 1 << 8
-"""Cells that clients wait for, and clients that wait for one of them, that are remembered."""
+"""Most cells whose misses are remembered, and most clients remembered for each of them."""
 
 
 @dataclass(eq=False, slots=True)
@@ -231,7 +231,7 @@ class CellEvents:
     # --- after clients have been answered -----------------------------------------------------------
 
     def emit(self, report: Callable[..., None], *what: Any) -> None:
-        """Have something reported once no client waits for the loop, in order; see `flush`."""
+        """Report something, in order, once no client waits for the loop; see `flush`."""
         self._pending.append((report, what))
 
     @property

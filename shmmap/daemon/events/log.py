@@ -80,7 +80,7 @@ class EventLog:
         self._subscribers.clear()
 
     def publish(self, kind: Callable[..., events.Event], *fields: object) -> None:
-        """Number, remember and send an event made of ``kind`` and its own fields."""
+        """Send an event made of ``kind`` and its own fields, numbered, and remember it."""
         self.last += 1
         now_ns = self._clock_ns()
         data = encode_event(kind(self.last, self.epoch, now_ns, *fields))
@@ -160,7 +160,7 @@ class MinuteLog:
         self._due_s: dict[str, float] = {}
 
     def count(self, event: str, of: str, nbytes: int) -> None:
-        """Add one of an event, of a client or for a reason, and its bytes."""
+        """Count an event and its bytes; ``of`` is the client or the reason that the log line names."""
         self._counts.setdefault(event, Counter())[of] += 1
         self._bytes[event] += nbytes
 

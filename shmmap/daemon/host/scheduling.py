@@ -66,14 +66,14 @@ def slice_ns() -> int:
 def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") -> bool:
     """Lower the weight of this process's session against all others on the machine.
 
-    True when there is no more to do, also where the kernel has no such groups, or they do not count because
-    a control group shares out the processors.  False when it has to be asked again: from others than root the
-    kernel takes ten such changes a second, of all processes together.
+    Return True if nothing is left to do, also if the kernel has no such groups or if control groups divide
+    the processors instead.  Return False if the kernel must be asked again: it accepts ten such changes a
+    second from all processes together, except from root.
 
     Parameters
     ----------
     niceness
-        As nice(2) has them, of the group as a whole.
+        Nice value of the whole group, as in nice(2).
     proc
         Directory with ``autogroup`` of this process.
     """

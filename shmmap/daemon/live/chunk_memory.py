@@ -145,7 +145,7 @@ class ChunkMemory:
     prefix
         What its names start with, see `live_prefix`.
     mode, gid
-        Who may read the chunks; a group of -1 is the process's own.
+        Permissions of the chunks' files; a group of -1 is the process's own.
 
     Attributes
     ----------
@@ -173,7 +173,7 @@ class ChunkMemory:
         return f"{self.prefix}{key.text}.{generation}"
 
     def give_access(self, fd: int) -> None:
-        """Let those read a file who may read the chunks."""
+        """Give a file the permissions of the chunks' files."""
         if self._gid >= 0:
             os.fchown(fd, -1, self._gid)
         os.fchmod(fd, self._mode)
@@ -184,7 +184,7 @@ class ChunkMemory:
         Raises
         ------
         CannotStart
-            What has its name is no file of this user, who alone may write it.
+            Its name belongs to something that is no file of this user, the only one who may write it.
         """
         path = self.path + self.prefix + name
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK

@@ -400,16 +400,16 @@ class LiveRelay:
         log.error("live worker ended", restarts=self.restarts)
         self._events.ended(self.restarts)
         if self._failures > 1:  # once is hardly noticed: the next one finds what was in memory
-            self._show_problem("the process that keeps live maps ends again and again: see the log")
+            self._show_problem("the process of the live maps keeps ending: see the log")
         self._tickets.lose()
 
     @property
     def next_s(self) -> float:
-        """Return when to refuse requests to a worker that ended: at once, some at a time."""
+        """When the next step is due: at once while requests to a worker that ended are left, else never."""
         return 0.0 if self._tickets.are_lost else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Refuse some of them."""
+        """Refuse some of the requests to a worker that ended."""
         del now_s
         self._tickets.refuse_some()
 
@@ -486,7 +486,7 @@ class LiveRelay:
     # --- the end --------------------------------------------------------------------------------
 
     def close(self, *, keep: bool) -> None:
-        """Have everything saved and all names removed, or leave memory to the next run.
+        """Save everything and remove all names, or leave memory to the next run.
 
         What could not be saved stays in memory, and is listed in `unsaved`.
         """
@@ -531,7 +531,7 @@ class LiveRelay:
             log.error("live worker does not start: what is in memory stays there for the next start")
 
     def _ask_to_end(self, end_s: float, *, keep: bool) -> messages.Ended | None:
-        """Have the worker end by a time; return its last message, if there is one."""
+        """Make the worker end by a time; return its last message, if there is one."""
         self._ended = None
         self._unsent.append(messages.encode(messages.End(keep)))
         while self._channel is not None and self._ended is None and (left_s := end_s - time.monotonic()) > 0:

@@ -68,7 +68,7 @@ class Adoption:
                 counts[self._take(name, now_s)] += 1
         step("daemon.adopted")
         if any(counts.values()):
-            log.info("segments of an earlier daemon", **counts)
+            log.info("leftover segments", **counts)
 
     def pages_came(self, pages: Iterable[int], now_s: float) -> None:
         """Judge what was deferred for pages that have come."""

@@ -31,7 +31,7 @@ FIRST_RETRY_S: Final = 1.0
 LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
 MAX_FAILURES: Final = 1 << 14
-"""Failures of a kind that are remembered: requests for ever new layers must not fill the memory with them."""
+"""Failures of a kind that are remembered: requests for always new layers must not fill the memory."""
 LOAD_S: Final = 1e-4
 """Time charged to a load besides that for its bytes: many tiny cells are work, too."""
 BYTE_S: Final = 1e-9
@@ -294,7 +294,7 @@ class Loads:
                 self._remember(load.key, failure)
 
     def failure(self, key: Key, code: str, message: str, stamp: Stamp | None, now_s: float) -> Failure:
-        """Describe why a load failed; the back-off doubles when it failed the same way before."""
+        """Describe why a load failed; the back-off doubles when it failed for the same reason before."""
         old = self.failures.get(key)
         if code in SPACE_CODES:
             delay_s = BUDGET_RETRY_S

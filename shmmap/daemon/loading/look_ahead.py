@@ -5,7 +5,7 @@ The area that a client asks for is moved along its path, a step at a time: cells
 are needed when the client is there.  The path is the route that the client sent; without one, and beyond its
 end, straight ahead and, a little later, to both sides of that, because it is unknown where the client turns;
 the longer it has come straight ahead, the farther.  What it will ask for along a kilometre is not kept: the
-path is looked over again and again (a *pass*), and what is not in memory is wished for.  So a wish is never
+path is looked over repeatedly (a *pass*), and what is not in memory is wished for.  So a wish is never
 out of date, whatever moves, changes or is evicted meanwhile.
 
 `Prefetcher` asks for a wish when no demand waits for a loader (`Prefetch.next`), and reports how loads ended.
@@ -30,19 +30,11 @@ from shmmap.daemon.map.catalogue_view import CatalogueView
 from shmmap.daemon.travel.motion import Motion
 from shmmap.geometry import Area
 
-__all__ = [
-    "PASS_S",
-    "URGENT_S",
-    "ClientPath",
-    "LookAhead",
-    "OriginHealth",
-    "Prefetch",
-    "Wish",
-]
+__all__ = ["PASS_S", "URGENT_S", "ClientPath", "LookAhead", "OriginHealth", "Prefetch", "Wish"]
 
 
 LOADS: Final = 64
-"""Loads from which their time is estimated."""
+"""Number of last loads from which the time of a load is estimated."""
 IN_A_ROW: Final = 4
 """Loads that fail one after the other before the origin, not single files, is taken to be the cause."""
 PROBE_S: Final = 0.5
@@ -161,7 +153,7 @@ class ClientPath:
 
     @property
     def pace_s(self) -> float:
-        """Seconds that the client takes for a metre at its greatest speed of late."""
+        """Seconds that the client takes for a metre at its greatest recent speed."""
         return 1.0 / max(self.motion.fastest_mps, SLOWEST_MPS)
 
     @property

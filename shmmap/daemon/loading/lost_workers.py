@@ -94,7 +94,7 @@ class LostWorkers:
                 self.loads.requeue(load)
 
     def _vanished(self, worker: Worker, now_s: float) -> None:
-        """Replace a worker whose parent ended: no job's fault, unless it happens again and again."""
+        """Replace a worker whose parent ended: no job's fault, unless it happens repeatedly."""
         at_work = worker.at_work or next(iter(worker.queue), 0)
         for job in self.pool.remove(worker):
             self.room.forget(job.number)

@@ -41,7 +41,7 @@ class OriginWatch:
     Parameters
     ----------
     try_again
-        Fetches what of the list of cells could not be had.
+        Fetches what is missing of the list of cells.
     reload
         Called when there is another version of the map.
     """
@@ -145,7 +145,7 @@ class DiskAhead:
         return Key(self._cache.catalogue.id(index), layer) not in self._scheduler.loads.by_key
 
     def _objects(self, index: int, layer: str) -> list[ObjectName]:
-        """What a loader would need."""
+        """Return the objects that a loader would need."""
         catalogue, layers = self._cache.catalogue, self._cache.layers
         own = unpack_source(catalogue.source(index))
         if catalogue.ready(index, layer) is not None:

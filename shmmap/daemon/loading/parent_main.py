@@ -36,7 +36,7 @@ __all__ = ["main"]
 
 MAX_SETTINGS_BYTES: Final = 1 << 14
 _OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
-_MOST_NICE: Final = 19
+_MAX_NICE: Final = 19
 
 
 def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
@@ -54,7 +54,7 @@ def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
 
 def _compile() -> int:
     """Compile the kernels of layers, unless another daemon is at it; returns the exit code."""
-    os.nice(_MOST_NICE)
+    os.nice(_MAX_NICE)
     from shmmap.layers.build import compile_kernels
 
     with contextlib.suppress(MemoryError):
@@ -156,9 +156,9 @@ def _send_last(end: socket.socket, message: worker_messages.Ended) -> None:
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID``.
 
-    The first packet has the settings, with zero bytes between them: the directory of segments, the memory
-    that a loader may take, bytes; directory and size of the disk cache, empty and 0 where there is none; of
-    a published map what `shmmap.origin.remote.opened_store.ServedFrom` says.
+    The first packet has the settings, separated by zero bytes: the directory of segments; the memory that a
+    loader may take, bytes; the disk cache's directory and size, empty and 0 without one; for a published map
+    also the fields of `shmmap.origin.remote.opened_store.ServedFrom`.
     """
     ours = channel_to_parent(arguments)
     signal.signal(signal.SIGIO, signal.SIG_IGN)

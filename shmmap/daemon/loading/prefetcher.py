@@ -119,7 +119,7 @@ class Prefetcher:
         return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved or self.ended else next_s
 
     def run_step(self, now_s: float) -> None:
-        """Follow some clients that moved, and have fetched what is needed first of what is not asked for."""
+        """Follow some clients that moved, and fetch what is needed first of what is not asked for."""
         self._now_s = now_s
         self._followed_s = now_s
         for session in self._sessions.follow_moves():
@@ -175,7 +175,7 @@ class Prefetcher:
         return swapped
 
     def _wished(self, key: Key, index: int, nbytes: int) -> Resident:
-        """What a wish would be in memory, to compare it with what is there."""
+        """Return a wish as it would be in memory, to compare it with what is there."""
         box = self._cache.catalogue.box(index)
         return Resident("", key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=self._now_s)
 
@@ -191,7 +191,7 @@ class Prefetcher:
     # --- loads ------------------------------------------------------------------------------------
 
     def make_room(self, load: Load, shortage: int, now_s: float) -> bool:
-        """Have memory freed for a wish; False if all there is will be needed sooner, or is in use."""
+        """Free memory for a wish; False if all there is will be needed sooner, or is in use."""
         index = self._cache.index_of(load.key.cell_id)
         if index is not None:
             wished = self._wished(load.key, index, load.estimate)

@@ -88,7 +88,7 @@ class PreparedParent:
 
     @property
     def pid(self) -> int:
-        """Its process id; 0 where there is none."""
+        """The parent's process id; 0 where there is none."""
         return self._process.pid if self._process is not None else 0
 
     def start(self) -> None:

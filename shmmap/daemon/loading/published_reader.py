@@ -34,19 +34,19 @@ from shmmap.origin.remote.zstd_frame import DAMAGED, unpack_frame
 from shmmap.segment.layout import SegmentHeader, SourceStamp
 from shmmap.segment.version import Source, Stamp
 
-__all__ = ["AT_ONCE", "PublishedReader"]
+__all__ = ["CONCURRENT_FETCHES", "PublishedReader"]
 
-AT_ONCE: Final = 32
+CONCURRENT_FETCHES: Final = 32
 """Objects that a loader fetches at once, as long as they are small."""
 MAX_BYTES: Final = 8 << 20
-"""Of larger ones fewer are fetched or held at once; always one."""
+"""Most bytes of objects that are fetched or held at once; a single object may be larger."""
 _STACK_BYTES: Final = 512 << 10
-"""Of a thread: what a loader may take of memory counts them whole."""
+"""Stack of a thread, small because the loader's limit of memory counts all of it."""
 
 
 @dataclass(eq=False, slots=True)
 class _Fetch:
-    """An object that jobs need; ``frame`` is it, or why it could not be had, once that is known."""
+    """An object that jobs need; ``frame`` is it, or why it could not be fetched, once that is known."""
 
     name: ObjectName
     jobs: set[int] = field(default_factory=set)
@@ -79,7 +79,9 @@ class ObjectFetcher:
         self._objects = objects
         self._lock = threading.Lock()
         threading.stack_size(_STACK_BYTES)
-        self._threads = ThreadPoolExecutor(AT_ONCE, "fetch")  # the loader's end waits for none of them
+        self._threads = ThreadPoolExecutor(
+            CONCURRENT_FETCHES, "fetch"
+        )  # the loader's end waits for none of them
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
         self._fetches: dict[bytes, _Fetch] = {}
         self._lacking: dict[int, set[bytes]] = {}
@@ -137,14 +139,14 @@ class ObjectFetcher:
             frame = _get(self._objects, fetch.name)
         except ShmmapError as error:
             frame = error
-        except Exception as error:  # noqa: BLE001  else the job would wait for ever
+        except Exception as error:  # noqa: BLE001  else the job would wait without bound
             frame = LoadFailed(f"{fetch.name.path}: {type(error).__name__}: {error}")
         with self._lock:
             self._under_way -= 1
-            self._settle(fetch, frame)
+            self._fetch_ended(fetch, frame)
             if isinstance(frame, Offline):
                 while self._queue:
-                    self._settle(self._queue.popleft(), frame)
+                    self._fetch_ended(self._queue.popleft(), frame)
             self._begin_some()
 
     # --- under the lock ---------------------------------------------------------------------------
@@ -166,7 +168,7 @@ class ObjectFetcher:
         os.eventfd_write(self.fd, 1)
 
     def _begin_some(self) -> None:
-        while self._queue and self._under_way < AT_ONCE:
+        while self._queue and self._under_way < CONCURRENT_FETCHES:
             fetch = self._queue[0]
             is_much = self._held_bytes and self._held_bytes + fetch.name.size > MAX_BYTES
             if is_much and (self._under_way or self._done):
@@ -177,7 +179,7 @@ class ObjectFetcher:
             self._held_bytes += fetch.name.size
             self._threads.submit(self._fetch, fetch)
 
-    def _settle(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
+    def _fetch_ended(self, fetch: _Fetch, frame: memoryview | ShmmapError) -> None:
         fetch.frame = frame
         for number in fetch.jobs:
             lacking = self._lacking.get(number)

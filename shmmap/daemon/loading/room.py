@@ -44,7 +44,7 @@ class Room:
     _waited_until_s: float = 0.0
 
     def watch(self, watched: WatchedDescriptors, clock: Callable[[], float]) -> None:
-        """Be called when the kernel reports what may free memory."""
+        """Register for the kernel's reports of what may free memory."""
         for fd, call in (
             (self.reclaimer.closer.fd, self.on_freed),
             (self.reclaimer.pins.fd, lambda: self.on_closes(clock())),
@@ -93,7 +93,7 @@ class Room:
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
     def wait(self, running: int, now_s: float) -> None:
-        """Have the load that comes next wait for room, while this many loads are ``running``."""
+        """Make the load that comes next wait for room, while this many loads are ``running``."""
         self.waited_for = True
         self._waited_at, self._waited_until_s = self._state(running), now_s + AGAIN_S
 

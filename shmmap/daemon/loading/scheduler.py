@@ -68,11 +68,11 @@ class MisplacedCells:
             )
 
     def map_changed(self) -> None:
-        """Have all of them looked at again by `check_some`: they may have changed, or left the map."""
+        """Let `check_some` look at all of them again: they may have changed, or left the map."""
         self._to_check = deque(self._versions)
 
     def check_some(self, most: int) -> None:
-        """Forget those of some cells that are not what they were."""
+        """Check at most this many cells, and forget those that have changed or left the map."""
         for _ in range(min(most, len(self._to_check))):
             cell_id = self._to_check.popleft()
             index = self._cache.catalogue.find(cell_id)
@@ -178,11 +178,11 @@ class Scheduler:
     def map_changed(self) -> None:
         """Serve another state of the map: loads of cells that left it are ended, some at each `pump`."""
         self._to_recheck = deque([*self.loads.by_key, *self.loads.failures])
-        self.pages_settled()
+        self.pages_finished()
         self.misplaced.map_changed()
         self.pool.read_through(self._opened)
 
-    def pages_settled(self) -> None:
+    def pages_finished(self) -> None:
         """Begin loads that wait for pages of the map, or find out what still lacks: some have come."""
         waiting, self._for_pages = self._for_pages, {}
         for load in waiting:
@@ -388,7 +388,7 @@ class Scheduler:
                 os.close(fd)
 
     def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
-        """Have a finished segment handed out from now on."""
+        """Hand out a finished segment from now on."""
         cache, catalogue, key = self._cache, self._cache.catalogue, load.key
         index = cache.index_of(key.cell_id)
         if index is None:
@@ -472,7 +472,7 @@ class Scheduler:
             self._end(load)
 
     def _fail(self, load: Load, code: str, message: str, stamp: Stamp | None, now_s: float) -> None:
-        """End a load without a segment; the back-off doubles when it failed the same way before."""
+        """End a load without a segment; the back-off doubles when it failed for the same reason before."""
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return

@@ -104,7 +104,7 @@ class Need(msgspec.Struct, array_like=True, tag="need"):
 class Done(msgspec.Struct, array_like=True, tag="done"):
     """The segment is finished, and the worker has closed its own descriptor of it.
 
-    So the daemon can ask the kernel from the first moment on who else uses the segment.
+    So the daemon can ask the kernel from the first moment on which processes use the segment.
     ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
     source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
     the disk cache; ``outside`` points lie outside the cell's box; ``objects``: what the worker has read of a
@@ -139,7 +139,7 @@ class Checked(msgspec.Struct, array_like=True, tag="checked"):
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
-    """No segment; ``stamp`` is the source's, if it could be had; ``unread``: it could not be read.
+    """No segment; ``stamp`` is the source's, if it is known; ``unread``: it could not be read.
 
     ``objects`` as in `Done`.
     """

@@ -227,7 +227,7 @@ class WorkerPool:
         Raises
         ------
         OSError
-            There is no file for its segment to be had.
+            No file can be made for its segment.
         """
         computed = is_computed(job)
         worker, start = self._least_busy(computed=computed), self._may_start
@@ -261,7 +261,7 @@ class WorkerPool:
         return True
 
     def read_through(self, opened: Opened) -> None:
-        """Have all workers read what they are given from now on through another directory."""
+        """Make all workers read what they are given from now on through another directory."""
         for worker in self._workers.values():
             worker.opened = ("unknown", -1)
             with contextlib.suppress(OSError):  # full or dying: with its next job, if there is one

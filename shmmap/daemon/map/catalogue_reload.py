@@ -69,7 +69,7 @@ class Reloader:
         return self._origin.path
 
     def ask(self, answer: Answer) -> None:
-        """Have the catalogue loaded; ``answer`` is called from `collect`."""
+        """Load the catalogue in a thread; ``answer`` is called from `collect`."""
         self._next.append(answer)
         if not self._asked:
             self._begin()

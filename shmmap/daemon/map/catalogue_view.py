@@ -47,7 +47,7 @@ class Ready(NamedTuple):
 
 
 class PageNews(NamedTuple):
-    """What became of pages that were wanted: ``come`` are here, ``out_of_reach`` cannot be had at present."""
+    """News of wanted pages: ``come`` are here, ``out_of_reach`` cannot be fetched at present."""
 
     come: Sequence[int]
     out_of_reach: Sequence[int]
@@ -73,7 +73,7 @@ class Pages(Protocol):
         """Return the page of a cell."""
 
     def cells(self, page: int) -> range:
-        """Indices of a page's cells, here or not."""
+        """Return the indices of a page's cells, here or not."""
 
     def cells_surely_in(self, area: Area) -> int:
         """How many cells the pages have that lie wholly in an area: it has as many at least."""
@@ -90,13 +90,13 @@ class Pages(Protocol):
         """Whether the page's cells are known."""
 
     def is_out_of_reach(self, page: int) -> bool:
-        """Whether it could not be had when it was last tried: no request waits for it.
+        """Whether it could not be fetched when it was last tried: no request waits for it.
 
         It is tried again by itself, after a while; when it comes, that is news like any other.
         """
 
     def want(self, pages: Iterable[int], priority: float) -> None:
-        """Have pages fetched, those with the lowest ``priority`` first, as loads have it.
+        """Fetch pages, those with the lowest ``priority`` first, as loads have it.
 
         That is metres from a client that asks, `shmmap.daemon.loading.loads.PREFETCH` and seconds for what
         one will ask for.  A page that is wanted already only moves forward; one that is here counts as just
@@ -131,7 +131,7 @@ class CatalogueView(Protocol):
 
     @property
     def pages(self) -> Pages | None:
-        """Its pages; None where all cells are known from the beginning."""
+        """The map's pages; None where all cells are known from the beginning."""
 
     @property
     def complete(self) -> bool:
@@ -201,7 +201,7 @@ class CatalogueView(Protocol):
         """Size of a cell's source as last known."""
 
     def ready(self, index: int, layer: str) -> Ready | None:
-        """What is known of a layer that the origin has ready made; None: it is computed here.
+        """Return what is known of a layer that the origin has ready made; None: it is computed here.
 
         Of ``points`` it may be None, too: where their size is only guessed, and their version is `version`.
         """

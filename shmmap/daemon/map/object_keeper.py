@@ -84,7 +84,7 @@ class ObjectKeeper:
         return THREADS - self._under_way
 
     def keep(self, key: KeptCell, names: Sequence[ObjectName]) -> None:
-        """Have these objects on the disk."""
+        """Bring these objects to the disk."""
         self._under_way += 1
         if len(self._threads) < min(self._under_way, THREADS):
             thread = threading.Thread(target=self._run, name="keep", daemon=True)
@@ -94,7 +94,7 @@ class ObjectKeeper:
         if self._threads:
             self._wanted.put((key, names))
         else:
-            self._settle(Kept(key, False))
+            self._finish(Kept(key, False))
 
     def take(self) -> list[Kept]:
         """Return what was done since the last time."""
@@ -106,9 +106,9 @@ class ObjectKeeper:
 
     def _run(self) -> None:
         while (wanted := self._wanted.get()) is not None:
-            self._settle(self._keep(*wanted))
+            self._finish(self._keep(*wanted))
 
-    def _settle(self, kept: Kept) -> None:
+    def _finish(self, kept: Kept) -> None:
         self._done.append(kept)
         os.eventfd_write(self.fd, 1)
 

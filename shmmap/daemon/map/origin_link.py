@@ -22,7 +22,7 @@ PROBE_S: Final = 1.0
 JITTER: Final = 0.2
 """Of the time between two questions: a fleet must not ask all at once."""
 LONG_TRUST_S: Final = 32.0
-"""Most time that an origin which answers is not doubted for single things that cannot be had."""
+"""Most time that an origin which answers is not doubted for single things that cannot be fetched."""
 END_S: Final = 0.5
 
 
@@ -74,9 +74,9 @@ class OriginLink:
         return self._is_out or self._is_doubted
 
     def doubt(self) -> None:
-        """Something could not be had: find out whether anything can.  May be called in any thread.
+        """Something could not be fetched: find out whether anything can.  May be called in any thread.
 
-        Where it just has answered, that one thing is what cannot be had: it is asked again later.
+        Where it just has answered, that one thing is what cannot be fetched: it is asked again later.
         """
         with self._condition:
             if self.is_doubted or self._closed:
@@ -162,7 +162,7 @@ class OriginLink:
             log.info("the map's origin answers again")
         if self._has_failed or now_s > self._answered_s + LONG_TRUST_S:
             self._trust_s = PROBE_S
-        elif self.is_doubted:  # it answers, and yet something cannot be had
+        elif self.is_doubted:  # it answers, and yet something cannot be fetched
             self._trust_s = min(2 * self._trust_s, LONG_TRUST_S)
         self._answered_s = now_s
 

@@ -236,7 +236,7 @@ class PublishedOrigin:
         return _Offer(self._seen.current)
 
     def _verify(self) -> _Offer:
-        """Have a separate process verify which version is signed."""
+        """Verify in a separate process which version is signed."""
         tag = None
         with contextlib.suppress(MapMissing, MapDataError):  # verifying names what is wrong
             _, tag = self._store.get_tagged(TIMESTAMP, MAX_METADATA_BYTES)
@@ -313,7 +313,7 @@ class PublishedOrigin:
         return view
 
     def _fetch_all(self, root: Root, known: dict[int, Shard], objects: ObjectReader) -> None:
-        """Read what is lacking of few shards, as far as that can be had."""
+        """Read what is lacking of few shards, as far as they can be fetched."""
 
         def fetch(number: int) -> Shard | None:
             try:
@@ -418,7 +418,7 @@ class PublishedOrigin:
         return ObjectCounts(*map(sum, zip(index, self.keeper.counts, strict=True)))
 
     def try_again(self) -> None:
-        """Have fetched again what of the list of cells could not be had; called in the serving loop."""
+        """Fetch again what is missing of the list of cells; called in the serving loop."""
         for pages in list(self._pages):
             pages.try_again()
 

@@ -189,7 +189,7 @@ class PublishedView:
         return int(page.shard.layers[POINTS].raws[row])
 
     def ready(self, index: int, layer: str) -> Ready | None:
-        """What is known of a layer that is published; None: it is computed here."""
+        """Return what is known of a layer that is published; None: it is computed here."""
         builder_version = self._ready.get(layer)
         if builder_version is None:
             return None
@@ -208,7 +208,7 @@ class PublishedView:
     def changes_from(self, before: object) -> CatalogueChange:
         """Find what differs from another version, as far as both know it.
 
-        Each shard is compared once, as soon as it is here: calls with each page that comes are cheap.
+        Each shard is compared once, when it has been fetched, so a call for each new page is cheap.
         """
         if not isinstance(before, PublishedView):
             raise TypeError(f"{type(before).__name__} is no version of a published map")

@@ -87,7 +87,7 @@ class _News:
 
 
 def _shared_out(page: Page) -> list[dict[bytes, int]]:
-    """Indices of a page's cells by name, for each table of names."""
+    """Map names to indices of a page's cells, for each table of names."""
     tables: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
     for index, name in enumerate(page.shard.names, page.first):
         tables[hash(name) % NAME_TABLES][name] = index
@@ -100,7 +100,7 @@ class ShardFetcher:
     Parameters
     ----------
     failed
-        Called, in a thread, when something could not be had.
+        Called, in a thread, when something could not be fetched.
     """
 
     def __init__(self, objects: ObjectReader, failed: Callable[[], None]) -> None:
@@ -115,7 +115,7 @@ class ShardFetcher:
         self._closed = False
 
     def want(self, pages: ShardPages, root: Root, number: int, priority: float) -> None:
-        """Have a shard delivered, unless it is being fetched; those with the lowest priority come first.
+        """Request a shard, unless it is being fetched; those with the lowest priority come first.
 
         One that is wanted again with a lower priority may be delivered twice.
         """
@@ -244,7 +244,7 @@ class ShardPages:
         return bisect.bisect_right(self._first, index) - 1
 
     def cells(self, page: int) -> range:
-        """Indices of a page's cells."""
+        """Return the indices of a page's cells."""
         return range(self._first[page], self._first[page + 1])
 
     def cells_surely_in(self, area: Area) -> int:
@@ -278,7 +278,7 @@ class ShardPages:
         return page in self._here
 
     def is_out_of_reach(self, page: int) -> bool:
-        """Whether it could not be had when it was last tried."""
+        """Whether it could not be fetched when it was last tried."""
         return page in self._lost
 
     def shards(self) -> dict[int, Shard]:
@@ -329,7 +329,7 @@ class ShardPages:
     # --- coming and going -------------------------------------------------------------------------
 
     def want(self, pages: Iterable[int], priority: float) -> None:
-        """Have pages fetched, those with the lowest priority first."""
+        """Fetch pages, those with the lowest priority first."""
         absent = []
         for number in pages:
             page = self._here.pop(number, None)
@@ -345,7 +345,7 @@ class ShardPages:
             self._around, self._nearest = (x, y), None
 
     def deliver(self, number: int, shard: Shard | None) -> None:
-        """Take a shard; None: it cannot be had at present.  Called in a thread."""
+        """Take a shard; None: it cannot be fetched at present.  Called in a thread."""
         page = self._page(number, shard) if shard is not None else None
         self._arrived.append((number, page, _shared_out(page) if page is not None else []))
         self._news.notify()
@@ -374,7 +374,7 @@ class ShardPages:
         return PageNews(come, lost)
 
     def try_again(self) -> None:
-        """Have fetched again what could not be had."""
+        """Fetch again the pages that could not be fetched before."""
         lost, self._lost = self._lost, set()
         self.want(lost, 0.0)
         self._lost |= lost  # until they come

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well this machine knows who uses a segment: tried out, not guessed from versions.
+"""How well this machine knows which processes use a segment: tried out, not guessed from versions.
 
 Of three sources the first that works is taken: leases (no process is overlooked), the locks that the client
 library takes (a process that opens segments otherwise is overlooked), and what sessions say they hold
@@ -26,7 +26,7 @@ _SLOT: Final = 12345
 
 
 class PinSource(enum.Enum):
-    """Where it is known from who uses a segment, best first; the value is for people."""
+    """What shows which processes use a segment, best first; the value is for people."""
 
     LEASES = "leases"
     LOCKS = "locks of clients"
@@ -67,29 +67,29 @@ def probe_pins(directory: ShmDirectory) -> PinSupport:
         with contextlib.suppress(OSError):
             os.ftruncate(fd, mmap.PAGESIZE)
         path = f"/proc/self/fd/{fd}"
-        leases = less not in ("locks", "sessions") and _works(_leases_tell, fd, path)
-        locks = less != "sessions" and _works(_locks_tell, fd, path)
-        events = _works(_closing_tells, path)
+        leases = less not in ("locks", "sessions") and _works(_leases_work, fd, path)
+        locks = less != "sessions" and _works(_locks_work, fd, path)
+        events = _works(_close_events_work, path)
     finally:
         os.close(fd)
     return PinSupport(leases, locks, events)
 
 
-def _works(way: Callable[..., bool], *arguments: object) -> bool:
+def _works(attempt: Callable[..., bool], *arguments: object) -> bool:
     try:
-        return way(*arguments)
+        return attempt(*arguments)
     except (OSError, ValueError):  # what it needs is not there
         return False
 
 
-def _leases_tell(fd: int, path: str) -> bool:
+def _leases_work(fd: int, path: str) -> bool:
     before = in_use(fd)
     with _mapped(path):
         during = in_use(fd)
     return (before, during, in_use(fd)) == (False, True, False)
 
 
-def _locks_tell(fd: int, path: str) -> bool:
+def _locks_work(fd: int, path: str) -> bool:
     with _mapped(path, _SLOT):
         during = holders(fd)
     return (during, holders(fd)) == ([_SLOT], [])
@@ -106,7 +106,7 @@ def _mapped(path: str, slot: int | None = None) -> mmap.mmap:
         os.close(other)
 
 
-def _closing_tells(path: str) -> bool:
+def _close_events_work(path: str) -> bool:
     with contextlib.closing(Inotify()) as events:
         events.add(path, CLOSED)
         os.close(os.open(path, os.O_RDONLY | os.O_CLOEXEC))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asking the kernel who uses a segment, and having it report when a process closes one.
+"""Ask the kernel which processes use a segment, and have it report when a process closes one.
 
-A retired segment that is still mapped stays open here (our own descriptor is the one that the lease
-is asked for, so it does not count), and the kernel is asked to report when any process closes or
-unmaps it.  So nothing of ours ever looks like a close, and no timer has to look now and then.
+The daemon keeps a retired segment open while a client maps it.  The kernel reports when any process closes
+or unmaps it, so no timer has to look.  The daemon asks through the descriptor that it keeps open, which the
+kernel does not count: looking opens and closes nothing, and causes no report itself.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class PinWatch:
         self._kept: dict[str, tuple[int, int]] = {}
         self._names: dict[int, str] = {}
         self._once: dict[str, int] = {}
-        self._most_kept = min(KEPT_OPEN, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // KEPT_SHARE)
+        self._max_kept = min(KEPT_OPEN, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // KEPT_SHARE)
         self._inotify: Inotify | None = None
         if events:
             with contextlib.suppress(OSError):
@@ -99,7 +99,7 @@ class PinWatch:
 
     def keep(self, name: str) -> bool:
         """Keep a retired segment open and have its closes reported; False if that cannot be."""
-        if self._inotify is None or len(self._kept) >= self._most_kept:
+        if self._inotify is None or len(self._kept) >= self._max_kept:
             return False
         try:
             fd = self._directory.open(name)
@@ -129,7 +129,7 @@ class PinWatch:
             os.close(fd)
 
     def watch_next_close(self, name: str) -> bool:
-        """Have the next close of a segment in service reported; False if that cannot be."""
+        """Watch for the next close of a segment in service; False if that is impossible."""
         if self._inotify is None:
             return False
         try:

@@ -23,7 +23,7 @@ from shmmap.daemon.map.catalogue_view import PageNews
 from shmmap.daemon.records import SPACE_CODES, Resident
 from shmmap.daemon.requests import limits
 from shmmap.daemon.requests.differential import difference, warm_difference
-from shmmap.daemon.requests.pending_request import Found, MapChanged, PendingRequest, WaitingList
+from shmmap.daemon.requests.pending_request import LARGE, Found, MapChanged, PendingRequest, WaitingList
 from shmmap.daemon.transport.connection import Connection
 from shmmap.daemon.transport.sessions import Session
 from shmmap.daemon.turns import Pace, batched
@@ -36,7 +36,7 @@ from shmmap.protocol.messages import FailedCell, Holder, PendingCell
 __all__ = ["CellRequests"]
 
 MAX_WAIT_S: Final = 3600.0
-MAX_AT_ONCE: Final = 4096
+MAX_COMPARED: Final = 4096
 """Cells of an area that are compared with what a client holds in one turn, if all are in memory."""
 MAX_LOOKED_AT: Final = 20_000
 """Cells of requests that are looked through before a page of the map is given up."""
@@ -45,8 +45,6 @@ HELD_PER_CELL: Final = 2
 """Bytes of packed versions, and cells held by name, of a request that waits: they take a cell's memory."""
 MAX_HOLDERS: Final = 16
 """Named beside each cell that does not fit: those that have most."""
-NOTED_PER_STEP: Final = 256
-"""Cells handed out that are noted as held between two looks at the time."""
 PROMISED: Final = 1e9
 """Priority of a load that only a "pending" promises: behind the distances of all that is asked for."""
 
@@ -58,12 +56,28 @@ Result = TypeVar("Result")
 
 @dataclass(eq=False, slots=True)
 class _Answer:
-    """What a reply says of cells; ``failed`` is still without the holders of memory."""
+    """What a reply says of cells.
+
+    Attributes
+    ----------
+    handles, pending
+        Cells that `encode` has not encoded yet.
+    failed
+        Failed cells; who holds the memory is added later.
+    """
 
     residents: list[Resident] = field(default_factory=list)
     handles: list[bytes] = field(default_factory=list)
-    pending: PackedArray = field(default_factory=PackedArray)
+    pending: list[PendingCell] = field(default_factory=list)
     failed: list[FailedCell] = field(default_factory=list)
+    encoded_handles: PackedArray = field(default_factory=PackedArray)
+    encoded_pending: PackedArray = field(default_factory=PackedArray)
+
+    def encode(self) -> None:
+        """Encode the cells that were added since the last call: very many at once take long."""
+        self.encoded_handles.add_encoded(self.handles)
+        self.encoded_pending.add(self.pending)
+        self.handles, self.pending = [], []
 
 
 class CellRequests:
@@ -113,8 +127,11 @@ class CellRequests:
         _note_area(session, area, layers)
 
         def find(wanted: PendingRequest) -> Generator[None, None, None]:
-            wanted.found.cells = [(index, layer) for index in self._known(wanted, layers) for layer in layers]
-            yield from ()  # all at once
+            known = self._known(wanted, layers)
+            yield from wanted.pause(now=len(known) > LARGE)
+            for indices in batched(known):
+                yield from wanted.pause()
+                wanted.found.cells += [(index, layer) for index in indices for layer in layers]
 
         return self._serve(self._pending(session, message, find, area), message.wait)
 
@@ -149,7 +166,7 @@ class CellRequests:
         cells, covered = catalogue.query(area, limits.MAX_CELLS)
         looks_around = catalogue.pages is not None and versions.halo_m(layers) > 0.0
         is_one = len(layers) == 1 and area.z is None
-        if is_one and covered and not looks_around and len(cells) <= MAX_AT_ONCE:
+        if is_one and covered and not looks_around and len(cells) <= MAX_COMPARED:
             warm = warm_difference(self._cache, message, cells, layers[0])
             if warm is not None and self._quota.has_room(session, warm.residents):
                 _note_area(session, area, layers)
@@ -157,8 +174,8 @@ class CellRequests:
                 found = Found(removed=warm.removed, removed_packed=warm.removed_packed)
                 self._reply(session, message.request, limits.layers_named(message.layers), answer, found)
                 # the bookkeeping can wait until the answer is out
-                self._statistics.add("hits", len(answer.handles))
-                return self._hand_out(session, answer)
+                self._statistics.add("hits", len(answer.residents))
+                return self._hand_out(session, answer, Pace())
         self._check_reach(layers)
         _note_area(session, area, layers)
 
@@ -247,7 +264,7 @@ class CellRequests:
                 return (yield from do())
 
     def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
-        """Have loaded what is cold of what was found; whether the request waits for that, or for more."""
+        """Load what is cold of what was found; whether the request waits for that, or for more."""
         now_s = self._now_s()
         may_wait = bool(wait_s) and self._waiting.has_room(wanted)
         yield from self._have_loaded(wanted, note=may_wait)
@@ -277,6 +294,7 @@ class CellRequests:
                 sizes.append(cache.estimate(index, layer) if resident is None else resident.nbytes)
         if not wanted.began_s:
             self._statistics.add("hits", len(found.cells) - len(cold))
+        yield from wanted.pause(now=wanted.is_large)
         yield from self._quota.check(wanted, sizes)
         if cold:
             yield from limits.check_queue(self._scheduler.loads, wanted, cold)
@@ -287,10 +305,9 @@ class CellRequests:
     def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
         """Request loads; ``note`` which, so that the request waits for them."""
         warm, prefetcher, now_s = self._cache.warm, self._scheduler.prefetcher, self._now_s()
-        distances = wanted.distances_m(cold)
-        for cells in batched(list(zip(cold, distances, strict=True))):
+        for cells in batched(cold):
             yield from wanted.pause()
-            for (index, layer), distance in cells:
+            for (index, layer), distance in zip(cells, wanted.distances_m(cells), strict=True):
                 key = self._cache.key(index, layer)
                 if key in wanted.found.refused or warm.get(index, layer) is not None:
                     continue  # another client may have had it loaded meanwhile
@@ -306,7 +323,7 @@ class CellRequests:
                 self._waiting.need(wanted, self._cache.key(index, layer))
 
     def _wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Let a request wait for its pages, without those that have settled since it was found."""
+        """Let a request wait for its pages, without those that are finished since it was found."""
         found, pages = wanted.found, self._cache.pages
         if pages is not None and found.pages:
             come = {page for page in found.pages if pages.is_here(page)}
@@ -369,6 +386,7 @@ class CellRequests:
             inside = set(cache.at_height([index for index, _ in found.cells], wanted.area.z))
             found.cells = [cell for cell in found.cells if cell[0] in inside]
         answer = _Answer()
+        yield from wanted.pause(now=wanted.is_large)
         for unknown in batched(found.unknown):
             yield from wanted.pause()
             for cell_id, layer in unknown:
@@ -379,17 +397,20 @@ class CellRequests:
                 resident = warm[layer].get(index) if layer in warm else None
                 resident = resident or cache.find_warm(index, layer, now_s)
                 if resident is not None and not found.refused:
+                    resident.last_use_s = now_s  # the rest is noted when the answer is out
                     answer.residents.append(resident)
                     answer.handles.append(resident.handle)
                 elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
                     self._answer_cold(wanted, index, layer, answer, now_s)
+            answer.encode()
         if may_wait and wanted.waits:
             return True
         failed = yield from self._failed(wanted, answer.failed)
+        yield from wanted.pause(now=wanted.is_large)
         self._reply(wanted.session, wanted.request, wanted.layers, answer, found, failed)
         if wanted.began_s:
             self._statistics.add_duration("wait", int((now_s - wanted.began_s) * 1e9))
-        yield from self._hand_out(wanted.session, answer)
+        yield from self._hand_out(wanted.session, answer, wanted.pace)
         return False
 
     def _waits_for(self, wanted: PendingRequest, index: int, layer: str, now_s: float) -> bool:
@@ -430,7 +451,7 @@ class CellRequests:
         elif not current:
             if not promised:  # evicted, or no longer out of room: "pending" promises a load
                 self._scheduler.want(index, layer, PROMISED, now_s, wanted.session.asker)
-            answer.pending.add((PendingCell(wire_id, layer),))
+            answer.pending.append(PendingCell(wire_id, layer))
 
     def _failed(self, wanted: PendingRequest, failed: list[FailedCell]) -> Generator[None, None, PackedArray]:
         """Encode what failed; name the holders of memory beside cells that there is no memory for."""
@@ -462,27 +483,33 @@ class CellRequests:
         """Send a reply; the bookkeeping follows in `_hand_out`, when it is on its way."""
         cache = self._cache
         map_version = cache.catalogue.map_version
+        answer.encode()
         reply = encode_cells(
-            request, cache.epoch, map_version, answer.handles, found.removed, found.removed_packed, layers,
-            found.covered, answer.pending, failed or PackedArray(), reason=found.reason,
+            request, cache.epoch, map_version, answer.encoded_handles, found.removed, found.removed_packed,
+            layers, found.covered, answer.encoded_pending, failed or PackedArray(), reason=found.reason,
         )  # fmt: skip
         session.connection.reply(reply)
 
-    def _hand_out(self, session: Session, answer: _Answer) -> Iterator[None]:
+    def _hand_out(self, session: Session, answer: _Answer, pace: Pace) -> Iterator[None]:
         """Note what a session was given."""
-        residents, pace = answer.residents, Pace()
-        self._cache.hand_out(residents, self._now_s())
-        self._statistics.add("handles_sent", len(answer.handles))
-        for begin in range(0, len(residents), NOTED_PER_STEP):
-            session.hold(residents[begin : begin + NOTED_PER_STEP])
+        self._statistics.add("handles_sent", len(answer.residents))
+        is_large = len(answer.residents) > LARGE
+        if is_large:
+            yield
+            pace.begin()
+        for residents in batched(answer.residents):
             yield from pace.pause()
             if not session.is_connected:
                 return
+            self._cache.hand_out(residents, self._now_s())
+            session.hold(residents)
+        if is_large:  # freeing what it took takes time, too
+            yield
 
     # --- what happens meanwhile -----------------------------------------------------------------
 
-    def pages_settled(self, news: PageNews) -> None:
-        """Follow pages of the map that have come, or cannot be had at present."""
+    def pages_finished(self, news: PageNews) -> None:
+        """Follow pages of the map that have come, or cannot be fetched at present."""
         for page in news.come:
             self._waiting.page_finished(page)
         for page in news.out_of_reach:

@@ -28,7 +28,7 @@ __all__ = ["WarmDifference", "difference", "warm_difference"]
 
 @dataclass(eq=False, slots=True)
 class WarmDifference:
-    """The difference where all of the area is in memory."""
+    """The difference for an area whose cells are all in memory."""
 
     residents: list[Resident]
     removed: tuple[str, ...]
@@ -105,29 +105,14 @@ def difference(
     cache, found = wanted.cache, wanted.found
     versions, of_version = cache.layers, cache.warm.of_version
     version_of = versions.version
-    for unknown in versions.unknown(indices, layers):
+    for cells in batched(indices):
         yield from wanted.pause()
-        version_of(*unknown)
+        for unknown in versions.unknown(cells, layers):
+            yield from wanted.pause()
+            version_of(*unknown)
     packed = set(unpack_versions(message.packed))
     inside = set(indices)
-    has: dict[int, set[str]] = {}
-    removed: dict[str, None] = {}
-    for held in batched(message.held):
-        yield from wanted.pause()
-        for cell in held:
-            index = cache.index_of(cell.id)
-            if index is None or index not in inside:
-                if found.covered or index is not None:
-                    removed[cell.id] = None
-                continue
-            named = layers if cell.layers is None else canonical_layers(cell.layers)
-            mine = [layer for layer in named if layer in layers]
-            if cell.version is not None:  # that of one of them; else it is an old one
-                current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
-                if not current_of:
-                    found.held_old.update(cache.key(index, layer) for layer in mine)
-                mine = current_of
-            has.setdefault(index, set()).update(mine)
+    has = yield from _held_layers(wanted, message.held, inside, layers)
     current: set[int] = set()
     for cells in batched(indices):
         yield from wanted.pause()
@@ -142,11 +127,38 @@ def difference(
         yield from wanted.pause()
         for version in versions_gone:
             key = of_version.get(version)
-            index = cache.index_of(key.cell_id) if key is not None else None
-            if key is not None and index in inside:
+            cell = cache.index_of(key.cell_id) if key is not None else None
+            if key is not None and cell in inside:
                 gone.discard(version)
                 found.held_old.add(key)
-            elif index is None and not found.covered:
+            elif cell is None and not found.covered:
                 gone.discard(version)
-    found.removed = tuple(removed)
     found.removed_packed = pack_versions(gone)
+
+
+def _held_layers(
+    wanted: PendingRequest, held: Sequence[HeldCell], inside: set[int], layers: tuple[str, ...]
+) -> Generator[None, None, dict[int, set[str]]]:
+    """Return the layers that the client has, by cell; note as found its old ones, and what to drop."""
+    cache, found = wanted.cache, wanted.found
+    version_of = cache.layers.version
+    has: dict[int, set[str]] = {}
+    removed: dict[str, None] = {}
+    for some in batched(held):
+        yield from wanted.pause()
+        for cell in some:
+            index = cache.index_of(cell.id)
+            if index is None or index not in inside:
+                if found.covered or index is not None:
+                    removed[cell.id] = None
+                continue
+            named = layers if cell.layers is None else canonical_layers(cell.layers)
+            mine = [layer for layer in named if layer in layers]
+            if cell.version is not None:  # that of one of them; else it is an old one
+                current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
+                if not current_of:
+                    found.held_old.update(cache.key(index, layer) for layer in mine)
+                mine = current_of
+            has.setdefault(index, set()).update(mine)
+    found.removed = tuple(removed)
+    return has

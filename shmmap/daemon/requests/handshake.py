@@ -48,7 +48,7 @@ class Handshake:
     on_live_session_end: Callable[[Session], None] = lambda _session: None
     departures: MinuteLog = field(default_factory=MinuteLog)
     _seen: Usage = field(default_factory=Usage)
-    _settling: list[Session] = field(default_factory=list)
+    _to_check: list[Session] = field(default_factory=list)
     _departed_before: list[Session] = field(default_factory=list)
 
     def enter(self, connection: Connection, message: Hello, now_s: float) -> Session:
@@ -94,7 +94,7 @@ class Handshake:
         self.cells.on_disconnect(session)
         self.sessions.departed[session.slot] = session
         if session.held:
-            self.survey.ask(session, lambda usage: self._settle(session, usage))
+            self.survey.ask(session, lambda usage: self._leave_if_unused(session, usage))
         else:
             self.leave(session)
 
@@ -105,14 +105,14 @@ class Handshake:
             session = departed[slot] = departed.pop(slot)  # the others come first next time
             if session.peer.pid and not os.path.exists(f"/proc/{session.peer.pid}"):
                 self.leave(session)
-        if not self._settling and self.survey.usage is not self._seen:
+        if not self._to_check and self.survey.usage is not self._seen:
             self._seen = self.survey.usage
-            self._settling, self._departed_before = self._departed_before, list(departed.values())
-        for session in self._settling[-LOOKED_AT:]:
-            self._settle(session, self._seen)
-        del self._settling[-LOOKED_AT:]
+            self._to_check, self._departed_before = self._departed_before, list(departed.values())
+        for session in self._to_check[-LOOKED_AT:]:
+            self._leave_if_unused(session, self._seen)
+        del self._to_check[-LOOKED_AT:]
 
-    def _settle(self, session: Session, usage: Usage) -> None:
+    def _leave_if_unused(self, session: Session, usage: Usage) -> None:
         known = usage.by_slot or not session.peer.pid  # else it stays while its process is there
         if known and session.slot in self.sessions.departed and session.slot not in usage.shares:
             self.leave(session)

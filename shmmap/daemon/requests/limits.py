@@ -97,7 +97,7 @@ def check_queue(loads: Loads, wanted: PendingRequest, cold: Sequence[tuple[int, 
             raise Busy(f"{MAX_QUEUED} loads of this process wait already", hint="wait for some of them")
 
 
-@lru_cache(maxsize=128)  # the specs of requests are few, read again and again
+@lru_cache(maxsize=128)  # requests have few specs, and repeat them
 def layers_of(specs: tuple[str, ...]) -> tuple[str, ...]:
     """Return the layers that a request names, in canonical form, duplicates left out.
 
@@ -192,7 +192,11 @@ class SessionQuota:
         counted: set[Key] = set()
         too_much: list[Key] = []
         added = 0
-        nearest: list[int] = np.argsort(wanted.distances_m(cells), kind="stable").tolist()
+        distances: list[float] = []
+        for some in batched(cells):
+            yield from wanted.pause()
+            distances += wanted.distances_m(some)
+        nearest: list[int] = np.argsort(distances, kind="stable").tolist()
         for positions in batched(nearest):
             yield from wanted.pause()
             for position in positions:

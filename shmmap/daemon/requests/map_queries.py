@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What any client may ask about the map: where it is, which cells there are, one of them, who uses what."""
+"""What any client may ask about the map: where it is, which cells there are, one of them, its users."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class MapQueries:
         Raises
         ------
         Offline
-            That cannot be had at present.
+            That cannot be fetched at present.
         """
         page = self.page(message)
         if page is None and len(self._waiting) < MAX_WAITING:
@@ -131,8 +131,8 @@ class MapQueries:
         else:
             session.connection.reply(encode(page or self.page(message, empty=True)))
 
-    def pages_settled(self, news: PageNews) -> None:
-        """Answer requests that waited for pages which have come, or cannot be had."""
+    def pages_finished(self, news: PageNews) -> None:
+        """Answer requests that waited for pages which have come, or cannot be fetched."""
         if self._waiting and (news.come or news.out_of_reach):
             waiting, self._waiting = self._waiting, []
             for one in waiting:
@@ -166,12 +166,12 @@ class MapQueries:
             connection.reply(encode(page or self.page(one.message, empty=True)))
 
     def page(self, message: messages.Metadata, *, empty: bool = False) -> messages.MetadataPage | None:
-        """A page of the list; if a page of the map has to come first None, or one without rows if ``empty``.
+        """List a page; if a page of the map has to come first, return None, or one without rows if ``empty``.
 
         Raises
         ------
         Offline
-            That cannot be had at present.
+            That cannot be fetched at present.
         """
         catalogue = self._catalogue
         removed: tuple[str, ...] = ()
@@ -215,7 +215,7 @@ class MapQueries:
         Raises
         ------
         Offline
-            One cannot be had at present.
+            One cannot be fetched at present.
         """
         absent = [page for page in needed if not pages.is_here(page)]
         pages.want(needed, 0.0)
@@ -255,7 +255,7 @@ class MapQueries:
         Raises
         ------
         Offline
-            The page cannot be had at present.
+            The page cannot be fetched at present.
         """
         listed = pages.of_area(area) if area is not None else range(len(pages))
         number, row = start >> ROW_BITS, start & ((1 << ROW_BITS) - 1)
@@ -275,7 +275,7 @@ class MapQueries:
         return indices.tolist(), listed[at + 1] << ROW_BITS if at + 1 < len(listed) else None
 
     def _changes_since(self, map_version: int) -> _Changes | None:
-        """What changed, remembered for the pages that follow; None where that is not known."""
+        """Find what changed, and remember it for the pages that follow; None where that is not known."""
         between = map_version, self._catalogue.map_version
         if self._changes is None or self._changes.between != between:
             change = self.map_switch.changes_since(map_version)

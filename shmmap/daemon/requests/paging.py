@@ -30,10 +30,10 @@ MAX_RETIRED: Final = 20_000
 
 @dataclass(eq=False, slots=True)
 class Paging:
-    """Passes on which pages have come, or cannot be had, and drops those that nothing needs.
+    """Passes on which pages have come, or cannot be fetched, and drops those that nothing needs.
 
     A page is needed while there is a segment of one of its cells, a load, a pin, a request that is not
-    answered yet, or a session whose area may have cells of it.  It is a chore of the serving loop.
+    answered yet, or a session whose area may have cells of it.  It is a background task of the serving loop.
     """
 
     cache: CellCache
@@ -62,9 +62,9 @@ class Paging:
             self.watched.watch(self._fd, self.collect, "map")
 
     def is_ready(self, new: CatalogueView, try_again: Callable[[], None]) -> bool:
-        """Whether another state of the map knows all that is known of the one that is served.
+        """Return whether a new state of the map has all pages that the served state has.
 
-        Else its pages are fetched, and ``try_again`` is called when some have come.
+        If not, fetch the missing pages, and call ``try_again`` when some have come.
         """
         self._stop_following_the_next()
         pages, served = new.pages, self.cache.pages
@@ -87,12 +87,12 @@ class Paging:
         self._coming_fd = -1
 
     def collect(self) -> None:
-        """Begin what waited for pages that have come, or cannot be had."""
+        """Begin what waited for pages that have come, or cannot be fetched."""
         pages = self.cache.pages
         if pages is None:
             return
         news = pages.collect()
-        if news.come and self._was_out_of_reach:  # what has failed for that may be had again
+        if news.come and self._was_out_of_reach:  # what failed for lack of a page may work now
             self.scheduler.loads.forget_failures()
         self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
@@ -100,11 +100,11 @@ class Paging:
             layers, ledger = self.cache.layers, self.cache.ledger
             if layers.halo_m(ledger.layers()):
                 self.map_switch.recheck()
-        self.cells.pages_settled(news)
-        self.scheduler.pages_settled()
-        self.queries.pages_settled(news)
+        self.cells.pages_finished(news)
+        self.scheduler.pages_finished()
+        self.queries.pages_finished(news)
 
-    # --- a chore of the loop ----------------------------------------------------------------------
+    # --- a background task of the loop ------------------------------------------------------------
 
     @property
     def next_s(self) -> float:

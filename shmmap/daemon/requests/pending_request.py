@@ -25,7 +25,7 @@ from shmmap.daemon.turns import Pace, Walk
 from shmmap.errors import NoSession
 from shmmap.geometry import Area, distance_to_boxes
 
-__all__ = ["MAX_OF_A_SESSION", "Finder", "Found", "MapChanged", "PendingRequest", "WaitingList"]
+__all__ = ["LARGE", "MAX_OF_A_SESSION", "Finder", "Found", "MapChanged", "PendingRequest", "WaitingList"]
 
 MAX_OF_A_SESSION: Final = 64
 """Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
@@ -34,6 +34,8 @@ MAX_CELLS_OF_A_PROCESS: Final = 20_000
 MAX_CELLS: Final = 200_000
 """Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
 OVERDUE_PER_TURN: Final = 256
+LARGE: Final = 1024
+"""More cells than this make a request large: a step that handles all of them gets a turn of its own."""
 
 Awaited = TypeVar("Awaited")
 
@@ -135,8 +137,8 @@ class PendingRequest:
             self.found, self.outdated = Found(self.cache.catalogue), False
             yield from self.find(self)
 
-    def pause(self) -> Iterator[None]:
-        """End the turn, if it has used its time.
+    def pause(self, *, now: bool = False) -> Iterator[None]:
+        """End the turn, if it has used its time, or ``now``: before much that is done at once.
 
         Raises
         ------
@@ -145,13 +147,18 @@ class PendingRequest:
         NoSession
             Meanwhile the session has ended.
         """
-        if self.pace.is_over:
+        if now or self.pace.is_over:
             yield
             self.pace.begin()
             if not self.session.is_connected:
                 raise NoSession("the session ended before the answer was ready", hint="send hello again")
             if self.cache.catalogue is not self.found.catalogue:
                 raise MapChanged
+
+    @property
+    def is_large(self) -> bool:
+        """Whether what is done at once for all cells found is worth a turn of its own."""
+        return len(self.found.cells) > LARGE
 
     @property
     def weight(self) -> int:
@@ -324,7 +331,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def page_finished(self, page: int, reason: str = "") -> None:
-        """Note for the requests that wait for a page that it has come, or why it cannot be had."""
+        """Note for the requests that wait for a page that it has come, or why it cannot be fetched."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:
@@ -339,7 +346,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def map_changed(self) -> None:
-        """Have what waits for pages found again: pages are others now."""
+        """Have requests that wait for pages find their cells again: the map has other pages now."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:
@@ -367,7 +374,7 @@ class WaitingList:
             self.do_later(steps())
 
     def do_later(self, steps: Iterator[None]) -> None:
-        """Have steps done in `tidy` that no client waits for."""
+        """Leave steps that no client waits for to `tidy`."""
         self._leftovers.append(steps)
 
     def tidy(self) -> Iterator[PendingRequest]:

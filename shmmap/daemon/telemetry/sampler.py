@@ -50,7 +50,7 @@ ROWS_PER_BEAT: Final = 128
 ROWS_PER_TURN: Final = 16
 """Rows of cells that are written at one beat, and in one of its turns: a tenth of a millisecond."""
 MAX_TURNS_OF_USED: Final = 4
-"""Turns of a beat in which rows of cells that were handed out are brought up to date."""
+"""Turns, at most, in which a beat updates the rows of cells that clients were given."""
 CLIENT_ROWS_PER_BEAT: Final = 64
 """Rows of clients that are brought up to date at one beat: half a millisecond."""
 SAMPLE_S: Final = 1.0
@@ -58,7 +58,7 @@ SAMPLE_S: Final = 1.0
 
 
 class RecentCounts:
-    """The values of some counters, remembered once a second: how much they grew of late.
+    """The values of some counters, remembered once a second: how much they grew recently.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class RecentCounts:
     def growth(self, values: Mapping[str, int], now_s: float) -> list[tuple[int, ...]]:
         """Return for each span how much each counter grew over it, to a sample's precision.
 
-        For a span longer than anything is remembered, it is the growth since the beginning.
+        If a span is longer than the memory of samples, return the growth since the first sample.
         """
         return [
             tuple(values[name] - old for name, old in zip(self._names, self._at(now_s - span), strict=True))

@@ -124,7 +124,7 @@ class Connection:
             self._send(framed(body))
 
     def cut(self, reason: str = "") -> None:
-        """Have the loop end it, which may be in the middle of something now; logged if there is a reason."""
+        """Mark it for the loop to end, which may be busy with it now; logged if there is a reason."""
         if not self._cut:
             self._cut = True
             self._incoming.forget()
@@ -290,7 +290,7 @@ class Connections:
         self.try_again()
 
     def try_again(self) -> None:
-        """Have listeners that wait for room look whether there is some."""
+        """Let listeners that wait for room check whether there is some."""
         self.short = False
         waiting, self._waiting = self._waiting, []
         for go_on in waiting:

@@ -73,7 +73,7 @@ class Session:
         self.connection, connection.slot = connection, self.slot
 
     def disconnect(self) -> None:
-        """Take the session off its connection, and forget what it said of where it is."""
+        """Separate the session from its connection, and forget its position."""
         self.connection.slot = 0
         self.intent = self.new_intent = self.area = None
         self.says_where = False

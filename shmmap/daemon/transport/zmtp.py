@@ -68,7 +68,7 @@ class Incoming:
         self.more = False
 
     def add(self, data: bytes) -> None:
-        """Take bytes that came."""
+        """Take received bytes."""
         self._buffer += data
 
     def messages(self, max_frames: int, send: Callable[[bytes], None]) -> list[tuple[bytes, bool]]:

@@ -124,7 +124,7 @@ class Motion:
     vx, vy
         Metres per second, map frame: as sent, else learnt from the poses; 0 if not known.
     fastest_mps
-        Its greatest speed of late.
+        Its greatest recent speed.
     route, along_m
         The route that it sends, if it is on it, and how far along it is.
     travelled_m

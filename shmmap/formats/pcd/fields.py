@@ -39,7 +39,7 @@ class PcdField:
     padding
         True for fields named ``_``, whose bytes mean nothing.
     file_name
-        The name as the file has it.
+        The name in the file.
     """
 
     name: str

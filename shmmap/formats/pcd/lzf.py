@@ -16,15 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "LITERAL_RUN",
-    "MAX_RATIO",
-    "TRUST_BYTES",
-    "compress",
-    "decompress",
-    "first_error",
-    "reachable",
-]
+__all__ = ["LITERAL_RUN", "MAX_RATIO", "TRUST_BYTES", "compress", "decompress", "first_error", "reachable"]
 
 LITERAL_RUN: Final = 32
 MAX_RATIO: Final = 88  # three bytes of input make at most 264 of output
@@ -55,7 +47,7 @@ def reachable(input_bytes: int, output_bytes: int) -> bool:
 
 @lru_cache(maxsize=1)
 def _native() -> Callable[[_Bytes, _Bytes], bool] | None:
-    """liblzf's own function, which the extension module carries; None where it does not show it.
+    """Find liblzf's own function in the extension module; None where the module does not export it.
 
     The module's function allocates its result twice, which costs as much as half the decompression
     in page faults; the C function writes to the buffer that it is given.

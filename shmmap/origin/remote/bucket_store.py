@@ -59,7 +59,7 @@ _REASONS: Final = {
     "AccessDenied": "no permission",
 }
 """Meaning of Amazon's error codes, which other stores use, too."""
-_LISTED_AT_ONCE: Final = 1000
+_OBJECTS_PER_PAGE: Final = 1000
 
 
 class BucketStore:
@@ -129,7 +129,7 @@ class BucketStore:
         """All objects below a prefix."""
         refuse_read_only(self)
         stream = self._ask(
-            prefix, lambda: obstore.list(self._store, prefix.rstrip("/"), chunk_size=_LISTED_AT_ONCE)
+            prefix, lambda: obstore.list(self._store, prefix.rstrip("/"), chunk_size=_OBJECTS_PER_PAGE)
         )
         chunks = iter(stream)
         while (chunk := self._ask(prefix, lambda: next(chunks, None))) is not None:

@@ -140,7 +140,7 @@ def s3_settings(
 
 
 def _static_keys(environment: Mapping[str, str]) -> tuple[dict[str, Any], str] | None:
-    """The keys in the service manager's file or in the shared credentials file, and which; or None."""
+    """Read the keys in the service manager's file or the shared credentials file, and which; or None."""
     profile = environment.get("AWS_PROFILE", "")
     files = [
         *_given_file(environment, AWS_FILE),
@@ -292,7 +292,7 @@ def _lines(path: str) -> dict[str, str]:
 
 
 def _section(path: str, name: str) -> Mapping[str, str] | None:
-    """A section of an INI file; None where there is no such file or section."""
+    """Read a section of an INI file; None where there is no such file or section."""
     parser = configparser.RawConfigParser(default_section="", strict=False)
     try:
         with open(path, encoding="utf-8") as file:

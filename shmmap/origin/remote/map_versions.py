@@ -60,7 +60,7 @@ MAX_METADATA_BYTES: Final = 512_000
 ENTRIES: Final = "versions/"
 _ENTRY: Final = re.compile(r"versions/([1-9]\d{0,18})\.json")
 _MAX_JSON_BYTES: Final = 64 << 10
-_READ_AT_ONCE: Final = 32
+_CONCURRENT_READS: Final = 32
 _MAX_VERSIONS: Final = 1_000_000
 _Named = TypeVar("_Named", bound=msgspec.Struct)
 
@@ -181,7 +181,7 @@ def list_entries(store: Store) -> list[int]:
 
 
 def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
-    """The entries of what is and was current, the latest first; ends where the one before has no entry."""
+    """Yield the entries of what is and was current, latest first, until one's predecessor has no entry."""
     version = current.version
     for _ in range(_MAX_VERSIONS):
         try:
@@ -230,9 +230,9 @@ def read_shards(store: ObjectReader, root: Root) -> Iterator[Shard]:
     def read(number: int) -> Shard:
         return unpack_shard(read_shard_object(store, root, number), root, number)
 
-    with ThreadPoolExecutor(_READ_AT_ONCE, "shard") as pool:
-        for begin in range(0, len(root.keys), _READ_AT_ONCE):  # what is decoded does not pile up
-            yield from pool.map(read, range(begin, min(begin + _READ_AT_ONCE, len(root.keys))))
+    with ThreadPoolExecutor(_CONCURRENT_READS, "shard") as pool:
+        for begin in range(0, len(root.keys), _CONCURRENT_READS):  # what is decoded does not pile up
+            yield from pool.map(read, range(begin, min(begin + _CONCURRENT_READS, len(root.keys))))
 
 
 # --- a new version ------------------------------------------------------------------------------------

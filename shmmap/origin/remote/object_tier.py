@@ -2,9 +2,9 @@
 """Objects of published maps on this machine's disk, so that nothing is fetched twice and no link is needed.
 
 An object is named by its SHA-256, here as in the store.  Its file is read into memory once and hashed there:
-so it does not matter who wrote it, whether it is whole, and what becomes of it meanwhile.  A file that is not
-what its name says is removed, and the object fetched again.  Nothing else depends on the disk: it may be
-full, read-only, or emptied at any moment.
+so neither its writer nor its state matters, nor what becomes of it meanwhile.  A file that is not what its
+name says is removed, and the object fetched again.  Nothing else depends on the disk: it may be full,
+read-only, or emptied at any moment.
 
 All processes of one account share the tier, and none of them is in charge: a file has its name once it is
 whole.  Only index pages are flushed to the disk: what a power cut leaves of the others is noticed by its

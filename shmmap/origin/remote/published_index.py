@@ -168,6 +168,7 @@ class Damage:
         self._name = name
 
     def __call__(self, message: str) -> MapDataError:
+        """Return the error with this message."""
         return MapDataError(message, path=self._name, cause=DAMAGED)
 
 
@@ -403,7 +404,7 @@ class LayerObjects:
         return ((hashes[32 * row : 32 * row + 32], size) for row, size in enumerate(self.sizes.tolist()))
 
     def name(self, row: int) -> ObjectName:
-        """The object of a cell."""
+        """Return the object of a cell."""
         return ObjectName(
             self.hashes[row].tobytes(),
             int(self.sizes[row]),
@@ -457,7 +458,7 @@ class Shard:
         return cell_version(self.id(row, id_prefix), self.stamp(row), self.box(row))
 
     def identity(self, row: int, root: Root) -> CellIdentity:
-        """What the objects of a cell lack, see `shmmap.origin.remote.published_object.write_segment`."""
+        """Return what a cell's objects lack, see `shmmap.origin.remote.published_object.write_segment`."""
         return CellIdentity(self.id(row, root.id_prefix), self.box(row), root.frame_id, self.stamp(row))
 
 

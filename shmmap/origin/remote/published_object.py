@@ -201,7 +201,7 @@ def _plane_count(column: Column) -> int:
 
 
 def _rows(segment: memoryview, column: Column) -> NDArray[np.uint8]:
-    """The bytes of a column, (rows, bytes of one)."""
+    """Return the bytes of a column, (rows, bytes of one)."""
     count = _plane_count(column)
     return np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(-1, count)
 
@@ -379,13 +379,13 @@ def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray
 
 
 def _mm_origin(unpacked: bytes | bytearray | memoryview) -> NDArray[np.float64] | None:
-    """Where the counts of points in millimetres begin; None where they are exact."""
+    """Return the origin from which points in millimetres count; None if points are exact."""
     (flags,) = _FLAGS.unpack_from(unpacked, FLAGS_AT)
     return np.array(_MM_ORIGIN.unpack_from(unpacked, MM_ORIGIN_AT)) if flags & MILLIMETRES else None
 
 
 def _decoded(column: Column) -> Column:
-    """The column as it will be in memory, of an object in millimetres."""
+    """Describe a column of an object in millimetres as it will be in memory."""
     if column.name != XYZ:
         return column
     return msgspec.structs.replace(column, dtype=_XYZ, nbytes=2 * column.nbytes)
@@ -394,7 +394,7 @@ def _decoded(column: Column) -> Column:
 def _decoded_blocks(
     unpacked: bytes | bytearray | memoryview, column: Column, mm_origin: NDArray[np.float64] | None
 ) -> Iterator[NDArray[Any]]:
-    """The rows of a column as they will be in memory, some at a time; valid until the next are taken."""
+    """Yield the rows of a column as they will be in memory, block by block; valid until the next block."""
     if not column.nbytes:
         return
     for rows in _row_blocks(unpacked, column):
@@ -405,7 +405,7 @@ def _decoded_blocks(
 
 
 def _row_blocks(unpacked: bytes | bytearray | memoryview, column: Column) -> Iterator[NDArray[np.uint8]]:
-    """The rows of a column, (n, bytes of a row), some at a time; each is valid until the next is taken."""
+    """Yield the rows of a column, (n, bytes of a row), block by block; each is valid until the next."""
     count = _plane_count(column)
     planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(count, -1)
     buffer = np.empty((min(_BLOCK_ROWS, planes.shape[1]), count), np.uint8)
@@ -496,7 +496,7 @@ def _spread() -> tuple[NDArray[np.uint64], ...]:
 
 
 class LayerSource(NamedTuple):
-    """The object of a layer, as `ObjectName` has it, and the version of what has built it."""
+    """The object of a layer, as in `ObjectName`, and the version of what has built it."""
 
     sha256: bytes
     size: int
@@ -525,5 +525,5 @@ def unpack_source(source: Source) -> Mapping[str, LayerSource]:
 
 
 def stamp_of(source: Source) -> Stamp:
-    """Return the stamp of a cell, which its points' content says."""
+    """Return the stamp of a cell: the first bytes of its points' content digest."""
     return unpack_source(source)[POINTS].content[:STAMP_BYTES]

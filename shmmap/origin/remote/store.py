@@ -199,7 +199,7 @@ def read_url(text: str) -> StoreUrl:
     if scheme not in _SCHEMES:
         raise BadRequest(
             f"a map cannot lie at {scheme}://",
-            hint=f"it can at {', '.join(f'{s}://' for s in _SCHEMES)}",
+            hint=f"the URL begins with one of {', '.join(f'{s}://' for s in _SCHEMES)}",
         )
     try:
         parts = urlsplit(text)

@@ -34,7 +34,7 @@ class Orders:
         self._pipe = pipe
 
     def say(self, what: Any) -> None:
-        """Tell the scene something."""
+        """Send a message to the scene."""
         self._pipe.send(("said", what))
 
     def go_on(self, pause_s: float = 0.0) -> bool:
@@ -104,7 +104,7 @@ class Actor:
         return self._next(timeout_s)[1]
 
     def end(self, timeout_s: float = TIMEOUT_S) -> Any:
-        """Tell it to end, and return what its function returns; errors as of `said`."""
+        """Ask it to end, and return what its function returns; errors as of `said`."""
         with contextlib.suppress(OSError):  # it has ended by itself
             self._pipe.send("end")
         how = what = None
@@ -141,8 +141,8 @@ class Seen:
     Attributes
     ----------
     times_ms
-        Of each round trip.  Somebody who would have asked in every period of a stall would have waited for
-        its rest: those are in the list, too.
+        Of each round trip, and of those that a stall left no time for: a request due in a stall counts
+        with the rest of the stall.
     longest_s
         When the longest one began and ended, by the monotonic clock.
     odd
@@ -294,8 +294,8 @@ def walks_cold(
     with RawClient(endpoint, name="walks", timeout=WALK_TIMEOUT_S) as client:
         before = client.ask("stats")[4]["loads_finished"]
         begin_s = time.monotonic()
-        way = places(x_m, y_m)
-        for x, y in way if once else itertools.cycle(way):
+        path = places(x_m, y_m)
+        for x, y in path if once else itertools.cycle(path):
             if time.monotonic() - begin_s > seconds or not orders.go_on():
                 break
             client.area(["box", x, y, x + INSIDE_M, y + INSIDE_M, None, None], wait=60.0)

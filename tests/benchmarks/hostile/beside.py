@@ -133,7 +133,7 @@ class Beside:
     def _judge(self) -> None:
         report, one = self._report, self._one
         alive = one.process is not None and one.process.poll() is None
-        report.must("the daemon lives", alive)
+        report.must("the daemon runs", alive)
         if not alive:
             return
         probe, echo = self._probe.end(), self._echo.end()

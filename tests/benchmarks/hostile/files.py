@@ -38,7 +38,7 @@ def hung_mount(path: Path) -> Iterator[Path]:
 
 
 def asks_for_what_hangs(orders: Orders, endpoint: str, names: list[str]) -> int:
-    """Ask again and again for cells whose files cannot be looked at; returns how often."""
+    """Keep asking for cells whose files cannot be looked at; returns how often."""
     count = 0
     with RawClient(endpoint, name="hangs") as client:
         while orders.go_on(0.02):

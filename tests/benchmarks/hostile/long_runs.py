@@ -142,5 +142,5 @@ def churn(report: Report, stage: Stage) -> None:
 
 
 def counters_of(one: DaemonProcess) -> dict[str, int]:
-    """The daemon's counters, from its statistics segment: no request is in anybody's way."""
+    """The daemon's counters, from its statistics segment: no request delays another."""
     return dict(read_statistics(one.instance, one.shm_dir).counters)

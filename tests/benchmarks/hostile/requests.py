@@ -27,7 +27,7 @@ def waits_with_many_requests(
 ) -> dict[str, int]:
     """In waves: some sessions send requests that wait for the whole map, and all fall due at once."""
     sessions = [RawClient(endpoint, name="waits") for _ in counts]
-    found = {"waves": 0, "answers": 0, "refused": 0, "most_bytes": 0}
+    found = {"waves": 0, "answers": 0, "refused": 0, "max_bytes": 0}
     while orders.go_on():
         found["waves"] += 1
         for session, count in zip(sessions, counts, strict=True):
@@ -39,7 +39,7 @@ def waits_with_many_requests(
                     return found
                 reply = session.receive_bytes()
                 found["refused" if len(reply) < 300 else "answers"] += 1
-                found["most_bytes"] = max(found["most_bytes"], len(reply))
+                found["max_bytes"] = max(found["max_bytes"], len(reply))
         orders.say(dict(found))
     return found
 

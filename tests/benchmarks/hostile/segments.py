@@ -127,7 +127,7 @@ def freeing(report: Report, stage: Stage) -> None:
 
 
 def holds_and_asks_for_more(orders: Orders, endpoint: str, held_m: float) -> dict[str, int]:
-    """Hold all that the quota allows, and ask for more again and again."""
+    """Hold all that the quota allows, and keep asking for more."""
     import shmmap
 
     found = {"held": 0, "requests": 0, "refused": 0}

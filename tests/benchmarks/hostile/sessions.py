@@ -33,7 +33,7 @@ from tests.support.raw_client import RawClient, circle
 DESCRIPTORS: Final = 1024
 STILL_MAPPED: Final = 100
 REST_S: Final = 3.0
-MOST_FAILURES: Final = 50
+MAX_FAILURES: Final = 50
 GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16 + 32)
 
 
@@ -97,7 +97,7 @@ def leaves_without_a_word(
     failures: list[str] = []
     count = 0
     for stop in stops:
-        while count < stop and len(failures) < MOST_FAILURES and orders.go_on():
+        while count < stop and len(failures) < MAX_FAILURES and orders.go_on():
             x, y = (rng.uniform(*span_m) for _ in range(2))
             route = tuple((x + 20.0 * math.cos(n), y + 20.0 * math.sin(n)) for n in range(64))
             try:
@@ -219,7 +219,7 @@ def dropped_clients(report: Report, stage: Stage) -> None:
 
 
 def leases(orders: Orders, paths: list[str]) -> int:
-    """Take and give back a lease of each file again and again, as the daemon does to see who uses it."""
+    """Keep taking and giving back a lease of each file, as the daemon does to see which are in use."""
     signal.signal(signal.SIGIO, signal.SIG_IGN)  # another process opens what is leased
     count = 0
     while orders.go_on():
@@ -254,8 +254,8 @@ def lease_probes(report: Report, stage: Stage) -> None:
     """Another process takes leases of the segments all the time; then one of them is a named pipe."""
     with stage.served(stage.new_map().root) as one, RawClient(one.endpoint) as client:
         paths = [client.path(cell) for cell in client.area(circle(0, 0, 50)).cells]
-        other_way = f"/proc/self/root{one.shm_dir}"
-        for what, shm_dir in (("the usual directory", ""), ("another path to it", other_way)):
+        other_path = f"/proc/self/root{one.shm_dir}"
+        for what, shm_dir in (("the usual directory", ""), ("another path to it", other_path)):
             with Actor(leases, paths) as prober, Actor(opens, one.endpoint, shm_dir, 10.0) as opener:
                 count, failures = opener.said()
                 report.note(f"{what}: {count} requests beside {prober.end()} leases; failed {dict(failures)}")

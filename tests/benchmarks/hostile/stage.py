@@ -17,7 +17,7 @@ from tests.benchmarks.make_many_cells import make_many_cells
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap, make_map
 
-MOST_BYTES: Final = 6 << 30
+MAX_BYTES: Final = 6 << 30
 """Private memory of a daemon, and of each of its loaders: a defect must not take the machine with it."""
 
 
@@ -114,7 +114,7 @@ class Stage:
         self, path: Path, *flags: str, descriptors: int = 0, **options: Any
     ) -> Iterator[DaemonProcess]:
         """Serve a map while the block runs, with at most ``descriptors`` of them."""
-        limits = ["prlimit", f"--data={MOST_BYTES}"]
+        limits = ["prlimit", f"--data={MAX_BYTES}"]
         limits += [f"--nofile={descriptors}:{descriptors}"] if descriptors else []
         one = DaemonProcess(path, *flags, command=limits, **options)
         try:

@@ -75,7 +75,7 @@ def test_rules_are_checked() -> None:
             ElevationRule(rule, resolution, min_points=points)
 
 
-def test_cells_of_any_size_find_who_shares_their_columns() -> None:
+def test_cells_of_any_size_find_those_that_share_their_columns() -> None:
     rng = np.random.default_rng(6)
     low = rng.integers(-60, 60, (80, 2))
     boxes = np.hstack([low, low + rng.integers(1, 30, (80, 2))])

@@ -24,7 +24,7 @@ DOCUMENT = {"map_version": "0123456789abcdef"}
 
 @pytest.fixture
 def made(tmp_path: Path) -> Made:
-    """A grid of two tiles each way, a third of it holes, and what filling within 0.6 m gives."""
+    """A grid of two by two tiles, a third of it holes, and what filling within 0.6 m gives."""
     rng = np.random.default_rng(4)
     x, y = np.meshgrid(np.arange(300), np.arange(270))
     heights = (700 + np.sin(x / 20) * 3 + y * 0.02).astype(np.float32)

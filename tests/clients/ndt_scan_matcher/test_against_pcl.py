@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The variant ``pcl`` beside PCL itself, at any leaf size and guess; needs g++ and libpcl-dev.
 
-What PCL does its own way is repeated: it stops where a step's translation, squared, is below epsilon (0.1 by
+What PCL does differently is repeated: it stops where a step's translation, squared, is below epsilon (0.1 by
 default: a third of a metre), takes angles below 1e-4 for zero in derivatives, and clips its line search.  Two
 things are not.  It moves points and measures how near centroids are in float32, which the tolerances are for.
 And a voxel that it has refused (points all the same) counts for it as one of zero inverse covariance; these

@@ -61,7 +61,7 @@ def error_m(result: Result) -> float:
 @pytest.mark.parametrize("variant", ["autoware", "pclomp", "pcl"])
 @pytest.mark.parametrize("neighbors", ["direct1", "direct7", "radius"])
 @pytest.mark.parametrize("line_search", [False, True])
-def test_backends_take_the_same_way(
+def test_backends_take_the_same_steps(
     points: NDArray[np.float64], scan: NDArray[np.float64], variant: str, neighbors: str, line_search: bool
 ) -> None:
     settings = Settings(variant, neighbors, line_search=line_search)  # type: ignore[arg-type]
@@ -211,7 +211,9 @@ def test_no_map_is_no_pose(points: NDArray[np.float64], scan: NDArray[np.float64
             assert result.covariance is None
 
 
-def test_regularization_pulls_along_the_way(points: NDArray[np.float64], scan: NDArray[np.float64]) -> None:
+def test_regularization_pulls_along_the_heading(
+    points: NDArray[np.float64], scan: NDArray[np.float64]
+) -> None:
     voxel_map = map_of(points, 2.0)
     plain = aligned(voxel_map, scan)
     heading = np.array([np.cos(TRUTH[5]), np.sin(TRUTH[5])])

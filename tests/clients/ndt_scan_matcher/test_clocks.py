@@ -19,7 +19,7 @@ from shmmap_clients.scans.trajectory import Trajectory
 
 
 def straight(*stamps: float, speed: float = 10.0, step_s: float = 0.1) -> Trajectory:
-    """A drive along x whose clock says these times; really a scan each ``step_s``."""
+    """A drive along x with these stamps; in truth a scan each ``step_s``."""
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     poses[:, 0, 3] = speed * step_s * np.arange(len(stamps))
     return Trajectory(np.array(stamps, np.float64), poses)

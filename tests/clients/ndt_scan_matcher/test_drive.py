@@ -58,7 +58,7 @@ def test_constant_velocity_continues_a_screw() -> None:
         if index >= 2:
             np.testing.assert_allclose(guess, drive.T_map_sensor[index], atol=1e-9)
         prediction.correct(stamp, drive.T_map_sensor[index])
-    # half the time, half the way: as far along the arc as interpolation
+    # half the time, half the distance: as far along the arc as interpolation
     half = interpolate(drive, 0.45)
     assert half is not None
     np.testing.assert_allclose(prediction.predict(0.45), half, atol=1e-9)
@@ -111,15 +111,15 @@ def test_errors_are_those_that_were_made() -> None:
 
 
 def test_relative_errors_are_of_every_stretch() -> None:
-    """Against the definition: from each pose to the first one that is so far along the way."""
+    """Against the definition: from each pose to the first one at that distance along the path."""
     truth = arc(150).T_map_sensor
     noise = np.random.default_rng(4).normal(0.0, 0.05, (150, 6)) * (1, 1, 1, 0.1, 0.1, 0.1)
     poses = np.array([T @ matrix_from_pose(one) for T, one in zip(truth, noise, strict=True)])
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
+    travelled_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1))])
     for stretch, found in trajectory_errors(poses, truth).rte.items():
         errors = []
         for start in range(150):
-            later = np.flatnonzero(way >= way[start] + stretch)
+            later = np.flatnonzero(travelled_m >= travelled_m[start] + stretch)
             if len(later):
                 ours = np.linalg.inv(poses[start]) @ poses[later[0]]
                 theirs = np.linalg.inv(truth[start]) @ truth[later[0]]

@@ -60,9 +60,9 @@ def test_a_map_has_no_more_bytes_than_allowed(
     cells = cells_of(points, 2.0)
     whole = sum(cell.map_bytes for cell in cells.values())
     limits = Limits(map_bytes=whole // 2)
-    assert limits.most_map_bytes == whole // 2
+    assert limits.max_map_bytes == whole // 2
     with NdtMatcher(Settings(backend=backend), limits=limits) as matcher:
-        capped = VoxelMap(cells, max_bytes=matcher.limits.most_map_bytes, centre=(-25.0, 0.0))
+        capped = VoxelMap(cells, max_bytes=matcher.limits.max_map_bytes, centre=(-25.0, 0.0))
         kept = sum(cell.map_bytes for cell in capped.cells.values())
         assert 0 < kept <= whole // 2
         assert kept + capped.bytes_left_out == whole
@@ -149,7 +149,7 @@ def test_limits_that_make_no_sense_are_refused() -> None:
     for given in wrong:
         with pytest.raises(shmmap.BadRequest):
             Limits(**given)
-    assert Limits(voxels=10).most_map_bytes == 960
+    assert Limits(voxels=10).max_map_bytes == 960
 
 
 def test_the_bound_of_time_is_measured_where_the_work_is_done(

@@ -131,7 +131,7 @@ def test_repeats_and_poses_in_a_batch_have_the_same_bits(
     # so few rows that a batch takes several launches
     there = ready("opencl", map_of(points, 2.0), scan, options=options)
     assert isinstance(there, OpenclBackend)
-    there._most_rows = 40
+    there._max_rows = 40
     how = Scoring("radius", "autoware")
     poses = NEAR + np.random.default_rng(4).normal(0.0, 0.3, (17, 6)) * [1, 1, 0.2, 0.05, 0.05, 0.3]
     batch = there.evaluate(poses, how)
@@ -169,7 +169,7 @@ def aligned(settings: Settings, voxel_map: VoxelMap, scan: NDArray[np.floating],
         return matcher.align(scan, guess)
 
 
-def assert_same_way(found: Result, wanted: Result, t: float, R: float, tp: float) -> None:
+def assert_same_result(found: Result, wanted: Result, t: float, R: float, tp: float) -> None:
     assert found.iterations == wanted.iterations
     assert found.converged == wanted.converged
     np.testing.assert_allclose(found.T_map_base[:3, 3], wanted.T_map_base[:3, 3], atol=t, rtol=0)
@@ -208,7 +208,7 @@ def test_all_reference_alignments(
             found.T_map_base[:3, :3], T[:3, :3], atol=to_originals[1], err_msg=str(row)
         )
         assert found.transform_probability == pytest.approx(probability, abs=to_originals[2]), row
-        assert_same_way(found, aligned(settings, voxel_map, scan, guess), *to_numba)
+        assert_same_result(found, aligned(settings, voxel_map, scan, guess), *to_numba)
 
 
 @pytest.mark.parametrize("double", [True, False])

@@ -159,7 +159,7 @@ def test_a_program_that_does_not_build_is_one_line(monkeypatch: pytest.MonkeyPat
 def test_memory_that_a_device_has_not_is_an_error() -> None:
     backend = OpenclBackend(Limits(source_points=100))
     with pytest.raises(DeviceMemory, match="not enough memory"):
-        MapBuffers(backend._context, backend.device, backend.device.info.most_bytes * 4)
+        MapBuffers(backend._context, backend.device, backend.device.info.max_bytes * 4)
 
 
 def test_a_small_device_lowers_the_limit_on_the_map(
@@ -170,15 +170,15 @@ def test_a_small_device_lowers_the_limit_on_the_map(
     voxel_map = map_of(points, 2.0)
     needed = sum(cell.map_bytes for cell in voxel_map.cells.values())
     tables = 18 << 20
-    as_if(monkeypatch, most_bytes=2 * (tables + needed // 2))
+    as_if(monkeypatch, max_bytes=2 * (tables + needed // 2))
     with NdtMatcher(Settings(backend="opencl", device=COPY)) as matcher:
-        most = matcher.limits.most_map_bytes
+        most = matcher.limits.max_map_bytes
         assert most == needed // 2
         cut = VoxelMap(voxel_map.cells, max_bytes=most)
         assert 0 < sum(cell.map_bytes for cell in cut.cells.values()) <= most
         matcher.set_map(matcher.prepare(cut))
         assert matcher.align(scan_from(points, TRUTH, 300), np.eye(4)).cut.map_bytes == cut.bytes_left_out > 0
-    as_if(monkeypatch, most_bytes=tables)
+    as_if(monkeypatch, max_bytes=tables)
     with pytest.raises(DeviceMemory):
         OpenclBackend(Limits(), options=COPY)
 
@@ -265,7 +265,7 @@ class Failing:
 
     name = "opencl"
     on_device = True
-    most_map_bytes = 1_000
+    max_map_bytes = 1_000
 
     def __init__(self, calls: int, real: Backend) -> None:
         self._left = calls
@@ -288,7 +288,7 @@ def test_wherever_a_device_fails_the_fallback_goes_on(points: NDArray[np.float64
     limits = Limits(source_points=300)
     failing: Any = Failing(calls, NumpyBackend(limits))
     backend = FallbackBackend(failing, NumpyBackend(limits))
-    assert backend.most_map_bytes == 1_000
+    assert backend.max_map_bytes == 1_000
     plain = NumpyBackend(limits)
     voxel_map, scan = map_of(points, 2.0), scan_from(points, TRUTH, 400)
     backend.prepare(voxel_map, HOW)

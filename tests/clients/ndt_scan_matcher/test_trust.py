@@ -130,17 +130,17 @@ def test_limits_that_make_no_sense_are_refused() -> None:
         Tracking(0)
 
 
-def test_a_vehicle_is_lost_after_so_many_results(points: NDArray[np.float64]) -> None:
+def test_a_vehicle_is_lost_after_the_given_number_of_results(points: NDArray[np.float64]) -> None:
     trusted = aligned(points, 2.0, BESIDE)
-    doubtful = replace(trusted, failed_limits=("nvtl",))
+    untrusted = replace(trusted, failed_limits=("nvtl",))
     nowhere = replace(trusted, failed_limits=("no_map",), no_map=True)
     tracking = Tracking(3)
     assert tracking.state == "uncertain"
-    states = [tracking.update(one) for one in (trusted, doubtful, doubtful, trusted)]
+    states = [tracking.update(one) for one in (trusted, untrusted, untrusted, trusted)]
     assert states == ["tracking", "uncertain", "uncertain", "tracking"], (
         "a trusted one starts the count again"
     )
-    states = [tracking.update(one) for one in (doubtful, doubtful, doubtful, doubtful, trusted)]
+    states = [tracking.update(one) for one in (untrusted, untrusted, untrusted, untrusted, trusted)]
     assert states == ["uncertain", "uncertain", "lost", "lost", "tracking"]
     assert tracking.update(nowhere) == "lost", "there is nothing to wait for"
-    assert Tracking(3, lost=True).update(doubtful) == "lost"
+    assert Tracking(3, lost=True).update(untrusted) == "lost"

@@ -180,7 +180,7 @@ def test_a_cell_without_a_column_leaves_zeros() -> None:
 
 
 def test_what_is_too_large_for_dds_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cdr, "MOST_BYTES", 100)
+    monkeypatch.setattr(cdr, "MAX_BYTES", 100)
     writer = CdrWriter()
     writer.blob(97, lambda place: None)  # noqa: ARG005
     with pytest.raises(ValueError, match="101 bytes, of at most 100"):

@@ -19,7 +19,7 @@ from shmmap_clients.ros_bridge.map_answers import RecentCells, Requesters, sensi
 from shmmap_clients.ros_bridge.parameters import Parameters
 from shmmap_clients.ros_bridge.participant import settings
 from shmmap_clients.ros_bridge.service_server import Request, Requester
-from shmmap_clients.ros_bridge.worker import MOST_OF_ONE, MOST_WAITING, WaitingRequests
+from shmmap_clients.ros_bridge.worker import MAX_PER_CLIENT, MAX_WAITING, WaitingRequests
 
 import shmmap
 
@@ -83,24 +83,24 @@ def test_the_one_that_has_not_asked_for_longest_is_forgotten() -> None:
 # --- turns --------------------------------------------------------------------------------------------
 
 
-def request(who: str, number: int = 0) -> Request:
+def request(client: str, number: int = 0) -> Request:
     server: Any = None
-    return Request(server, number, Requester(who, incompatible=False, vendor=""), 0)
+    return Request(server, number, Requester(client, incompatible=False, vendor=""), 0)
 
 
 def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
     waiting = WaitingRequests()
-    for number in range(MOST_OF_ONE + 3):
+    for number in range(MAX_PER_CLIENT + 3):
         assert waiting.put(request("flood", number))
         if number == 1:
             assert waiting.put(request("other"))
     taken = [waiting.get() for _ in range(len(waiting))]
     assert [(one.requester.name, one.message) for one in taken] == [
         ("other", 0),
-        *(("flood", number) for number in range(3, MOST_OF_ONE + 3)),
+        *(("flood", number) for number in range(3, MAX_PER_CLIENT + 3)),
     ]
     assert not waiting
-    for number in range(MOST_WAITING):
+    for number in range(MAX_WAITING):
         assert waiting.put(request(f"{number}"))
     assert not waiting.put(request("one too many"))
 
@@ -108,11 +108,11 @@ def test_a_client_has_few_requests_waiting_and_its_newest_count() -> None:
 def test_clients_take_turns() -> None:
     """However many one has waiting, and what could not be answered yet comes after all others."""
     waiting = WaitingRequests()
-    for number in range(MOST_OF_ONE):
+    for number in range(MAX_PER_CLIENT):
         waiting.put(request("greedy", number))
     waiting.put(request("other"))
     slow = waiting.get()
-    waiting.again(slow)
+    waiting.requeue(slow)
     waiting.put(request("new"))
     taken = [waiting.get() for _ in range(len(waiting))]
     assert [one.requester.name for one in taken[:3]] == ["other", "new", "greedy"]

@@ -14,9 +14,9 @@ from shmmap_clients.ros_bridge.status_file import StatusFile, status_name
 
 import shmmap
 from shmmap.daemon.config import load_config
-from shmmap.doctor.finding import Finding
-from shmmap.doctor.patient import examine
-from shmmap.doctor.ros_bridge import check_ros_bridge
+from shmmap.doctor.access import check_ros_bridge
+from shmmap.doctor.checks import examine
+from shmmap.doctor.verdicts import Finding
 
 HOLDER = """\
 import json, sys
@@ -50,11 +50,11 @@ def bridge(socket: str, domain: int, status: object) -> subprocess.Popen[str]:
     return made
 
 
-def test_doctor_names_strangers_of_bridges_that_run(socket: str, tmp_path: Path) -> None:
+def test_doctor_names_incompatible_peers_of_running_bridges(socket: str, tmp_path: Path) -> None:
     assert finding(socket, tmp_path).skipped
     fast = {"service": "/map/get_partial_pointcloud_map", "vendor": "Fast DDS"}
-    status = {"domain": 3, "clients": 5, "strangers": [fast, fast, {"service": "/x", "vendor": ""}]}
-    with bridge(socket, 0, {"domain": 0, "clients": 1, "strangers": []}) as first:
+    status = {"domain": 3, "clients": 5, "incompatible": [fast, fast, {"service": "/x", "vendor": ""}]}
+    with bridge(socket, 0, {"domain": 0, "clients": 1, "incompatible": []}) as first:
         found = finding(socket, tmp_path)
         assert (found.state, found.fact) == ("ok", "domain 0: 1 client")
         with bridge(socket, 3, status) as second:
@@ -70,10 +70,10 @@ def test_doctor_names_strangers_of_bridges_that_run(socket: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    "status", ["", "[]", "{", '{"domain": 1}', '{"domain": "x", "clients": 1, "strangers": []}', "\0"]
+    "status", ["", "[]", "{", '{"domain": 1}', '{"domain": "x", "clients": 1, "incompatible": []}', "\0"]
 )
 def test_doctor_survives_what_is_no_bridge_s_file(socket: str, tmp_path: Path, status: str) -> None:
-    with bridge(socket, 1, {"domain": 1, "clients": 0, "strangers": []}) as one:
+    with bridge(socket, 1, {"domain": 1, "clients": 0, "incompatible": []}) as one:
         Path(tmp_path, status_name("town", 1)).write_text(status)
         assert finding(socket, tmp_path).skipped
         one.kill()

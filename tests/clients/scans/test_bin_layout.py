@@ -190,7 +190,7 @@ def test_named_columns_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ScanReader(BinLayout.parse("x:f8,y:f4,z")).read(path)
 
 
-def test_all_scans_of_a_drive_are_read_in_one_way_that_is_said_once(tmp_path: Path) -> None:
+def test_all_scans_of_a_drive_have_one_layout_that_is_logged_once(tmp_path: Path) -> None:
     said: list[str] = []
     reader = ScanReader(say=said.append)
     (tmp_path / "0.bin").write_bytes(b"")

@@ -68,17 +68,17 @@ def test_files_without_poses_or_places(tmp_path: Path, read: Callable[[Path], ob
     for name, said in (("empty", "no poses"), ("binary.csv", "not a text file"), ("folder.csv", "directory")):
         with pytest.raises(MapDataError, match=said):
             read(tmp_path / name)
-    with pytest.raises(MapMissing, match=r"way\.csv"):
-        read(tmp_path / "way.csv")
+    with pytest.raises(MapMissing, match=r"route\.csv"):
+        read(tmp_path / "route.csv")
 
 
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("way.tum", "# t x y z q\n1.0 1.5 -2 7 0 0 0 1\n2.0 3 4e1 7 0 0 0.7071068 0.7071068\n"),
-        ("way.csv", "1.5,-2\n3,4e1\n"),
-        ("way.CSV", "\ufeffx,y,z\n1.5,-2,7\n\n3, 40,\n"),
-        ("way.csv", '# planned\n"z","y","x"\n7,-2,1.5 # here it begins\n7,40,3,\n'),
+        ("route.tum", "# t x y z q\n1.0 1.5 -2 7 0 0 0 1\n2.0 3 4e1 7 0 0 0.7071068 0.7071068\n"),
+        ("route.csv", "1.5,-2\n3,4e1\n"),
+        ("route.CSV", "\ufeffx,y,z\n1.5,-2,7\n\n3, 40,\n"),
+        ("route.csv", '# planned\n"z","y","x"\n7,-2,1.5 # here it begins\n7,40,3,\n'),
     ],
 )
 def test_places_of_a_route(tmp_path: Path, name: str, text: str) -> None:
@@ -99,7 +99,7 @@ def test_places_of_a_route(tmp_path: Path, name: str, text: str) -> None:
     ],
 )
 def test_what_is_no_route_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    file = tmp_path / "way.csv"
+    file = tmp_path / "route.csv"
     file.write_text(text)
     with pytest.raises(MapDataError, match=said) as refused:
         read_route(file)

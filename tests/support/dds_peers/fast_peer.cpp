@@ -3,7 +3,7 @@
 //
 //   fast_peer DOMAIN VERB NAME ...      as cyclone_peer.c, and prints the same
 //
-// A fourth verb, `stranger`, speaks rmw_fastrtps_cpp's mapping: no clientid, no 16 bytes. It prints "matched" when
+// A fourth verb, `incompatible`, speaks rmw_fastrtps_cpp's mapping: no clientid, no 16 bytes. It prints "matched" when
 // the service is there, and waits until its standard input ends. A fifth, `raw`, sends differential requests as
 // they are given, each the hexadecimal digits of a sample with its encapsulation, until they are acknowledged.
 #include <unistd.h>
@@ -168,7 +168,7 @@ int main(int argc, char **argv) {
   if (argc < 4) fail("usage");
   const int domain = std::atoi(argv[1]);
   const std::string verb = argv[2], name = argv[3];
-  const bool stranger = verb == "stranger";
+  const bool incompatible = verb == "incompatible";
   DomainParticipantQos qos;
   auto udp = std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>();
   udp->interfaceWhiteList.push_back("127.0.0.1");
@@ -192,7 +192,7 @@ int main(int argc, char **argv) {
   reply_type.register_type(participant);
   auto *requests = participant->create_topic("rq" + name + "Request", type + "Request_", TOPIC_QOS_DEFAULT);
   auto *replies = participant->create_topic("rr" + name + "Reply", type + "Response_", TOPIC_QOS_DEFAULT);
-  const std::string user = stranger ? "" : "clientid=1.f." + std::to_string(getpid()) + ";";
+  const std::string user = incompatible ? "" : "clientid=1.f." + std::to_string(getpid()) + ";";
   const std::vector<eprosima::fastrtps::rtps::octet> user_data(user.begin(), user.end());
   DataWriterQos writer_qos;
   writer_qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
@@ -230,12 +230,12 @@ int main(int argc, char **argv) {
   Writer request;
   const uint64_t guid = 0xfa57dd5000000000u | static_cast<uint32_t>(getpid());
   const int64_t seq = 78;
-  if (!stranger) {
+  if (!incompatible) {
     request.number<uint64_t>(guid);
     request.number<int64_t>(seq);
   }
   if (verb == "raw") {
-  } else if (stranger) {
+  } else if (incompatible) {
     for (int n = 0; n < 3; n++) request.number<float>(0);
   } else if (verb == "selected") {
     request.texts(argv + 4, argv + argc);
@@ -245,16 +245,16 @@ int main(int argc, char **argv) {
     if (verb == "differential") request.texts(argv + 7, argv + argc);
   }
   if (verb != "raw" && !writer->write(&request.bytes)) fail("write");
-  if (stranger) {
+  if (incompatible) {
     std::puts("matched");
     std::fflush(stdout);
     while (std::getchar() != EOF) {
     }
   }
   // A request that is written before the service has found this writer is lost: CycloneDDS skips what is older than
-  // the first heartbeat, and nothing tells the writer. So it is asked again, under the same number.
+  // the first heartbeat, and the writer does not learn of it. So it is asked again, under the same number.
   int asked_again = 0;
-  for (bool done = stranger || verb == "raw"; !done;) {
+  for (bool done = incompatible || verb == "raw"; !done;) {
     if (!reader->wait_for_unread_message({2, 0})) {
       if (++asked_again == 30) fail("no reply");
       if (!writer->write(&request.bytes)) fail("write");

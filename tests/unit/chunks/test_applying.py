@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence adds up as in a slow reference; whoever dies while writing leaves a chunk as it was."""
+"""Evidence has its worth and adds up as in a slow reference; a dead writer leaves a chunk as it was."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from shmmap.chunks import applying
 from shmmap.chunks.layout import MAPPERS, ChunkView
 from shmmap.chunks.marking import Marker
 from shmmap.chunks.marks import Marks
-from shmmap.chunks.occupancy import Occupancy, ScanFilter
+from shmmap.chunks.occupancy import Occupancy, ScanFilter, log_odds, probability
 from shmmap.chunks.voxels import ChunkKey
-from shmmap.errors import SegmentCorrupt
+from shmmap.errors import ConfigError, SegmentCorrupt
 from tests.support.chunk_memory import ChunkMemory
 from tests.support.live_drive import SlowOccupancy
 
@@ -22,7 +22,7 @@ FILTER = ScanFilter(0.2, 9.0, -5.0, 5.0)
 
 
 def drive(scans: int, *, seed: int = 1) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Scans with poses along a way that crosses chunks, comes back, and jumps."""
+    """Scans with poses along a path that crosses chunks, comes back, and jumps."""
     rng = np.random.default_rng(seed)
     found = []
     for number in range(scans):
@@ -55,7 +55,7 @@ def test_a_drive_equals_the_slow_one_voxel_by_voxel() -> None:
 
 
 def test_evidence_stops_at_the_clamps_and_may_come_to_nothing() -> None:
-    """A miss, and so many hits that what they add up to is exactly as much: unknown again."""
+    """A miss, and hits that add up to exactly as much: unknown again."""
     memory = ChunkMemory(0.1, Occupancy(hit=1 / (1 + math.exp(-0.4055)), miss=1 / (1 + math.exp(0.4055))))
     assert memory.occupancy.steps[:2] == (405, -405)
     key, place = ChunkKey(0, 0, 0), {0: 1}
@@ -118,15 +118,15 @@ def test_a_scan_that_comes_twice_counts_once() -> None:
 
 def test_a_chunk_remembers_the_mappers_that_the_map_knows() -> None:
     memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
-    everybody = tuple(range(1, MAPPERS + 1))
-    for mapper in everybody:
-        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=1, known=everybody)
+    all_mappers = tuple(range(1, MAPPERS + 1))
+    for mapper in all_mappers:
+        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=1, known=all_mappers)
     with pytest.raises(SegmentCorrupt, match="32 mappers"):
-        memory.apply(one_word(key, {0: 1}, {}), mapper=99, scan=1, known=(*everybody, 99))
+        memory.apply(one_word(key, {0: 1}, {}), mapper=99, scan=1, known=(*all_mappers, 99))
     memory = ChunkMemory(0.1)
-    for mapper in everybody:
-        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=1, known=everybody)
-    known = (*everybody[:3], *everybody[4:], 99)
+    for mapper in all_mappers:
+        memory.apply(one_word(key, {0: 1}, {}), mapper=mapper, scan=1, known=all_mappers)
+    known = (*all_mappers[:3], *all_mappers[4:], 99)
     memory.apply(one_word(key, {0: 1}, {}), mapper=99, scan=1, known=known)
     mappers = memory.chunks[key].state["mappers"]["number"].tolist()
     assert mappers == [1, 2, 3, 99, *range(5, MAPPERS + 1)]
@@ -208,3 +208,51 @@ def test_an_undo_record_of_something_else_is_refused() -> None:
     assert memory.undo.of == (key, 1)
     with pytest.raises(SegmentCorrupt, match="undo record"):
         memory.undo.restore(ChunkView(bytearray(view.data[: 4096 + 3 * 512])))
+
+
+# --- what evidence is worth: Rolling-Bonxai's figures, in thousandths -------------------------------------
+
+
+def test_the_defaults_are_rolling_bonxai_s() -> None:
+    assert Occupancy().steps == (847, -405, -1992, 3476)
+    assert Occupancy().thresholds == (0, 0)
+    assert ScanFilter() == ScanFilter(min_range=0.5, max_range=5.0, min_z=-2.0, max_z=2.0)
+
+
+def test_log_odds_and_back() -> None:
+    assert [log_odds(p) for p in (0.5, 0.9, 0.1)] == [0, 2197, -2197]
+    assert probability(0) == 0.5
+    assert probability(log_odds(0.7)) == pytest.approx(0.7, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("hit", 0.5), ("hit", 0.4), ("hit", 1.0), ("hit", math.nan), ("miss", 0.5), ("miss", 0.6),
+        ("miss", 0.0), ("clamp_min", 0.5), ("clamp_max", 0.5), ("clamp_max", 1.5), ("occupied_above", 0.4),
+        ("occupied_above", 0.97), ("free_below", 0.6), ("free_below", 0.12), ("hit", 0.5001),
+    ],
+)  # fmt: skip
+def test_an_occupancy_that_makes_no_sense_is_refused(key: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=key) as caught:
+        Occupancy(**{key: value})
+    assert caught.value.key == key
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("max_range", {"max_range": 0.5}), ("max_range", {"max_range": math.inf}),
+        ("min_range", {"min_range": math.nan}), ("min_range", {"min_range": -1.0}), ("max_z", {"min_z": 2.0}),
+    ],
+)  # fmt: skip
+def test_a_filter_that_lets_nothing_through_is_refused(key: str, values: dict[str, float]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        ScanFilter(**values)
+    assert caught.value.key == key
+
+
+def test_rays_have_a_greatest_length() -> None:
+    Marker(0.05, ScanFilter(max_range=201.0))
+    with pytest.raises(ConfigError, match=r"at most 201\.6 m"):
+        Marker(0.05, ScanFilter(max_range=202.0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies of a chunk that somebody writes are whole, and voxels are found where they are."""
+"""Copies of a chunk that is being written are whole, and voxels are found where they are."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def opened(chunk: tuple[ChunkFile, Path]) -> Iterator[int]:
 def written(chunk: tuple[ChunkFile, Path]) -> Iterator[ChunkView]:
     """A chunk that another process fills with one number after the other, without end."""
     one, path = chunk
-    command = [sys.executable, "-m", "tests.support.constant_writer", str(path), str(FILLED)]
+    command = [sys.executable, "-m", "tests.support.chunk_memory", str(path), str(FILLED)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as writer:
         try:
             assert writer.stdout is not None

@@ -149,9 +149,9 @@ def test_version_and_its_json(capsys: pytest.CaptureFixture[str]) -> None:
     import shmmap
 
     assert main(["version", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["shmmap"] == shmmap.__version__
-    assert all(re.fullmatch(r"\d+\.\d+", told[name]) for name in ("protocol", "layout"))
+    document = json.loads(capsys.readouterr().out)
+    assert document["shmmap"] == shmmap.__version__
+    assert all(re.fullmatch(r"\d+\.\d+", document[name]) for name in ("protocol", "layout"))
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0

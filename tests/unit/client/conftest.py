@@ -41,10 +41,20 @@ class Segments:
     ) -> tuple[str, Handle]:
         rows = len(next(iter(columns.values())))
         name, header = publish_segment(
-            self.directory, columns, block=PublishBlock(epoch=7, version=version), cell_id=cell_id, box=box,
-            layer=layer, origin=origin, z_min=-1.0, z_max=8.0, source=SourceStamp(11, 22, 33),
-            source_digest=bytes(range(16)), source_points=rows + 2, dropped_points=2,
-        )  # fmt: skip
+            self.directory,
+            columns,
+            block=PublishBlock(epoch=7, version=version),
+            cell_id=cell_id,
+            box=box,
+            layer=layer,
+            origin=origin,
+            z_min=-1.0,
+            z_max=8.0,
+            source=SourceStamp(11, 22, 33),
+            source_digest=bytes(range(16)),
+            source_points=rows + 2,
+            dropped_points=2,
+        )
         return name, Handle(cell_id, version, layer, name, 0, header.total_bytes, rows, *box)
 
     def attach(self, name: str, handle: Handle) -> Cell:
@@ -73,8 +83,11 @@ def make_cell(segments: Segments) -> Callable[..., Cell]:
         xyz = (low + rng.random((count, 3)) * (high - low)).astype(np.float32)
         intensity = rng.random(count).astype(np.float32)
         return segments.cell(
-            cell_id, {"xyz": xyz, "intensity": intensity}, box=box,
-            version=version or abs(hash(cell_id)) % 2**60, **options,
-        )  # fmt: skip
+            cell_id,
+            {"xyz": xyz, "intensity": intensity},
+            box=box,
+            version=version or abs(hash(cell_id)) % 2**60,
+            **options,
+        )
 
     return make

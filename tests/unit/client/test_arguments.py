@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Routes of any length are sent as at most 512 places, equally far apart."""
+"""Arguments of requests: routes are thinned to 512 places, and what cannot be sent is refused before."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmmap import BadRequest
+import shmmap
 from shmmap.client.arguments import (
     FARTHEST_M,
     MAX_ROUTE_PLACES,
@@ -21,6 +21,9 @@ from shmmap.client.arguments import (
     request_waits,
     thinned,
 )
+from shmmap.client.live.live_map import LiveMap, _area
+from shmmap.errors import BadRequest
+from shmmap.protocol.areas import SphereMessage
 from shmmap.protocol.messages import Intent
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -110,3 +113,30 @@ def test_as_planners_have_them(route: Any) -> None:
     assert pose_intent(0, 0, 0, 0, None, route).route == ((1.0, 2.0), (3.0, 4.0))
     assert pose_intent(0, 0, 0, 0, None, ()).route == ()
     assert pose_intent(0, 0, 0, 0, None, np.empty((0, 2))).route == ()
+
+
+# --- areas and places of live maps ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (0, 0, 0, 1.4e154), (0, 0, 0, 1.7e308), (0, 0, 0, 1e150), (1e155, 0, 0, 1), (0, -1.7e308, 0, 1),
+        (0, 0, 10**400, 1), (0, 0, 0, 10**400), (math.nan, 0, 0, 1), (0, 0, math.inf, 1), (0, 0, 0, math.inf),
+        (0, 0, 0, -1e-9), (0, 0, 0, math.nan),
+    ],
+)  # fmt: skip
+def test_spheres_that_make_no_sense(numbers: tuple[float, float, float, float]) -> None:
+    with pytest.raises(BadRequest, match="finite"):
+        _area(shmmap.live.Sphere(*numbers))
+
+
+def test_spheres_that_do() -> None:
+    assert _area(shmmap.live.Sphere(1, -2, 3, 0)) == SphereMessage(1.0, -2.0, 3.0, 0.0)
+    assert _area(shmmap.live.Sphere(0, 0, 0, 9e149)) == SphereMessage(0.0, 0.0, 0.0, 9e149)
+    assert _area(None) is None
+
+
+def test_a_place_beyond_all_floats() -> None:
+    with pytest.raises(BadRequest, match="not finite"):
+        LiveMap.move_to(object.__new__(LiveMap), 10**400, 0, 0)

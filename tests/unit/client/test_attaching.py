@@ -41,7 +41,7 @@ def test_staleness_follows_the_last_reply(segments: Segments) -> None:
     assert not cell.stale
 
 
-def test_a_version_is_told_when_its_last_layer_is_unmapped(segments: Segments) -> None:
+def test_a_version_is_reported_when_its_last_layer_is_unmapped(segments: Segments) -> None:
     points = segments.cell("/a", XYZ, version=5)
     voxel = segments.cell("/a", XYZ, version=5, layer="voxel")
     other = segments.cell("/b", XYZ, version=6)
@@ -55,7 +55,7 @@ def test_a_version_is_told_when_its_last_layer_is_unmapped(segments: Segments) -
     assert attacher.any_mapped
     del other
     assert attacher.unmapped() == [6]
-    assert attacher.unmapped() == [6], "until it was told"
+    assert attacher.unmapped() == [6], "until it was reported"
     assert not attacher.any_mapped
 
 

@@ -142,7 +142,7 @@ def test_dlpack_is_the_same_memory_read_only_or_refused(segments: Segments) -> N
     assert not alias.flags.writeable
 
 
-def test_writing_past_numpy_ends_the_process_and_harms_nobody(segments: Segments) -> None:
+def test_writing_past_numpy_ends_the_process_and_harms_no_other(segments: Segments) -> None:
     """What the documentation warns of: the mapping itself is read-only."""
     name, handle = segments.publish("/map/a.pcd", COLUMNS)
     program = f"""

@@ -67,7 +67,7 @@ def test_what_is_not_covered_is_incomplete() -> None:
     assert "not covered" in repr(CellSet(covered=False))
 
 
-def test_holders_are_lines_that_name_who() -> None:
+def test_holders_are_lines_that_name_the_process() -> None:
     holders = (Holder(0xAB, 42, 1000, "ndt", 4096, 3), Holder(0, 0, -1, "", 8192))
     error = cell_error(FailedCell("a", "points", "over_budget", "full", holders), "/a")
     assert error.holders == holders

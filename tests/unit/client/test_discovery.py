@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding the daemon: every way it can fail is told apart, against real sockets."""
+"""Finding the daemon: every failure has an error of its own, against real sockets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from shmmap.client.discovery import candidates, find_socket
 from shmmap.errors import BadRequest, NoAnswer, NoSocket, ProtocolMismatch, SocketPermission, StaleSocket
 
 SOON_S = 0.3
-"""How long a test waits for somebody who does not answer."""
+"""How long a test waits for a daemon that does not answer."""
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def test_another_program_is_a_protocol_mismatch(place: Path, words: bytes) -> No
 
 
 def test_a_daemon_that_ends_before_it_answers(place: Path) -> None:
-    """A socket that was made for it: the connection waited, and nobody ever accepted it."""
+    """A socket that was made for it: the connection waited, and was never accepted."""
     with listening(place / "s.sock") as server:
         thread = threading.Thread(target=lambda: server.accept()[0].close())
         thread.start()
@@ -247,7 +247,7 @@ def test_a_daemon_that_ends_while_one_connects(place: Path) -> None:
         thread.join()
 
 
-def test_all_places_are_told_about(place: Path) -> None:
+def test_all_places_are_named(place: Path) -> None:
     with listening(place / "stale.sock"):
         pass
     with pytest.raises(StaleSocket) as caught:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views for libraries that know no read-only memory: read without a copy, written without harm to anybody."""
+"""Views for libraries that know no read-only memory: read without a copy, written without harm to others."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def private_kib(path: str) -> int:
     return total
 
 
-def test_a_write_is_a_page_of_this_process_and_nobody_else_sees_it(segments: Segments) -> None:
+def test_a_write_is_a_page_of_this_process_and_no_other_sees_it(segments: Segments) -> None:
     cell = segments.cell("/map/a.pcd", COLUMNS)
     before = segment_file(segments, cell).read_bytes()
     view, other = writable(cell), writable(cell)

@@ -7,46 +7,34 @@ Files are real, segments are real, loaders are real processes.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from shmmap.daemon.cache.cell_cache import CellCache
-from shmmap.daemon.cache.ledger import Ledger
-from shmmap.daemon.cache.map_switch import MapSwitch
 from shmmap.daemon.config import DaemonConfig
-from shmmap.daemon.events.log import EventLog
-from shmmap.daemon.loading.prepared_parent import PreparedParent
-from shmmap.daemon.loading.scheduler import Scheduler
-from shmmap.daemon.loading.worker_pool import WorkerPool
+from shmmap.daemon.map_in_memory import MapInMemory
 from shmmap.daemon.pins.watch import PinWatch
-from shmmap.daemon.records import Key
 from shmmap.daemon.requests.cell_requests import CellRequests
 from shmmap.daemon.requests.map_queries import MapQueries
 from shmmap.daemon.requests.operators.operator_pins import OperatorPins
-from shmmap.daemon.requests.pending_request import WaitingList
 from shmmap.daemon.transport.connection import Connection
-from shmmap.daemon.transport.sessions import Session, Sessions
-from shmmap.daemon.turns import WatchedDescriptors
+from shmmap.daemon.transport.sessions import Session
 from shmmap.origin.catalogue import Catalogue
 from shmmap.origin.map_directory import open_map
 from shmmap.protocol.codec import decode_reply
 from shmmap.protocol.messages import Area, BoxMessage, Cells, Differential, Selected
 from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
-from shmmap.statistics.identity import DaemonIdentity
-from shmmap.statistics.writer import StatisticsWriter
 from tests.support import connections
 from tests.support.daemon_process import stop
 
-EPOCH = 77
-PATIENCE_S = 240.0
+TIMEOUT_S = 240.0
 EVERYWHERE = BoxMessage(-1e4, -1e4, 1e4, 1e4)
 
 
@@ -62,74 +50,47 @@ def finish(work: Iterator[None] | None) -> None:
 
 
 class InnerDaemon:
-    """CellCache, sessions and requests over one map; ``offset_s`` moves its clock ahead."""
+    """What the daemon has in memory, and requests over one map; ``offset_s`` moves its clock ahead."""
 
     def __init__(
         self,
         map_path: str,
         *,
-        budget_bytes: int = 64 << 20,
+        cache_dir: str,
         quota_bytes: int = 64 << 20,
         workers: int = 1,
         load_timeout_s: float = 300.0,
-        cache_dir: str,
-        shm_dir: str = "",
-        name: str = "inner",
         prefetch_share: float = 0.0,
-        outage_tolerance_s: float = 10.0,
+        **settings: Any,
     ) -> None:
         prepare_process()
-        self.shm_dir = shm_dir or tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
+        self.shm_dir = tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
         self.directory = ShmDirectory(self.shm_dir)
         self.origin = open_map(map_path, cache_dir=cache_dir)
-        catalogue = self.origin.load()
-        identity = DaemonIdentity(
-            pid=os.getpid(), start_time_ticks=1, pid_namespace=1, epoch=EPOCH, instance="inner",
-            endpoint="", map_path=map_path, map_version=catalogue.map_version, shm_dir=self.shm_dir,
-            id_prefix=catalogue.id_prefix, library_version="0", started_unix_ns=0, frame_id="map",
-        )  # fmt: skip
-        self.statistics = StatisticsWriter(self.directory, name, identity)
-        self.sessions = Sessions()
-        self.ledger = Ledger(budget_bytes)
-        self.ledger.overhead_bytes = self.statistics.size_bytes
-        pins = PinWatch(self.directory, events=True)
-        self.watched = WatchedDescriptors()
-        self.parent = PreparedParent((self.shm_dir, str(2 << 30)), self.watched)
-        self.ended: list[Key] = []
-        self.event_log = EventLog(EPOCH)
-        self.cache = CellCache(
-            catalogue,
-            self.ledger,
-            self.directory,
-            self.sessions,
-            pins,
-            self.statistics,
-            self.event_log,
+        config = DaemonConfig(
+            map_path=map_path,
             instance="inner",
-            mode=0o400,
-            gid=-1,
-        )
-        self.reclaimer, self.evictor, self.events = (
-            self.cache.reclaimer,
-            self.cache.evictor,
-            self.cache.events,
+            shm_dir=self.shm_dir,
+            workers=workers,
+            load_timeout_s=load_timeout_s,
+            prefetch_share=prefetch_share,
+            **{"budget_bytes": 64 << 20, "outage_tolerance_s": 10.0, **settings},
         )
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None
-        self.map_switch = MapSwitch(self.cache)
-        make_pool = partial(WorkerPool, workers, self.directory, self.parent, load_timeout_s, self.watched)
-        self.waiting = WaitingList(self.ledger)
-        self.scheduler = Scheduler(
-            self.cache,
-            self.map_switch,
-            make_pool,
-            self,
-            clock=self.now_s,
-            prefetch_share=prefetch_share,
-            outage_tolerance_s=outage_tolerance_s,
+        pins = PinWatch(self.directory, events=True)
+        self.memory = memory = MapInMemory(
+            config, self.origin.load(), self.directory, pins, "", 0o400, -1, clock=self.now_s
+        )
+        self.cache, self.scheduler, self.sessions = memory.cache, memory.scheduler, memory.sessions
+        self.statistics, self.event_log, self.watched = memory.statistics, memory.event_log, memory.watched
+        self.map_switch, self.waiting = memory.map_switch, memory.waiting
+        self.ledger, self.reclaimer, self.evictor = (
+            self.cache.ledger,
+            self.cache.reclaimer,
+            self.cache.evictor,
         )
         self.loads, self.pool = self.scheduler.loads, self.scheduler.pool
-        self.scheduler.room.watch(self.watched, self.now_s)
         self.hold_answers = False
         self.due: list[Iterator[None]] = []
         self.replies: list[tuple[Session, Any]] = []
@@ -141,11 +102,16 @@ class InnerDaemon:
             due=self._answer,
             clock=self.now_s,
         )
+        pins_of_operators = OperatorPins(self.cache, self.scheduler)
         self.queries = MapQueries(
-            DaemonConfig(map_path=map_path, instance="inner", shm_dir=self.shm_dir), self.cache,
-            self.sessions, OperatorPins(self.cache, self.scheduler), self.map_switch, self.loads,
+            config,
+            self.cache,
+            self.sessions,
+            pins_of_operators,
+            self.map_switch,
+            self.loads,
             self.event_log,
-        )  # fmt: skip
+        )
 
     def _answer(self, _connection: Connection, answer: Iterator[None]) -> None:
         """An answer is due, in the next turn; kept while `hold_answers`."""
@@ -155,11 +121,6 @@ class InnerDaemon:
         """Begin to serve a request for cells, and do what of it needs no waiting."""
         verb = getattr(self.cells, type(message).__name__.lower())
         finish(verb(session, message))
-
-    def load_finished(self, key: Key) -> None:
-        """Note the end of a load, as the list of waiting requests does."""
-        self.ended.append(key)
-        self.waiting.load_finished(key)
 
     def now_s(self) -> float:
         """Return the time of the daemon's clock."""
@@ -171,7 +132,7 @@ class InnerDaemon:
         self.stopped_at_s = time.monotonic()
 
     def session(self, name: str = "") -> Session:
-        """Open a session of a process that nobody watches."""
+        """Open a session of a process that is not watched."""
         connection = connections.of(reply=lambda data: self.replies.append((session, decode_reply(data))))
         session = self.sessions.open(connection, name, self.now_s())
         return session
@@ -197,14 +158,19 @@ class InnerDaemon:
             self.evictor.run_step(now_s)
         while not self.hold_answers and self.due:
             finish(self.due.pop(0))
-        self.events.flush()
+        self.cache.events.flush()
 
     def run_until(self, done: Callable[[], object]) -> None:
         """Turn until ``done()``."""
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + TIMEOUT_S
         while not done():
             self.turn()
             assert time.monotonic() < end_s, "the daemon never came to it"
+
+    def run_until_nothing_waits(self) -> None:
+        """Turn until no request waits; nothing may be kept for any."""
+        self.run_until(lambda: self.cells.next_deadline_s() == math.inf)
+        assert (list(self.ledger.needed()), self.waiting._of_load, len(self.cells)) == ([], {}, 0)
 
     def reply_to(self, request: int) -> Any:
         """Run until this request is answered; returns the reply."""
@@ -234,7 +200,7 @@ class InnerDaemon:
 
     @contextlib.contextmanager
     def loaders_standing_still(self) -> Iterator[list[int]]:
-        """Stop the loaders (one is started if there is none); on the way out they go on."""
+        """Stop the loaders (one is started if there is none); when the block ends they go on."""
         if not len(self.pool):
             self.pool.start_one()
         self.run_until(lambda: all(worker.ready for worker in self.pool))
@@ -253,22 +219,15 @@ class InnerDaemon:
         new = self.origin.load(fresh=True)
         self.map_switch.switch(new, new.changes_from(self.cache.catalogue))
         self.scheduler.map_changed()
-        self.events.flush()
+        self.cache.events.flush()
         return new
-
-    def leave(self) -> None:
-        """End everything but the segments, as before a restart."""
-        for session in list(self.sessions):
-            self.sessions.close(session)
-        self.pool.close()
-        self.cache.close(keep=True)
-        self.statistics.close()
-        self.watched.close()
-        self.directory.close()
 
     def close(self) -> None:
         """End everything and remove the directory."""
-        self.leave()
+        for session in list(self.sessions):
+            self.sessions.close(session)
+        self.memory.close(keep=True)
+        self.directory.close()
         shutil.rmtree(self.shm_dir)
 
 

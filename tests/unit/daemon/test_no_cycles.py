@@ -77,7 +77,7 @@ def test_what_refers_to_itself_is_found() -> None:
     assert left_behind() == ["Key", "Load"]
 
 
-def test_requests_loads_and_what_gives_way(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> None:
+def test_requests_loads_and_evictions(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> None:
     """Cold, warm, packed, named, failed, refused, pending, in vain; and what comes of an eviction."""
     one = whole(small_map.root)
     (small_map.pcd_dir / "20_20.pcd").write_bytes(b"no PCD")

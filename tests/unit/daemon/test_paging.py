@@ -550,7 +550,7 @@ def test_another_version_is_served_when_it_knows_what_is_known_of_this_one(paged
     assert (names(since.rows), since.since_known) == (["20_20.pcd"], True)
 
 
-def test_a_version_that_is_held_back_gives_way_to_a_later_one(paged: Paged) -> None:
+def test_a_version_that_is_held_back_is_replaced_by_a_later_one(paged: Paged) -> None:
     paged.know(WEST, EAST)
     paged.origin.sharing = {WEST}
     held: list[PagedView] = []
@@ -684,7 +684,7 @@ def test_a_layer_that_looks_into_what_is_out_of_reach_is_offline(paged: Paged) -
 
 
 @pytest.mark.parametrize("change", [False, True])
-def test_segments_of_what_is_not_known_yet_are_set_aside(
+def test_segments_of_unknown_cells_are_kept_unjudged(
     paged: Paged, whole: Callable[..., WholeDaemon], change: bool
 ) -> None:
     """They are judged when their page comes."""
@@ -712,7 +712,7 @@ def test_segments_of_what_is_not_known_yet_are_set_aside(
     assert paged.count("loads_finished") - loaded == int(change)
 
 
-def test_what_is_set_aside_is_judged_by_a_later_version_that_knows_more(
+def test_unjudged_segments_are_judged_by_a_later_version_that_knows_more(
     paged: Paged, whole: Callable[..., WholeDaemon], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paged.know(WEST, EAST)
@@ -728,7 +728,7 @@ def test_what_is_set_aside_is_judged_by_a_later_version_that_knows_more(
     assert (paged.count("adopted"), paged.daemon.memory.cache.ledger.set_aside_bytes) == (16, 0)
 
 
-def test_what_is_set_aside_goes_with_the_daemon(paged: Paged, whole: Callable[..., WholeDaemon]) -> None:
+def test_unjudged_segments_go_with_the_daemon(paged: Paged, whole: Callable[..., WholeDaemon]) -> None:
     paged.know(WEST, EAST)
     paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
     paged.daemon.close(keep=True)
@@ -818,7 +818,7 @@ def test_a_window_keeps_what_may_be_in_the_unknown_part(
             update = window.move_to(1.0, 0.0, wait=1.0)
         assert (update.removed, update.covered, update.complete) == ((), False, False)
         assert (names(window.cells), window.complete) == (ALL, False)
-        assert not window.covers(1.0, 0.0, 1.0), "nobody knows where the unknown cells lie"
+        assert not window.covers(1.0, 0.0, 1.0), "where the unknown cells lie is unknown"
         assert not window.points_around(1.0, 0.0, 1.0).covered
         assert not window.wait_until_current(0.05)
         paged.pages.come(EAST)

@@ -23,7 +23,7 @@ MakeWindow = Callable[..., Any]
 KINDS = ("background", "blocking", "c++")
 NEVER = 1e9
 SOON_S = 0.02
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 STRAIGHT = ((0.0, 0.0), (30.0, 0.0))
 LEFT = ((0.0, 0.0), (0.0, 30.0))
 
@@ -59,8 +59,8 @@ def one(whole: Callable[..., WholeDaemon], small_map: DividedMap) -> Iterator[Wh
 
 
 def move_until(received: list[Intent], move: Callable[[], object], fits: Callable[[Intent], bool]) -> Intent:
-    """Move again and again until an intent that fits has come to the daemon."""
-    end_s = time.monotonic() + PATIENCE_S
+    """Keep moving until an intent that fits has come to the daemon."""
+    end_s = time.monotonic() + TIMEOUT_S
     while not any(map(fits, received)):
         move()
         assert time.monotonic() < end_s, f"only these came: {received}"
@@ -75,7 +75,7 @@ def test_another_route_and_another_velocity_come(
     make: MakeWindow, one: WholeDaemon, received: list[Intent]
 ) -> None:
     with make(one.endpoint) as window:
-        window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=PATIENCE_S)
+        window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=TIMEOUT_S)
         came = move_until(received, lambda: window.move_to(0, 0, vx=5.0, route=STRAIGHT), anything)
         assert (came.vx, came.route) == (5.0, STRAIGHT)
         came = move_until(
@@ -93,7 +93,7 @@ def test_nothing_is_asked_before_it_has_moved_or_time_has_passed(
     make: MakeWindow, one: WholeDaemon, received: list[Intent]
 ) -> None:
     with make(one.endpoint, refresh_interval=NEVER) as window:
-        window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=PATIENCE_S)
+        window.move_to(0, 0, vx=5.0, route=STRAIGHT, wait=TIMEOUT_S)
         before = len(received)
         for step in range(200):
             window.move_to(step * 0.02, 0, vx=5.0 + step, route=LEFT)
@@ -103,7 +103,7 @@ def test_nothing_is_asked_before_it_has_moved_or_time_has_passed(
 def test_a_route_that_is_given_once_comes(one: WholeDaemon, received: list[Intent]) -> None:
     """The window is not moved again: its thread asks when its interval is over."""
     with shmmap.MapWindow(one.endpoint, 15.0, update_distance=NEVER, refresh_interval=SOON_S) as window:
-        window.move_to(0, 0, route=STRAIGHT, wait=PATIENCE_S)
+        window.move_to(0, 0, route=STRAIGHT, wait=TIMEOUT_S)
         window.move_to(0, 0, route=LEFT)
         move_until(received, lambda: time.sleep(0.01), lambda i: i.route == LEFT)
 
@@ -113,7 +113,7 @@ def test_long_routes_are_thinned(make: MakeWindow, one: WholeDaemon, received: l
     turns = np.linspace(0.0, 9.0, 6000)
     route = np.stack([20.0 * turns * np.cos(turns), 20.0 * turns * np.sin(turns)], axis=-1)
     with make(one.endpoint) as window:
-        window.move_to(0, 0, route=route.tolist(), wait=PATIENCE_S)
+        window.move_to(0, 0, route=route.tolist(), wait=TIMEOUT_S)
         came = move_until(received, lambda: window.move_to(0, 0, route=route.tolist()), anything)
         assert np.array(came.route) == pytest.approx(thinned(route), abs=1e-9)
         assert len(came.route) == MAX_ROUTE_PLACES

@@ -150,7 +150,7 @@ def environment(count: int = 1, pid: int | None = None) -> dict[str, str]:
 
 @pytest.fixture
 def passed() -> Iterator[Callable[[socket.socket], int]]:
-    """Pass sockets the way a service manager does: descriptors in a row, inheritable."""
+    """Pass sockets as a service manager does: descriptors in a row, inheritable."""
     numbers: list[int] = []
 
     def give(one: socket.socket) -> int:

@@ -18,7 +18,7 @@ from shmmap.protocol.events import LongTurn, Recent, decode_event
 from tests.support.divided_map import DividedMap
 from tests.unit.daemon.whole_daemon import WholeDaemon
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_requests_come_before_other_work(one: WholeDaemon) -> None:
 
     def ask() -> None:
         one.send(Recent(next(requests)))
-        assert select.select([connection.fd], [], [], PATIENCE_S)[0]
+        assert select.select([connection.fd], [], [], TIMEOUT_S)[0]
 
     def load() -> None:
         answered.append(one.memory.statistics.values["replies"] - before)

@@ -30,7 +30,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 
 HELLO = m.Hello(1, *m.PROTOCOL_VERSION, "walker")
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 class WholeDaemon:
@@ -79,7 +79,7 @@ class WholeDaemon:
             loop.turn()
 
     def turn_until(self, done: Callable[[], object]) -> None:
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + TIMEOUT_S
         while not done():
             self.turn()
             assert time.monotonic() < end_s

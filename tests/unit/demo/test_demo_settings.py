@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shmmap.demo.demo_town import DemoSettings, fit, free_memory_bytes
+from shmmap.demo.demo_town import DemoSettings, HeightImage, fit, free_memory_bytes
 from shmmap.errors import ConfigError
-from shmmap.simulation.height_image import HeightImage
 from tests.support.pictures import png_pixels
 
 GIB = 1 << 30

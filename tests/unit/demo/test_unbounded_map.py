@@ -9,7 +9,7 @@ import numpy as np
 
 from shmmap.chunks.occupancy import Occupancy
 from shmmap.chunks.voxels import ChunkKey, voxels_of
-from shmmap.demo.unbounded_map import UnboundedMap
+from shmmap.demo.live_drive import UnboundedMap
 from tests.support.live_drive import FILTER, RESOLUTION, Voxel, drive
 from tests.support.live_reference import reference, stored_drive
 

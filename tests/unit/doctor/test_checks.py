@@ -16,23 +16,17 @@ from msgspec.structs import replace
 
 from shmmap.daemon.config import DaemonConfig
 from shmmap.daemon.config_live import LiveSettings
-from shmmap.doctor import access, cells, daemon, live, memory, signed_map
-from shmmap.doctor.checks import CHECKS, diagnose
-from shmmap.doctor.finding import Finding, worst
-from shmmap.doctor.patient import Machine, Patient, examine
-from shmmap.doctor.verdicts import cache_verdict
+from shmmap.doctor import access, cells, daemon, live, memory, published, verdicts
+from shmmap.doctor.checks import CHECKS, diagnose, examine
+from shmmap.doctor.diagnosis import Diagnosis, Machine
+from shmmap.doctor.verdicts import Finding, cache_verdict, worst
 from shmmap.protocol.rows import ClientRow, LiveMapRow
 from shmmap.statistics.counters import COUNTER_NAMES, REFUSALS
 from shmmap.statistics.snapshot import Snapshot
 from tests.support.divided_map import make_map
-from tests.support.doctor_ward import USER, Ward, snapshot
+from tests.unit.doctor.conftest import USER, Ward, snapshot
 
 S = 1_000_000_000
-
-
-@pytest.fixture
-def ward(tmp_path: Path) -> Ward:
-    return Ward(tmp_path / "machine")
 
 
 def test_the_worst_of_several() -> None:
@@ -43,7 +37,7 @@ def test_the_worst_of_several() -> None:
 
 def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
     """Whatever this machine is like: one finding each, and advice with everything that is not well."""
-    config = DaemonConfig(endpoint=str(tmp_path / "none.sock"), instance="nobody-has-this-name")
+    config = DaemonConfig(endpoint=str(tmp_path / "none.sock"), instance="no-such-instance")
     findings = diagnose(examine(config, ""))
     assert len({one.name for one in findings}) == len(findings) == len(CHECKS)
     for one in findings:
@@ -56,22 +50,22 @@ def test_every_check_says_something_about_this_machine(tmp_path: Path) -> None:
 
 def test_a_disk_cache_in_order(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     uid = os.geteuid()
-    assert memory.check_disk_cache(ward.patient(cache_bytes=0)).skipped
-    assert memory.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town")).skipped
+    assert memory.check_disk_cache(ward.diagnosis(cache_bytes=0)).skipped
+    assert memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town")).skipped
     ward.file("/var/town/layers/ab/1.layer", "x" * 5000)
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x" * 5000)
-    found = memory.check_disk_cache(ward.patient(uid=uid, cache_dir="/var/town", cache_bytes=1 << 20))
+    found = memory.check_disk_cache(ward.diagnosis(uid=uid, cache_dir="/var/town", cache_bytes=1 << 20))
     assert (found.state, found.advice) == ("ok", "")
     assert found.fact.startswith("/var/town: 9.8 KiB of 1.0 MiB used, ")
     monkeypatch.setenv("CACHE_DIRECTORY", "/var/town")
-    assert memory.check_disk_cache(ward.patient(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
+    assert memory.check_disk_cache(ward.diagnosis(uid=uid)).fact.startswith("/var/town: 9.8 KiB of 8.0 GiB")
 
 
 @pytest.mark.parametrize("mode", [0o775, 0o1777])
 def test_a_disk_cache_that_others_may_write(ward: Ward, mode: int) -> None:
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x")
     ward.root.joinpath("var/town/objects").chmod(mode)
-    found = memory.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.diagnosis(uid=os.geteuid(), cache_dir="/var/town"))
     assert found.state == "warn"
     assert f"/var/town/objects may be written by other users (mode {mode:04o})" in found.fact
     assert "chmod go-w /var/town/objects" in found.advice
@@ -82,17 +76,17 @@ def test_a_disk_cache_that_others_may_write(ward: Ward, mode: int) -> None:
 def test_a_disk_cache_of_another_user(ward: Ward, which: str) -> None:
     ward.file(f"/var/town/objects/cells/ab/{1:064x}", "x")
     os.chown(ward.root / which, USER, -1)
-    found = memory.check_disk_cache(ward.patient(uid=0, cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.diagnosis(uid=0, cache_dir="/var/town"))
     assert found.state == "warn"
     assert f"belongs to user {USER}" in found.fact or f"belongs to {USER}" in found.fact
     for name in ("var/town", "var/town/objects"):
         os.chown(ward.root / name, USER, -1)
-    assert memory.check_disk_cache(ward.patient(uid=USER, cache_dir="/var/town")).state == "ok"
+    assert memory.check_disk_cache(ward.diagnosis(uid=USER, cache_dir="/var/town")).state == "ok"
 
 
 def test_a_disk_cache_that_is_none(ward: Ward) -> None:
     ward.file("/var/town", "a file")
-    found = memory.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.diagnosis(uid=os.geteuid(), cache_dir="/var/town"))
     assert (found.state, found.fact) == ("warn", "/var/town is no directory")
 
 
@@ -101,7 +95,7 @@ def test_a_disk_cache_without_room(ward: Ward, monkeypatch: pytest.MonkeyPatch) 
     here = os.statvfs(ward.root)
     full = os.statvfs_result((*here[:4], here.f_blocks // 25, *here[5:]))  # f_bavail
     monkeypatch.setattr(os, "statvfs", lambda _: full)
-    found = memory.check_disk_cache(ward.patient(uid=os.geteuid(), cache_dir="/var/town"))
+    found = memory.check_disk_cache(ward.diagnosis(uid=os.geteuid(), cache_dir="/var/town"))
     assert found.state == "warn"
     assert "nothing more is kept" in found.fact
 
@@ -111,29 +105,29 @@ def test_a_disk_cache_without_room(ward: Ward, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize(("budget", "state"), [(0, "ok"), (1 << 20, "ok"), (1 << 60, "fail")])
 def test_a_budget_against_the_file_system(ward: Ward, budget: int, state: str) -> None:
-    found = memory.check_shared_memory(ward.patient(budget_bytes=budget))
+    found = memory.check_shared_memory(ward.diagnosis(budget_bytes=budget))
     assert found.state == state
     assert ("remount,size=" in found.advice) == (state == "fail")
 
 
 def test_what_the_daemon_uses_already_is_no_shortage(ward: Ward) -> None:
-    here = os.statvfs(ward.patient().machine.path("/dev/shm"))
+    here = os.statvfs(ward.diagnosis().machine.path("/dev/shm"))
     free = here.f_bavail * here.f_frsize
     seen = snapshot(budget_bytes=free + (1 << 30), bytes_resident=1 << 31)
-    assert memory.check_shared_memory(ward.patient(seen)).state != "fail"
+    assert memory.check_shared_memory(ward.diagnosis(seen)).state != "fail"
     seen = snapshot(budget_bytes=free + (1 << 31), bytes_resident=1 << 20)
-    assert memory.check_shared_memory(ward.patient(seen)).state == "fail"
+    assert memory.check_shared_memory(ward.diagnosis(seen)).state == "fail"
 
 
 def test_a_directory_that_is_no_tmpfs(ward: Ward) -> None:
     ward.file("/proc/self/mounts", "/dev/vda / ext4 rw 0 0\ntmpfs /dev/shm tmpfs rw 0 0\n")
     (ward.root / "var/my maps").mkdir(parents=True)
-    assert memory.check_shared_memory(ward.patient()).state == "ok"
-    found = memory.check_shared_memory(ward.patient(shm_dir="/var/my maps"))
+    assert memory.check_shared_memory(ward.diagnosis()).state == "ok"
+    found = memory.check_shared_memory(ward.diagnosis(shm_dir="/var/my maps"))
     assert (found.state, "ext4" in found.fact) == ("fail", True)
     ward.file("/proc/self/mounts", "/dev/vda / ext4 rw 0 0\ntmpfs /var/my\\040maps tmpfs rw 0 0\n")
-    assert memory.check_shared_memory(ward.patient(shm_dir="/var/my maps")).state == "ok"
-    assert memory.check_shared_memory(ward.patient(shm_dir="/no/such")).state == "fail"
+    assert memory.check_shared_memory(ward.diagnosis(shm_dir="/var/my maps")).state == "ok"
+    assert memory.check_shared_memory(ward.diagnosis(shm_dir="/no/such")).state == "fail"
 
 
 @pytest.mark.parametrize(
@@ -157,7 +151,7 @@ def test_limits_of_the_control_group(
 ) -> None:
     ward.file("/proc/self/cgroup", line + "\n")
     ward.file(file, limit + "\n")
-    found = memory.check_memory_limit(ward.patient(budget_bytes=budget))
+    found = memory.check_memory_limit(ward.diagnosis(budget_bytes=budget))
     assert found.state == state
     assert ("lower the budget" in found.advice) == (state == "fail")
 
@@ -168,22 +162,22 @@ def test_what_the_processes_use_beside_the_segments(ward: Ward) -> None:
     ward.file("/sys/fs/cgroup/a/memory.max", f"{300 << 20}\n")
     for used, state in ((100 << 20, "ok"), (200 << 20, "warn")):
         ward.file("/sys/fs/cgroup/a/memory.stat", f"anon {used}\nshmem {150 << 20}\nfile {150 << 20}\n")
-        patient = ward.patient(snapshot(budget_bytes=150 << 20), budget_bytes=150 << 20)
-        found = memory.check_memory_limit(patient)
+        diagnosis = ward.diagnosis(snapshot(budget_bytes=150 << 20), budget_bytes=150 << 20)
+        found = memory.check_memory_limit(diagnosis)
         assert found.state == state
         assert f"its processes use {used >> 20} MiB" in found.fact
 
 
 def test_the_cache_is_judged_as_status_does(ward: Ward) -> None:
-    assert cells.check_cache(ward.patient()).state == "ok"
+    assert cells.check_cache(ward.diagnosis()).state == "ok"
     seen = snapshot(refused_over_budget_10min=3, budget_bytes=1 << 20)
-    found = cells.check_cache(ward.patient(seen))
+    found = cells.check_cache(ward.diagnosis(seen))
     verdict = cache_verdict(seen.counters)
     assert (found.state, found.fact, found.advice) == ("warn", verdict.text, verdict.hint)
     assert found.fact.startswith("TOO SMALL")
     seen = snapshot(refused_over_budget_10min=3, refused_over_budget_1min=1, budget_bytes=1 << 20)
-    assert cells.check_cache(ward.patient(seen)).state == "fail", "clients lack cells now"
-    assert cells.check_cache(ward.patient(snapshot(evictions=3))).state == "ok"
+    assert cells.check_cache(ward.diagnosis(seen)).state == "fail", "clients lack cells now"
+    assert cells.check_cache(ward.diagnosis(snapshot(evictions=3))).state == "ok"
 
 
 DRIVING = {
@@ -261,18 +255,18 @@ def test_whether_prefetching_keeps_up(
     assert set(counters) <= set(COUNTER_NAMES)
     seen = snapshot()
     seen.counters.update(counters)
-    found = cells.check_prefetching(ward.patient(seen))
+    found = cells.check_prefetching(ward.diagnosis(seen))
     assert (found.state, found.advice) == (state, advice)
     assert found.fact.startswith(fact)
-    assert cells.check_prefetching(ward.patient()).skipped, "no daemon runs"
+    assert cells.check_prefetching(ward.diagnosis()).skipped, "no daemon runs"
 
 
 def test_containers(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert memory.check_container(ward.patient()).fact == "not in a container"
+    assert memory.check_container(ward.diagnosis()).fact == "not in a container"
     ward.file("/run/systemd/container", "podman\n")
-    assert memory.check_container(ward.patient()).state == "ok"
+    assert memory.check_container(ward.diagnosis()).state == "ok"
     monkeypatch.setattr(memory, "CONTAINER_DEFAULT_BYTES", 1 << 60)
-    found = memory.check_container(ward.patient())
+    found = memory.check_container(ward.diagnosis())
     assert (found.state, "--shm-size" in found.advice, "--ipc=host" in found.advice) == ("warn", True, True)
 
 
@@ -304,7 +298,7 @@ def test_huge_pages(
     choices = "always within_size advise never deny force ".replace(f"{switch} ", f"[{switch}] ")
     if switch:
         ward.file("/sys/kernel/mm/transparent_hugepage/shmem_enabled", choices)
-    found = memory.check_huge_pages(ward.patient())
+    found = memory.check_huge_pages(ward.diagnosis())
     assert (found.state, found.fact.startswith(fact)) == (state, True), found
     assert (advice in found.advice) if advice else not found.advice, found
     if "within_size;" in found.fact:
@@ -319,7 +313,7 @@ LIDAR = LiveMapRow(
 
 
 def with_live(*rows: LiveMapRow, clients: Sequence[ClientRow] = (), **counters: int) -> Snapshot:
-    """A daemon that keeps these live maps, and lets nobody connect."""
+    """A daemon that keeps these live maps, and accepts no connection."""
     seen = snapshot("hung")
     seen.__dict__ |= {"counters": counters, "live": list(rows), "clients": list(clients)}
     return seen
@@ -332,9 +326,9 @@ def marks(ward: Ward, mode: int = 0o700) -> None:
 
 
 def test_without_live_maps_there_is_nothing_to_look_at(ward: Ward) -> None:
-    for patient in (ward.patient(), ward.patient(with_live())):
+    for diagnosis in (ward.diagnosis(), ward.diagnosis(with_live())):
         for check in (live.check_live_maps, live.check_live_disk, live.check_live_memory):
-            assert check(patient).skipped, check
+            assert check(diagnosis).skipped, check
 
 
 @pytest.mark.parametrize(
@@ -354,7 +348,7 @@ def test_without_live_maps_there_is_nothing_to_look_at(ward: Ward) -> None:
 def test_what_is_wrong_with_live_maps(
     ward: Ward, row: LiveMapRow, restarts: int, state: str, fact: str
 ) -> None:
-    found = live.check_live_maps(ward.patient(with_live(row, live_restarts=restarts)))
+    found = live.check_live_maps(ward.diagnosis(with_live(row, live_restarts=restarts)))
     assert (found.state, fact in found.fact) == (state, True), found
 
 
@@ -365,7 +359,7 @@ def test_the_disk_of_live_maps(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
     mine = os.geteuid()
 
     def check(*, uid: int = mine, seen: Snapshot | None = None, file: str = "") -> Finding:
-        return live.check_live_disk(ward.patient(seen, uid=uid, file=file, live=settings))
+        return live.check_live_disk(ward.diagnosis(seen, uid=uid, file=file, live=settings))
 
     assert check().state == "ok"  # the daemon makes it
     assert "/maps/lidar is gone" in check(seen=with_live(LIDAR)).fact
@@ -381,7 +375,7 @@ def test_the_disk_of_live_maps(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> N
 
     # what the service sees
     ward.file("/etc/systemd/system/shmmapd.service", "")
-    monkeypatch.setattr(Patient, "runs_as", mine)
+    monkeypatch.setattr(Diagnosis, "runs_as", mine)
     installed = "/etc/shmmap/shmmap.toml"
     assert "ProtectSystem=" in check(file=installed).fact
     drop_in = "/etc/systemd/system/shmmapd.service.d/x.conf"
@@ -401,7 +395,7 @@ def test_chunks_are_not_on_huge_pages(ward: Ward) -> None:
     ward.file("/proc/self/mounts", plain + huge)
 
     def check(**more: Any) -> Finding:
-        return live.check_live_memory(ward.patient(live=settings, **more))
+        return live.check_live_memory(ward.diagnosis(live=settings, **more))
 
     assert check().state == "ok"
     assert check(shm_dir="/run/huge").fact == "/dev/shm"
@@ -411,7 +405,7 @@ def test_chunks_are_not_on_huge_pages(ward: Ward) -> None:
 
 def test_where_mappers_put_their_scans(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     def check(**settings: Any) -> Finding:
-        return live.check_live_memory(ward.patient(with_live(LIDAR), **settings))
+        return live.check_live_memory(ward.diagnosis(with_live(LIDAR), **settings))
 
     assert "marks is gone" in check().fact
     marks(ward)
@@ -458,7 +452,7 @@ def test_readers_that_keep_chunks_are_named(ward: Ward) -> None:
     process(ward, 103, 1, "other", [name.replace("default", "night") for name in chunks], [])
 
     def check() -> Finding:
-        return live.check_live_memory(ward.patient(seen))
+        return live.check_live_memory(ward.diagnosis(seen))
 
     assert check().state == "ok"
     process(ward, 200, 1, "few", gone[:1], [])
@@ -478,8 +472,8 @@ def test_readers_whose_requests_take_much_time_are_named(ward: Ward, monkeypatch
     clients = [ClientRow(3, 4242, 0, 0, "perception", "python3", 0, 0, 0, 0)]
     busiest = ((3, 730), (9, 500), (5, 499))
     row = replace(LIDAR, readers=busiest)
-    monkeypatch.setattr(live, "_told", lambda _patient: (row,))
-    found = live.check_live_memory(ward.patient(with_live(LIDAR, clients=clients)))
+    monkeypatch.setattr(live, "_reported", lambda _diagnosis: (row,))
+    found = live.check_live_memory(ward.diagnosis(with_live(LIDAR, clients=clients)))
     assert found.state == "warn"
     assert found.fact.endswith("perception, pid 4242: 73 % for lidar; session 9: 50 % for lidar")
 
@@ -487,25 +481,25 @@ def test_readers_whose_requests_take_much_time_are_named(ward: Ward, monkeypatch
 def test_chunks_of_a_daemon_that_does_not_run_are_no_rubbish(ward: Ward) -> None:
     ward.file("/dev/shm/shmmap-live.default.lidar.-1_0_0.8", "x")
     ward.file("/dev/shm/shmmap-live.default.lidar.undo", "x")
-    found = daemon.check_leftovers(ward.patient())
+    found = daemon.check_leftovers(ward.diagnosis())
     assert (found.state, "default: 1 segment" in found.fact, " rm " in found.advice) == ("warn", True, False)
-    assert daemon.check_leftovers(ward.patient(snapshot())).state == "ok"
+    assert daemon.check_leftovers(ward.diagnosis(snapshot())).state == "ok"
 
 
 def test_a_daemon_that_keeps_live_maps_alone_needs_no_map(ward: Ward) -> None:
-    assert access.check_map_access(ward.patient(live=(LiveSettings("lidar"),))).state == "ok"
+    assert access.check_map_access(ward.diagnosis(live=(LiveSettings("lidar"),))).state == "ok"
 
 
 # --- kernel ---
 
 
 def test_pins_on_a_real_tmpfs(monkeypatch: pytest.MonkeyPatch) -> None:
-    patient = Patient(Machine(), DaemonConfig(), "", "", snapshot("absent"))
-    assert daemon.check_pins(patient).state == "ok"
+    diagnosis = Diagnosis(Machine(), DaemonConfig(), "", "", snapshot("absent"))
+    assert daemon.check_pins(diagnosis).state == "ok"
     monkeypatch.setenv("SHMMAP_TEST_PINS", "locks")
-    found = daemon.check_pins(patient)
+    found = daemon.check_pins(diagnosis)
     assert (found.state, "locks of clients" in found.fact) == ("warn", True)
-    missing = Patient(Machine(), DaemonConfig(shm_dir="/no/such/directory"), "", "", snapshot("absent"))
+    missing = Diagnosis(Machine(), DaemonConfig(shm_dir="/no/such/directory"), "", "", snapshot("absent"))
     assert daemon.check_pins(missing).state == "fail"
 
 
@@ -514,7 +508,7 @@ def test_descriptors_of_the_daemon(ward: Ward, hard: str, state: str) -> None:
     ward.file(
         "/proc/4242/limits", f"Limit  Soft Limit  Hard Limit\nMax open files   1024    {hard}    files\n"
     )
-    found = daemon.check_descriptors(ward.patient(snapshot()))
+    found = daemon.check_descriptors(ward.diagnosis(snapshot()))
     assert found.state == state
     assert "pid 4242" in found.fact
 
@@ -523,13 +517,13 @@ def test_descriptors_of_the_daemon(ward: Ward, hard: str, state: str) -> None:
 
 
 def test_groups(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert access.check_group(ward.patient(endpoint="/no/socket")).state == "ok"
-    assert access.check_group(ward.patient(group="no such group")).state == "fail"
+    assert access.check_group(ward.diagnosis(endpoint="/no/socket")).state == "ok"
+    assert access.check_group(ward.diagnosis(group="no such group")).state == "fail"
     mine, other = str(os.getegid()), "61999"
     monkeypatch.setattr(os, "getgroups", list)
-    assert access.check_group(ward.patient(group=other, uid=0)).state == "ok"
+    assert access.check_group(ward.diagnosis(group=other, uid=0)).state == "ok"
     ward.file("/proc/4242/status", "")
-    someone = ward.patient(snapshot(), group=other, uid=USER + 1)
+    someone = ward.diagnosis(snapshot(), group=other, uid=USER + 1)
     assert access.check_group(someone).state == "fail"
     assert "usermod -aG 61999" in access.check_group(someone).advice
     assert access.check_group(dataclasses.replace(someone, config=DaemonConfig(group=mine))).state == "ok"
@@ -541,26 +535,26 @@ def test_groups(ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_sockets(tmp_path: Path, ward: Ward, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "ANSWER_S", 0.05)
     path = tmp_path / "s"
-    assert access.check_socket(ward.patient(endpoint=str(path))).state == "warn"
+    assert access.check_socket(ward.diagnosis(endpoint=str(path))).state == "warn"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(str(path))
-        assert "gone" in access.check_socket(ward.patient(endpoint=str(path))).fact
+        assert "gone" in access.check_socket(ward.diagnosis(endpoint=str(path))).fact
         listener.listen()
-        assert "does not answer" in access.check_socket(ward.patient(endpoint=str(path))).fact
+        assert "does not answer" in access.check_socket(ward.diagnosis(endpoint=str(path))).fact
 
 
 def test_a_socket_that_waits_for_the_first_client(tmp_path: Path) -> None:
-    """Nobody connects to it: that would start the daemon."""
+    """Nothing connects to it: that would start the daemon."""
     path = str(tmp_path / "s")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(path)
-        patient = Patient(Machine(), DaemonConfig(endpoint=path), "", path, snapshot("absent"))
-        bound_alone = patient.awaits_first_client
+        diagnosis = Diagnosis(Machine(), DaemonConfig(endpoint=path), "", path, snapshot("absent"))
+        bound_alone = diagnosis.awaits_first_client
         listener.listen()
         listener.setblocking(False)
-        assert (bound_alone, patient.awaits_first_client) == (False, True)
-        assert not dataclasses.replace(patient, seen=snapshot()).awaits_first_client
-        assert access.check_socket(patient).state == daemon.check_daemon(patient).state == "ok"
+        assert (bound_alone, diagnosis.awaits_first_client) == (False, True)
+        assert not dataclasses.replace(diagnosis, seen=snapshot()).awaits_first_client
+        assert access.check_socket(diagnosis).state == daemon.check_daemon(diagnosis).state == "ok"
         with pytest.raises(BlockingIOError):
             listener.accept()
 
@@ -568,14 +562,15 @@ def test_a_socket_that_waits_for_the_first_client(tmp_path: Path) -> None:
 def test_maps(tmp_path: Path, ward: Ward) -> None:
     made = make_map(tmp_path / "map", columns=2, rows=1, points=3)
     path = str(made.root)
-    assert access.check_map_access(ward.patient()).state == "warn"
-    assert access.check_map_access(ward.patient(map_path=str(tmp_path / "none"))).state == "fail"
+    assert access.check_map_access(ward.diagnosis()).state == "warn"
+    assert access.check_map_access(ward.diagnosis(map_path=str(tmp_path / "none"))).state == "fail"
     assert (
-        access.check_map_access(ward.patient(snapshot(), map_path=path)).fact == "/maps/town is being served"
+        access.check_map_access(ward.diagnosis(snapshot(), map_path=path)).fact
+        == "/maps/town is being served"
     )
-    assert access.check_map_access(ward.patient(map_path=path, uid=0)).state == "ok"
+    assert access.check_map_access(ward.diagnosis(map_path=path, uid=0)).state == "ok"
     made.root.chmod(0o750)
-    found = access.check_map_access(ward.patient(map_path=path))
+    found = access.check_map_access(ward.diagnosis(map_path=path))
     assert found.state == "fail"
     assert "chmod" in found.advice
 
@@ -587,16 +582,16 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
     (home / "alice").chmod(0o700)
     monkeypatch.setattr("shmmap.service.program._HIDDEN", (str(home),))
     ward.file("/etc/systemd/system/shmmapd.service", "")
-    monkeypatch.setattr(Patient, "runs_as", USER)
-    patient = ward.patient(map_path=str(made.root), file="/etc/shmmap/shmmap.toml", uid=0)
-    found = access.check_map_access(patient)
+    monkeypatch.setattr(Diagnosis, "runs_as", USER)
+    diagnosis = ward.diagnosis(map_path=str(made.root), file="/etc/shmmap/shmmap.toml", uid=0)
+    found = access.check_map_access(diagnosis)
     assert (found.state, "unit install --map" in found.advice) == ("fail", True)
     ward.file(
         "/etc/systemd/system/shmmapd.service.d/x.conf", f"[Service]\nBindReadOnlyPaths={home}/alice/map\n"
     )
-    assert access.check_map_access(patient).state == "ok"
+    assert access.check_map_access(diagnosis).state == "ok"
     (made.root / "pointcloud_map.pcd").chmod(0o700)
-    assert access.check_map_access(patient).state == "fail"
+    assert access.check_map_access(diagnosis).state == "fail"
 
 
 # --- daemon ---
@@ -614,23 +609,23 @@ def test_a_map_in_a_home_directory(tmp_path: Path, ward: Ward, monkeypatch: pyte
     ],
 )
 def test_the_daemon(ward: Ward, seen: Snapshot, state: str) -> None:
-    assert daemon.check_daemon(ward.patient(seen)).state == state
+    assert daemon.check_daemon(ward.diagnosis(seen)).state == state
 
 
 def test_statistics_of_others(ward: Ward) -> None:
-    patient = dataclasses.replace(ward.patient(), seen=None, unreadable="no")
-    assert daemon.check_daemon(patient).state == "warn"
+    diagnosis = dataclasses.replace(ward.diagnosis(), seen=None, unreadable="no")
+    assert daemon.check_daemon(diagnosis).state == "warn"
 
 
 def test_leftovers(ward: Ward) -> None:
-    assert daemon.check_leftovers(ward.patient()).fact == "none"
+    assert daemon.check_leftovers(ward.diagnosis()).fact == "none"
     ward.file("/dev/shm/shmmap.default.0123456789abcdef", "x" * 5000)
     ward.file("/dev/shm/shmmap.default.statistics", "x")
-    found = daemon.check_leftovers(ward.patient())
+    found = daemon.check_leftovers(ward.diagnosis())
     assert (found.state, "default: 1 segment, 8.0 KiB" in found.fact) == ("warn", True)
-    assert daemon.check_leftovers(ward.patient(snapshot())).state == "ok"
+    assert daemon.check_leftovers(ward.diagnosis(snapshot())).state == "ok"
     ward.file("/dev/shm/shmmap.no-such-instance.0123456789abcdef.zombie", "x")
-    found = daemon.check_leftovers(ward.patient(snapshot()))
+    found = daemon.check_leftovers(ward.diagnosis(snapshot()))
     assert (found.state, "no-such-instance" in found.fact) == ("warn", True)
 
 
@@ -662,21 +657,21 @@ def test_logind(ward: Ward, files: dict[str, str], state: str) -> None:
     (ward.root / "run/systemd/system").mkdir(parents=True)
     for name, text in files.items():
         ward.file(name, text)
-    assert daemon.check_logind(ward.patient()).state == state
-    assert daemon.check_logind(ward.patient(uid=995)).state == "ok"
+    assert daemon.check_logind(ward.diagnosis()).state == state
+    assert daemon.check_logind(ward.diagnosis(uid=995)).state == "ok"
 
 
 def test_logind_without_systemd(ward: Ward) -> None:
-    assert daemon.check_logind(ward.patient()).state == "ok"
+    assert daemon.check_logind(ward.diagnosis()).state == "ok"
 
 
 def test_reloads(ward: Ward) -> None:
-    assert daemon.check_reload(ward.patient()).state == "ok"
-    once = daemon.check_reload(ward.patient(snapshot(reloads=0)))
+    assert daemon.check_reload(ward.diagnosis()).state == "ok"
+    once = daemon.check_reload(ward.diagnosis(snapshot(reloads=0)))
     assert once.fact == "the map was read once, at the start"
-    again = daemon.check_reload(ward.patient(snapshot(reloads=3)))
+    again = daemon.check_reload(ward.diagnosis(snapshot(reloads=3)))
     assert again.fact == "the map was read at the start and 3 times again"
-    found = daemon.check_reload(ward.patient(snapshot(last_reload_failed=1, last_reload_unix_ns=1)))
+    found = daemon.check_reload(ward.diagnosis(snapshot(last_reload_failed=1, last_reload_unix_ns=1)))
     assert (found.state, "shmmap reload" in found.advice) == ("fail", True)
 
 
@@ -708,21 +703,64 @@ def test_the_signature_of_a_published_map(
 ) -> None:
     """Times are given as seconds before now."""
     counters = {name: seconds(value) if name != REFUSAL else value for name, value in counters.items()}
-    found = signed_map.check_signature(ward.patient(snapshot("healthy", version="", **counters)))
+    found = published.check_signature(ward.diagnosis(snapshot("healthy", version="", **counters)))
     assert (found.state, says in found.fact) == (state, True)
     assert found.skipped == (says == "not verified")
     assert bool(found.advice) == (state != "ok")
-    problems = signed_map.trust_problems(counters, time.time())
+    problems = verdicts.trust_problems(counters, time.time())
     assert bool(problems) == (says == "expired since" or REFUSAL in counters)
-    assert bool(signed_map.signature_lines(counters, time.time())) == bool(counters)
-    assert signed_map.check_signature(ward.patient()).skipped, "no daemon runs"
+    assert bool(verdicts.signature_lines(counters, time.time())) == bool(counters)
+    assert published.check_signature(ward.diagnosis()).skipped, "no daemon runs"
 
 
 def test_what_has_expired_and_is_refused_is_both_said() -> None:
     counters = {SIGNED: seconds(900), UNTIL: seconds(60), REFUSAL: REFUSALS.index("expired")}
-    expired, refused = signed_map.trust_problems(counters, time.time())
+    expired, refused = verdicts.trust_problems(counters, time.time())
     assert "expired since" in expired
     assert "is refused, expired" in refused
     # a clock that is behind changes nothing about that
     behind = {**counters, SIGNED: seconds(30)}
-    assert len(signed_map.trust_problems(behind, time.time() - 86400)) == 2
+    assert len(verdicts.trust_problems(behind, time.time() - 86400)) == 2
+
+
+# --- whether the cache is too small: the same verdict for every verb that prints it -----------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({}, "large enough: nothing evicted for room, nothing refused"),
+        (
+            {"evictions": 29},
+            (
+                "large enough: nothing evicted for room or refused in the last 10 min"
+                " (29 evicted for room since the start)"
+            ),
+        ),
+        (
+            {"evictions": 29, "refused_over_budget": 4},
+            (
+                "large enough: nothing evicted for room or refused in the last 10 min"
+                " (29 evicted for room and 4 refused since the start)"
+            ),
+        ),
+        ({"refused_quota": 9}, "large enough: nothing evicted for room, nothing refused"),
+        (
+            {"evictions_10min": 50, "misses_10min": 500, "loads_after_eviction_10min": 5, "evictions": 50},
+            "large enough: 50 evicted for room in the last 10 min, hardly any asked for again",
+        ),
+        (
+            {"evictions_10min": 50, "misses_10min": 50, "loads_after_eviction_10min": 30},
+            "TOO SMALL: 30 loads in the last 10 min (60 % of all) were of cells evicted before",
+        ),
+        (
+            {"refused_over_budget_10min": 2, "bytes_pinned": 1 << 20, "budget_bytes": 1 << 20},
+            "TOO SMALL: 2 cells refused in the last 10 min; clients use 1.0 MiB of 1.0 MiB",
+        ),
+    ],
+)
+def test_the_verdict_on_the_cache(values: dict[str, int], text: str) -> None:
+    assert set(values) <= set(COUNTER_NAMES)
+    verdict = cache_verdict(values)
+    assert verdict.text == text
+    assert ("--budget" in verdict.hint) == verdict.too_small == text.startswith("TOO SMALL")

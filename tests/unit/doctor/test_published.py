@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from shmmap.doctor.published import check_clock, check_credentials, check_link, check_versions
 from shmmap.doctor.store_probe import StoreAnswer
 from shmmap.statistics.counters import REFUSALS
-from tests.support.doctor_ward import Ward, snapshot
+from tests.unit.doctor.conftest import Ward, snapshot
 
 URL = "s3://maps/town"
 ANSWERS: dict[str, Any] = {
@@ -24,21 +23,16 @@ ANSWERS: dict[str, Any] = {
 }
 
 
-@pytest.fixture
-def ward(tmp_path: Path) -> Ward:
-    return Ward(tmp_path / "machine")
-
-
 def look(ward: Ward, answer: StoreAnswer, *, url: str = URL, **counters: int) -> dict[str, tuple[str, str]]:
     """State and text of each row."""
     counts = {"published_version": 7, "published_refused": 0, "published_expires_unix_ns": 0}
     counts |= {"published_taken_unix_ns": time.time_ns(), **counters}
-    patient = ward.patient(snapshot(**counts), map_path=url)  # type: ignore[arg-type]
-    assert patient.seen is not None
-    patient.seen.identity = None  # the map is that of the settings
-    patient.__dict__["store"] = answer
+    diagnosis = ward.diagnosis(snapshot(**counts), map_path=url)  # type: ignore[arg-type]
+    assert diagnosis.seen is not None
+    diagnosis.seen.identity = None  # the map is that of the settings
+    diagnosis.__dict__["store"] = answer
     checks = (check_link, check_credentials, check_clock, check_versions)
-    found = [check(patient) for check in checks]
+    found = [check(diagnosis) for check in checks]
     return {one.name: ("skip" if one.skipped else one.state, f"{one.fact} -> {one.advice}") for one in found}
 
 

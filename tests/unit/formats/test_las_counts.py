@@ -17,7 +17,7 @@ from tests.support.cloud_bytes import POINTS, las_file, patched
 
 
 def said(path: Path) -> str:
-    """Warnings of all three ways to read a file, which are the same."""
+    """Warnings of the three readers of a file, which are the same."""
     warnings = describe(path).warnings
     assert read_cloud(path).warnings == warnings
     made = divide([path], path.with_suffix(".map"), DivideSettings(durable=False, force=True))

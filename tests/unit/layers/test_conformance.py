@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every kind keeps the contract on every cloud, and the suite notices who does not."""
+"""Every kind keeps the contract on every cloud, and the suite notices one that does not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_contract(name: str, cloud: str) -> None:
 
 
 def build(points: PointTable, parameters: Parameters) -> LayerTable:
-    """The lowest z: what the kinds below spoil in one way each."""
+    """The lowest z; each kind below spoils it in its own way."""
     del parameters
     z = points.xyz[points.finite(), 2].astype(np.float64)
     return LayerTable({"low": z.min(initial=np.inf).reshape(1)}, 1, {"low": "m"})

@@ -94,7 +94,7 @@ def test_layers_and_states_are_apart(one: Bench) -> None:
     assert not one.cache.has(replace(key, spec=newer))
 
 
-def test_any_damage_is_noticed_and_built_anew(one: Bench) -> None:
+def test_any_damage_is_noticed_and_built_again(one: Bench) -> None:
     layer = "ndt(leaf=4.0,min_points=3)"
     _, true = one.make(layer)
     size = len(true)
@@ -154,7 +154,7 @@ def test_another_cell_s_entry_in_its_place_is_not_used(one: Bench) -> None:
 
 
 @pytest.mark.root
-def test_a_stranger_s_file_is_not_used(one: Bench) -> None:
+def test_another_account_s_file_is_not_used(one: Bench) -> None:
     one.make(LAYERS[1])
     os.chown(one.cache._version_path(one.key(LAYERS[1]).version_name()), 12345, -1)
     assert not one.cache.has(one.key(LAYERS[1]))

@@ -54,7 +54,7 @@ def test_a_full_disk_leaves_what_was_there(
     assert sorted(os.listdir(tmp_path)) == ["cloud.pcd", "out.npz"]
 
 
-def test_the_document_tells_every_kind_and_column() -> None:
+def test_the_document_names_every_kind_and_column() -> None:
     rows = {line.split("`")[1]: line for line in DOCUMENT.splitlines() if line.startswith("| `")}
     assert set(rows) == {kind.name for kind in kinds()}
     for kind in kinds():
@@ -63,5 +63,5 @@ def test_the_document_tells_every_kind_and_column() -> None:
             if parameter.default is not None:
                 assert f"`{parameter.name}` = {parameter.default:g}" in rows[kind.name]
         for column in kind.columns:
-            told = f"`{column.name}`" in rows[kind.name] or "as `points`" in rows[kind.name]
-            assert told or column.name == "*", (kind.name, column.name)
+            named = f"`{column.name}`" in rows[kind.name] or "as `points`" in rows[kind.name]
+            assert named or column.name == "*", (kind.name, column.name)

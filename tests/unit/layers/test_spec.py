@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layer specs: one canonical form, everything else refused with a way out."""
+"""Layer specs: one canonical form, everything else refused with a hint."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def test_a_state_learnt_in_place_forgets_what_looks_into_it_alone(one: Map) -> N
     assert {name for name, _ in others(before, after)} == {"0_0.pcd", "0_20.pcd", "20_0.pcd", "20_20.pcd"}
 
 
-def test_dependents_are_those_who_look(one: Map) -> None:
+def test_dependents_are_the_cells_that_look(one: Map) -> None:
     """Neighbours seen from the other side, whatever the reach."""
     layers = [*PLAIN, *FAR, *(f"normals(radius={r})" for r in (20.0, 19.999999, 20.000001, 40.0, 50.0))]
     for index in range(16):
@@ -152,7 +152,7 @@ def test_what_is_unknown_is_what_takes_long(one: Map, monkeypatch: pytest.Monkey
     assert (3, "denoise") not in list(one.versions.unknown(range(16), ["denoise"]))
     before = one.all(FAR)
     monkeypatch.setattr(layer_versions, "MAX_REMEMBERED", 4)
-    for number in range(100):  # requests for ever new layers fill no memory
+    for number in range(100):  # requests for always new layers fill no memory
         one.versions.version(number % 16, f"normals(radius={number % 50 + 1}.0)")
     assert sum(map(len, one.versions._known.values())) == one.versions._count <= 16 * len(FAR)
     assert one.all(FAR) == before

@@ -25,7 +25,7 @@ def small_parts() -> Iterator[None]:
     """Few cells are very many here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spatial_index, "_LINEAR_CELLS", 0)
-        patch.setattr(spatial_index, "_AT_ONCE", AT_ONCE)
+        patch.setattr(spatial_index, "_CELLS_PER_BATCH", AT_ONCE)
         patch.setattr(spatial_index, "_FEW_ROWS", 2)
         yield
 
@@ -119,7 +119,7 @@ def test_cells_beside_a_circle_are_not_looked_at(centre: tuple[float, float], te
     assert sum(tested) < 5 * SIDE
 
 
-def test_who_needs_to_know_only_that_they_are_many(tested: list[int]) -> None:
+def test_a_query_with_a_limit_ends_soon_after_it(tested: list[int]) -> None:
     index = SpatialIndex(town())
     for area in (Circle(600.0, 600.0, 1e4), Box(0.0, 0.0, 1200.0, 1200.0), AutowareSquare(0.0, 0.0, 1e6)):
         tested.clear()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metadata files in the dialects that exist, by the fast way and by the YAML parser."""
+"""Metadata files in the dialects that exist, by the fast reader and by the YAML parser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def contents(metadata: MapMetadata) -> dict[str, tuple[float, float]]:
 
 
 def read(text: str, *, strict: bool = False) -> MapMetadata:
-    """Parse both ways and require the same result."""
+    """Parse with both readers and require the same result."""
     data = text.encode()
     quick = parse_metadata(data, path="m.yaml", strict=strict)
     slow = parse_metadata(data, path="m.yaml", strict=strict, lines=False)
@@ -138,7 +138,7 @@ def test_strict_refuses_what_autoware_s_loader_refuses(corner: str) -> None:
 
 
 def test_unknown_keys_are_reported_and_in_strict_mode_refused() -> None:
-    text = HEAD + "z_resolution: 5\nauthor: somebody\nnested: {a: [1, 2], b: {c: d}}\nempty:\na.pcd: [1, 2]\n"
+    text = HEAD + "z_resolution: 5\nauthor: mapper\nnested: {a: [1, 2], b: {c: d}}\nempty:\na.pcd: [1, 2]\n"
     metadata = read(text)
     assert contents(metadata) == {"a.pcd": (1.0, 2.0)}
     (problem,) = metadata.problems
@@ -263,7 +263,7 @@ pieces = st.sampled_from([*WORDS.split(" "), *SPACED, *ODD])
 @example(["#\x00"])
 @given(st.lists(st.lists(pieces, max_size=8).map("".join), max_size=6))
 @settings(max_examples=400, deadline=None)
-def test_what_the_quick_way_accepts_means_the_same_to_the_parser(lines: list[str]) -> None:
+def test_what_the_fast_reader_accepts_means_the_same_to_the_parser(lines: list[str]) -> None:
     data = (HEAD + "\n".join(lines)).encode()
     for strict in (False, True):
         if not collect_lines(data, EntryCollector(strict)):
@@ -297,7 +297,7 @@ def outcome(data: bytes, *, strict: bool, lines: bool) -> object:
 
 @given(st.lists(line_like, max_size=8))
 @settings(max_examples=400, deadline=None)
-def test_likely_lines_mean_the_same_both_ways(lines: list[str]) -> None:
+def test_likely_lines_mean_the_same_to_both_readers(lines: list[str]) -> None:
     data = (HEAD + "\n".join(lines)).encode()
     for strict in (False, True):
         assert outcome(data, strict=strict, lines=True) == outcome(data, strict=strict, lines=False)

@@ -168,7 +168,7 @@ def test_what_has_not_changed_is_shared(root: Path) -> None:
     assert compare(third, fourth).ids("removed") == (first.id(1),)
 
 
-def test_nothing_is_sorted_again_by_who_reads(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_sorts_nothing_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is made of names and boxes comes with them; of the same ones it is that of the state before."""
     monkeypatch.setattr(spatial_index, "_LINEAR_CELLS", 0)
     for i in range(3):
@@ -231,7 +231,7 @@ def test_bytes_of_a_catalogue(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(rest) == 256
 
 
-def test_who_has_names_and_boxes_gets_the_stamps_alone() -> None:
+def test_a_process_with_names_and_boxes_gets_only_the_stamps() -> None:
     before, other = many(1_000_000), many(1_000_000, 5.0)
     after = many(1_000_000)
     after.set_stamp(CELLS - 1, before.stamp(0))

@@ -81,7 +81,7 @@ def test_the_longest_packet_arrives_and_short_ones_take_no_memory() -> None:
     assert peak < 1 << 16
 
 
-def test_who_does_not_wait_gets_what_is_there_and_the_channel_still_waits() -> None:
+def test_a_receive_without_wait_leaves_the_channel_blocking() -> None:
     ours, theirs = channel()
     buffer = packet_buffer()
     with ours, theirs:
@@ -92,7 +92,7 @@ def test_who_does_not_wait_gets_what_is_there_and_the_channel_still_waits() -> N
         assert bytes(receive_packet(theirs, buffer, wait=False)[0]) == b"one"
 
 
-def test_the_longest_packet_goes_both_ways() -> None:
+def test_the_longest_packet_passes_in_both_directions() -> None:
     ours, theirs = channel()
     longest = bytes(MAX_PACKET_BYTES - 1024)
     with ours, theirs:

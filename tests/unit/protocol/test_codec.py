@@ -196,6 +196,13 @@ holders = st.builds(Holder, numbers, small, st.integers(-1, 1 << 32), texts, sma
 failed_cells = st.builds(FailedCell, texts, texts, texts, texts, st.lists(holders, max_size=3).map(tuple))
 
 
+def encoded(elements: list[bytes]) -> PackedArray:
+    array = PackedArray()
+    array.add_encoded(elements[:5])
+    array.add_encoded(elements[5:])
+    return array
+
+
 @settings(max_examples=200, deadline=None)
 @given(
     st.tuples(numbers, numbers, numbers),
@@ -233,7 +240,7 @@ def test_any_content(
     halves = PackedArray(failures[:7])
     halves.add(failures[7:])
     parts = encode_cells(
-        *ids, [encode_handle(h) for h in cells], tuple(removed), packed,
+        *ids, encoded([encode_handle(h) for h in cells]), tuple(removed), packed,
         tuple(layers), covered, PackedArray(pending), halves, reason=reason,
     )  # fmt: skip
     assert parts == encode(whole)
@@ -244,15 +251,17 @@ def test_any_content(
 def test_any_number_of_handles(count: int) -> None:
     """The head of a MessagePack array has one byte, three or five."""
     handle = Handle("a.pcd", 1, "points", "0" * 16, 0, 4096, 10, 0.0, 0.0, 20.0, 20.0)
-    parts = encode_cells(1, 2, 3, [encode_handle(handle)] * count, (), b"", ())
+    parts = encode_cells(1, 2, 3, encoded([encode_handle(handle)] * count), (), b"", ())
     assert parts == encode(Cells(1, 2, 3, (handle,) * count))
 
 
 @pytest.mark.parametrize("count", [0, 15, 16, 65535, 65536])
 def test_any_number_of_removed_ids(count: int) -> None:
     removed = ("x",) * count
-    assert encode_cells(1, 2, 3, [], removed, b"", ()) == encode(Cells(1, 2, 3, (), removed))
-    assert encode_cells(1, 2, 3, [], (), bytes(count), ()) == encode(Cells(1, 2, 3, (), (), bytes(count)))
+    assert encode_cells(1, 2, 3, PackedArray(), removed, b"", ()) == encode(Cells(1, 2, 3, (), removed))
+    assert encode_cells(1, 2, 3, PackedArray(), (), bytes(count), ()) == encode(
+        Cells(1, 2, 3, (), (), bytes(count))
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 65535, 65536])

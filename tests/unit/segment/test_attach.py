@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Attaching: right bytes, read-only, for exactly as long as any view lives."""
+"""Attaching: right bytes, read-only, for exactly as long as any view exists."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_views_cannot_be_written_nor_made_writable(shm: ShmDirectory, publish: P
 
 
 @pytest.mark.parametrize("kind", ["column", "slice", "reshaped", "raw", "memoryview"])
-def test_the_mapping_lives_as_long_as_any_view(shm: ShmDirectory, publish: Publish, kind: str) -> None:
+def test_the_mapping_lasts_as_long_as_any_view(shm: ShmDirectory, publish: Publish, kind: str) -> None:
     """Also when the name is gone, and the segment object."""
     name = publish(5000)
     sink: SimpleQueue[Owned | None] = SimpleQueue()
@@ -124,7 +124,7 @@ def test_gone(shm: ShmDirectory) -> None:
     with pytest.raises(StaleHandle):
         attach("/shmmap.unit.0000", shm_dir=shm.path)
     with pytest.raises(StaleHandle):
-        attach("/shmmap.unit.nobody-has-this")  # plain POSIX shared memory
+        attach("/shmmap.unit.unused-name")  # plain POSIX shared memory
 
 
 def test_what_is_no_segment(shm: ShmDirectory, publish: Publish) -> None:
@@ -210,7 +210,7 @@ def test_populated_pages_are_there_at_once(shm: ShmDirectory, publish: Publish) 
 
 @pytest.mark.parametrize("usual", [True, False])
 def test_a_name_that_something_else_has_by_now(shm: ShmDirectory, usual: bool) -> None:
-    """A pipe would keep who opens it waiting, were it not for O_NONBLOCK."""
+    """Without O_NONBLOCK, opening a pipe would block."""
     directory = DEFAULT_SHM_DIR if usual else shm.path
     path = f"{directory}/unit-{os.getpid()}.pipe"
     os.mkfifo(path)
@@ -224,8 +224,8 @@ def test_a_name_that_something_else_has_by_now(shm: ShmDirectory, usual: bool) -
 def test_a_lease_that_is_not_given_back(
     shm: ShmDirectory, publish: Publish, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The daemon was stopped in the middle of a look: the client is told to ask again, and not held up."""
-    prepare_process()  # a lease that somebody wants back is told by a signal
+    """The daemon was stopped in the middle of a look: the client gets an error at once, and may ask again."""
+    prepare_process()  # the kernel asks a lease back by a signal
     name = publish()
     fd = shm.open(name)
     try:

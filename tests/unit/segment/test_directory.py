@@ -81,7 +81,7 @@ def test_free_and_size(shm: ShmDirectory) -> None:
     assert 0 < shm.free_bytes() <= shm.size_bytes()
 
 
-def test_full_is_told_from_other_failures() -> None:
+def test_full_is_distinguished_from_other_failures() -> None:
     assert is_full(OSError(28, "No space left on device"))
     assert is_full(OSError(122, "Disk quota exceeded"))
     assert not is_full(OSError(13, "Permission denied"))

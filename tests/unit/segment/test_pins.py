@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel's word on who uses a segment."""
+"""What the kernel says of a segment's users."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.unit.segment.conftest import Publish
 
 @pytest.fixture(autouse=True)
 def sigio() -> Iterator[None]:
-    """Whoever takes leases ignores SIGIO."""
+    """A process that takes leases ignores SIGIO."""
     before = signal.getsignal(signal.SIGIO)
     prepare_process()
     yield
@@ -46,7 +46,7 @@ def pinned(shm: ShmDirectory, name: str) -> bool:
         os.close(fd)
 
 
-def who(shm: ShmDirectory, name: str) -> list[int]:
+def slots_of(shm: ShmDirectory, name: str) -> list[int]:
     fd = shm.open(name)
     try:
         return holders(fd)
@@ -54,7 +54,7 @@ def who(shm: ShmDirectory, name: str) -> list[int]:
         os.close(fd)
 
 
-def test_nobody_an_open_file_a_mapping(shm: ShmDirectory, publish: Publish) -> None:
+def test_an_open_file_and_a_mapping_are_uses(shm: ShmDirectory, publish: Publish) -> None:
     name = publish()
     assert not pinned(shm, name)
     fd = shm.open(name)
@@ -86,13 +86,13 @@ print(len(attach(sys.argv[1], shm_dir=sys.argv[2], slot=5).columns), flush=True)
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_looking_does_not_disturb_whoever_opens_meanwhile(
+def test_looking_does_not_disturb_an_open_meanwhile(
     monkeypatch: pytest.MonkeyPatch, shm: ShmDirectory, elsewhere: bool
 ) -> None:
     """An open that meets a lease is tried until the lease is given back, and succeeds.
 
-    The one who looks holds the lease until the kernel says that somebody is breaking it: the reader is in
-    the middle of its open then.  In the usual directory, and in another.
+    The test holds the lease until the kernel says that an open breaks it: the reader is in the middle of
+    its open then.  In the usual directory, and in another.
     """
     directory = ShmDirectory(shm.path) if elsewhere else ShmDirectory()
     columns: dict[str, NDArray[Any]] = {"xyz": np.zeros((9, 3), np.float32)}
@@ -130,17 +130,17 @@ def test_looking_does_not_disturb_whoever_opens_meanwhile(
         directory.close()
 
 
-def test_who_holds(shm: ShmDirectory, publish: Publish) -> None:
+def test_slots_of_holders(shm: ShmDirectory, publish: Publish) -> None:
     name = publish()
     slots = [0, 1, 2, 5, 1000, 2**32, 2**61 + 1, MAX_SLOT]
     held = [attach(name, shm_dir=shm.path, slot=slot) for slot in slots]
     anonymous = attach(name, shm_dir=shm.path)
-    assert who(shm, name) == slots
+    assert slots_of(shm, name) == slots
     del held[3]
-    assert who(shm, name) == [s for s in slots if s != 5]
+    assert slots_of(shm, name) == [s for s in slots if s != 5]
     held.clear()
-    assert who(shm, name) == []
-    assert pinned(shm, name)  # the one that told nobody
+    assert slots_of(shm, name) == []
+    assert pinned(shm, name)  # by the one without a slot
     assert anonymous.published is not None
     del anonymous
     assert not pinned(shm, name)
@@ -151,7 +151,7 @@ def test_many_holders_are_counted_up_to_a_limit(shm: ShmDirectory, publish: Publ
     rng = random.Random(3)
     slots = sorted(rng.sample(range(MAX_SLOT), 300))
     held = [attach(name, shm_dir=shm.path, slot=slot) for slot in slots]
-    assert who(shm, name) == slots
+    assert slots_of(shm, name) == slots
     fd = shm.open(name)
     some = holders(fd, limit=10)
     os.close(fd)
@@ -160,13 +160,13 @@ def test_many_holders_are_counted_up_to_a_limit(shm: ShmDirectory, publish: Publ
     held.clear()
 
 
-def test_locks_over_ranges_are_nobody_s_and_hide_nobody(shm: ShmDirectory, publish: Publish) -> None:
+def test_locks_over_ranges_count_as_no_holder_and_hide_none(shm: ShmDirectory, publish: Publish) -> None:
     name = publish()
-    stranger = shm.open(name)
-    fcntl.fcntl(stranger, 37, struct.pack("@hhqqi4x", fcntl.F_RDLCK, 0, 100, 50, 0))
+    other_fd = shm.open(name)
+    fcntl.fcntl(other_fd, 37, struct.pack("@hhqqi4x", fcntl.F_RDLCK, 0, 100, 50, 0))
     held = attach(name, shm_dir=shm.path, slot=99), attach(name, shm_dir=shm.path, slot=150)
-    assert who(shm, name) == [99, 150]
-    os.close(stranger)
+    assert slots_of(shm, name) == [99, 150]
+    os.close(other_fd)
     del held
 
 
@@ -178,7 +178,7 @@ def test_readers_cannot_take_the_writer_s_lock(shm: ShmDirectory, publish: Publi
     os.close(fd)
 
 
-def test_a_random_life_against_a_model(shm: ShmDirectory, publish: Publish) -> None:
+def test_random_steps_against_a_model(shm: ShmDirectory, publish: Publish) -> None:
     """Many segments, mapped and dropped in any order: pins and holders are always exact."""
     rng = random.Random(11)
     names = [publish(seed=i) for i in range(6)]
@@ -198,7 +198,7 @@ def test_a_random_life_against_a_model(shm: ShmDirectory, publish: Publish) -> N
             assert shm.rename(current, name + zombie[name])
             current = name + zombie[name]
         assert pinned(shm, current) == bool(held[name])
-        assert who(shm, current) == sorted({slot for slot, _ in held[name] if slot is not None})
+        assert slots_of(shm, current) == sorted({slot for slot, _ in held[name] if slot is not None})
 
 
 def test_nothing_of_it_needs_the_name(shm: ShmDirectory, publish: Publish) -> None:
@@ -215,17 +215,17 @@ def test_nothing_of_it_needs_the_name(shm: ShmDirectory, publish: Publish) -> No
 def test_asking_for_holders_without_number_ends(
     shm: ShmDirectory, publish: Publish, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who asks has only so much time: the answer is what was found by then."""
+    """After its timeout the look returns what it has found."""
     name = publish()
-    stranger = shm.open(name)
+    other_fd = shm.open(name)
     slots = range(1, 600, 3)
     for slot in slots:
-        lock_slot(stranger, slot)
+        lock_slot(other_fd, slot)
     fd = shm.open(name)
     assert holders(fd) == list(slots)
     monkeypatch.setattr(pins, "TIMEOUT_S", 0.0)
     found = holders(fd)
     os.close(fd)
-    os.close(stranger)
+    os.close(other_fd)
     assert 0 < len(found) < 16
     assert set(found) <= set(slots)

@@ -42,7 +42,7 @@ def test_a_whole_segment(segment: tuple[int, SegmentHeader]) -> None:
 
 
 def test_each_byte_of_the_header(segment: tuple[int, SegmentHeader]) -> None:
-    """Only eight are nobody's: padding after the two checksums, which neither covers."""
+    """All but eight matter: the padding after the two checksums, which neither covers."""
     fd, header = segment
     overlooked = []
     for at in range(header.header_bytes):

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shmmap.simulation.lidar import Lidar
-from shmmap.simulation.lidar_drive import Traffic
+from shmmap.simulation.lidar import Lidar, Traffic
 from shmmap.simulation.town import Town
 
 

@@ -32,7 +32,7 @@ def held_file(shm: ShmDirectory) -> int:
     return fd
 
 
-def test_a_second_writer_is_refused_and_told_who_is_first(
+def test_a_second_writer_is_refused_and_the_first_named(
     shm: ShmDirectory, identity: DaemonIdentity, writer: StatisticsWriter
 ) -> None:
     first = os.stat(shm.path + NAME).st_ino
@@ -68,7 +68,7 @@ def test_what_a_killed_writer_left_is_replaced(shm: ShmDirectory, identity: Daem
 
 
 def test_a_reader_s_lock_makes_no_writer(shm: ShmDirectory) -> None:
-    """Who may only read the file gets read locks and flocks on it: a dead daemon's name stays free."""
+    """A process that may only read the file gets read locks and flocks: a dead daemon's name stays free."""
     ours = held_file(shm)
     take_name(shm, "unit", ours)
     with shm.opened(NAME) as reading:
@@ -86,7 +86,7 @@ def test_a_reader_s_lock_makes_no_writer(shm: ShmDirectory) -> None:
 
 
 @pytest.mark.root
-def test_a_stranger_s_lock_makes_no_writer(shm: ShmDirectory) -> None:
+def test_another_account_s_lock_makes_no_writer(shm: ShmDirectory) -> None:
     fd = os.open(shm.path + NAME, os.O_RDWR | os.O_CREAT, 0o666)
     os.fchown(fd, 12345, -1)
     hold(fd)
@@ -114,7 +114,7 @@ def test_something_that_is_no_file(shm: ShmDirectory) -> None:
 def test_one_that_comes_between_the_look_and_the_renaming_keeps_the_name(
     shm: ShmDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both saw the dead one; who removes by name would remove the one that was quicker."""
+    """Both saw the dead one; removing by name would remove the quicker one's file."""
     dead, quicker, slower = held_file(shm), held_file(shm), held_file(shm)
     take_name(shm, "unit", dead)
     os.close(dead)

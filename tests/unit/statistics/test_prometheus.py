@@ -76,14 +76,14 @@ def test_every_line_is_as_the_format_wants_it(found: Snapshot) -> None:
     assert (types["shmmap_requests_total"], samples["shmmap_requests_total", ""]) == ("counter", 3)
     assert types["shmmap_budget_bytes"] == "gauge"
     assert samples["shmmap_last_reload_timestamp_seconds", ""] == 1_500_000_000.5
-    told = {name.removeprefix("shmmap_").removesuffix("_total") for name in types}
+    exported = {name.removeprefix("shmmap_").removesuffix("_total") for name in types}
     assert samples["shmmap_longest_turn_requests_seconds", ""] == 0.012
-    told |= {f"{name.removesuffix('_seconds')}_ns" for name in told}
+    exported |= {f"{name.removesuffix('_seconds')}_ns" for name in exported}
     expected = {c.name for c in COUNTERS if not c.name.endswith(("_10s", "_1min", "_10min"))}
     not_yet = {"origin_out_since_unix_ns", *PUBLISHED}
-    assert expected - not_yet - {"last_reload_unix_ns"} <= told
-    assert not not_yet & told
-    assert {f"{h.name}_seconds" for h in HISTOGRAMS} <= told
+    assert expected - not_yet - {"last_reload_unix_ns"} <= exported
+    assert not not_yet & exported
+    assert {f"{h.name}_seconds" for h in HISTOGRAMS} <= exported
 
 
 def test_a_published_map(found: Snapshot) -> None:
@@ -120,8 +120,8 @@ def test_live_maps(found: Snapshot) -> None:
     found.__dict__["live"] = [lidar, replace(lidar, name="radar", problem="full", damaged_count=2)]
     types, samples = parse(exposition(found, "unit"))
     assert {key: samples[key] for key in before} == before
-    told = {key[0].removeprefix("shmmap_live_"): n for key, n in samples.items() if key[1] == "lidar"}
-    assert told == {
+    exported = {key[0].removeprefix("shmmap_live_"): n for key, n in samples.items() if key[1] == "lidar"}
+    assert exported == {
         "bytes": 4096, "waiting_bytes": 9, "budget_bytes": 1 << 20,
         "active_voxels": 100, "files": 3, "file_bytes": 777, "scans_applied_total": 11,
         "scans_durable_total": 7, "damaged_files": 0, "failing": 0,

@@ -91,7 +91,7 @@ def test_offsets_and_counts_are_compared_with_the_size(
 
 
 @pytest.mark.root
-def test_a_stranger_may_not_read(shm: ShmDirectory, writer: StatisticsWriter) -> None:
+def test_another_account_may_not_read(shm: ShmDirectory, writer: StatisticsWriter) -> None:
     os.chmod(shm.path, 0o755)
     os.seteuid(65534)
     try:

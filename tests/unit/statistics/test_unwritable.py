@@ -72,7 +72,7 @@ def test_no_room_for_rows(
 
 @contextlib.contextmanager
 def files_no_larger_than(nbytes: int) -> Iterator[None]:
-    """Let writes behind so many bytes of any file fail (EFBIG; Python ignores SIGXFSZ)."""
+    """Let writes beyond ``nbytes`` of any file fail (EFBIG; Python ignores SIGXFSZ)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (nbytes, hard))
     try:
@@ -165,8 +165,8 @@ def test_too_long_an_identity_is_refused(shm: ShmDirectory, identity: DaemonIden
     assert os.listdir(shm.path) == []
 
 
-def test_a_name_that_somebody_else_has(shm: ShmDirectory, identity: DaemonIdentity) -> None:
-    """A directory stands for a stranger's file: it cannot be replaced either."""
+def test_a_name_that_another_file_has(shm: ShmDirectory, identity: DaemonIdentity) -> None:
+    """A directory stands for another account's file: it cannot be replaced either."""
     path = f"{shm.path}/shmmap.unit.statistics"
     os.mkdir(path)
     with pytest.raises(CannotStart) as failure:

@@ -86,7 +86,7 @@ def test_clients_come_and_go(shm: ShmDirectory, writer: StatisticsWriter) -> Non
     assert read_statistics("unit", shm.path).clients == changed
 
 
-def test_one_reader_follows_lives_of_the_daemon(shm: ShmDirectory, identity: DaemonIdentity) -> None:
+def test_one_reader_follows_the_daemon_s_runs(shm: ShmDirectory, identity: DaemonIdentity) -> None:
     with StatisticsReader("unit", shm.path) as reader:
         assert reader.snapshot().state == "absent"
         first = StatisticsWriter(shm, "unit", identity)
@@ -97,7 +97,9 @@ def test_one_reader_follows_lives_of_the_daemon(shm: ShmDirectory, identity: Dae
         seen = reader.snapshot(tables=False)
         assert seen.identity is not None
         assert (seen.counters["requests"], seen.identity.map_version) == (5, 8)
-        os.unlink(f"{shm.path}/shmmap.unit.statistics")  # the first one lives here, and nobody gets its name
+        os.unlink(
+            f"{shm.path}/shmmap.unit.statistics"
+        )  # the first one still runs, so its name would be refused
         second = StatisticsWriter(shm, "unit", replace(identity, epoch=9))
         seen = reader.snapshot()
         assert seen.identity is not None

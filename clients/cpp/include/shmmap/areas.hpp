@@ -117,9 +117,9 @@ inline bool overlaps(const Area& area, const Sides& cell) {
 
 /// A route of at most 512 places: itself, or places equally far apart along it, its ends among them.
 inline std::vector<std::array<double, 2>> thinned(std::vector<std::array<double, 2>> route) {
-  constexpr std::size_t most_places = 512;
+  constexpr std::size_t max_places = 512;
   constexpr double farthest_m = 1e8;  // what is farther away counts as this, as in the daemon
-  if (route.size() <= most_places) return route;
+  if (route.size() <= max_places) return route;
   std::vector<double> along(route.size(), 0.0);
   for (auto& place : route)
     for (auto& side : place) side = std::clamp(side, -farthest_m, farthest_m);
@@ -127,8 +127,8 @@ inline std::vector<std::array<double, 2>> thinned(std::vector<std::array<double,
     along[at] = along[at - 1] + std::hypot(route[at][0] - route[at - 1][0], route[at][1] - route[at - 1][1]);
   if (along.back() == 0.0) return {route.front()};
   std::vector<std::array<double, 2>> found;
-  for (std::size_t number = 0, at = 0; number + 1 < most_places; ++number) {
-    const double here = static_cast<double>(number) * (along.back() / static_cast<double>(most_places - 1));
+  for (std::size_t number = 0, at = 0; number + 1 < max_places; ++number) {
+    const double here = static_cast<double>(number) * (along.back() / static_cast<double>(max_places - 1));
     while (at + 2 < route.size() && along[at + 1] <= here) ++at;
     const double step = along[at + 1] - along[at], share = step > 0.0 ? std::min((here - along[at]) / step, 1.0) : 0.0;
     found.push_back({route[at][0] + share * (route[at + 1][0] - route[at][0]),

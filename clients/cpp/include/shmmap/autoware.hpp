@@ -13,7 +13,7 @@
 //
 // Autoware's `cached_ids` say which cells a node has, and not in which version.  So these objects remember
 // the version of each cell that they handed out, and a cell that has changed in the map comes again under its
-// id.  Hence: one object for each thing that keeps cells, and what it returns must be taken over as a whole.
+// id.  So use one object for each thing that keeps cells, and take over as a whole what it returns.
 // Copies share one memory and one connection.  A node's one thread may use them as well as several: a second
 // call waits for the first one to end.
 //
@@ -39,10 +39,10 @@ namespace shmmap {
 struct LoaderOptions {
   Options client = {};  ///< how the daemon is found
   double wait = 10.0;   ///< seconds, at most 3600; see above
-  /// Gets a line about what could not be had.  It is called in the caller's thread.
+  /// Gets a line about what could not be loaded.  It is called in the caller's thread.
   std::function<void(const std::string&)> log = {};
   /// Asked ten times a second while a call waits: where it returns false the call ends with what has come by then.
-  /// Of a node: `[] { return rclcpp::ok(); }`, lest a request delay its end.
+  /// Of a node: `[] { return rclcpp::ok(); }`, so that no request delays its end.
   std::function<bool()> keep_waiting = {};
 };
 
@@ -127,8 +127,8 @@ class HeldCells {
     std::set<std::string> seen;
     for (const auto& id : cached) {
       // what was not handed out here was not asked for: it is replaced, or nothing of the area
-      const bool stranger = versions_.count(id) == 0 && covered && missing.count(id) == 0;
-      if (found.added.count(id) == 0 && (stranger || gone.count(id) != 0) && seen.insert(id).second)
+      const bool is_foreign = versions_.count(id) == 0 && covered && missing.count(id) == 0;
+      if (found.added.count(id) == 0 && (is_foreign || gone.count(id) != 0) && seen.insert(id).second)
         found.removed.push_back(id);
     }
     versions_ = std::move(held);

@@ -162,7 +162,7 @@ class Client {
     }
   }
 
-  /// All cells of an area, and what of them could not be had.  `wait`: seconds that the daemon may take to load
+  /// All cells of an area, and what of them could not be loaded.  `wait`: seconds that the daemon may take to load
   /// (at most 3600); none: what is in memory, the rest is `pending` and being loaded.
   Answer area(const Area& area, const std::vector<std::string>& layers = {"points"},
               std::optional<double> wait = default_wait, const std::optional<Intent>& intent = std::nullopt) {
@@ -235,7 +235,7 @@ class Client {
   using Clock = detail::Clock;
 
   static constexpr double greeting_s = 1.0;
-  static constexpr std::size_t most_request_bytes = std::size_t{4} << 20;  // more ends the connection
+  static constexpr std::size_t max_request_bytes = std::size_t{4} << 20;  // more ends the connection
   static constexpr std::chrono::milliseconds look_again{20};  // for a daemon that does not listen
   static constexpr double attach_s = 0.2;  // for the daemon to have looked at a segment
   static constexpr int attempts = 8;
@@ -365,7 +365,7 @@ class Client {
   }
 
   static void check_size(const std::string& message) {
-    if (message.size() > most_request_bytes)
+    if (message.size() > max_request_bytes)
       throw BadRequest("bad_request", "the request has " + std::to_string(message.size()) +
                                           " bytes, and a daemon takes at most 4 MiB",
                        "ask for fewer cells at a time, or send versions (packed) in place of names");

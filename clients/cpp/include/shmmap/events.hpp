@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What happens in the daemon, without missing anything unnoticed.  Events come on a socket of their own, numbered;
-// what is missing between two of them is asked for, and what the daemon does not remember any more is `Missed`.
+// what is missing between two of them is asked for, and what the daemon does not remember any more is `MissedEvents`.
 
 #ifndef SHMMAP_EVENTS_HPP
 #define SHMMAP_EVENTS_HPP
@@ -48,11 +48,11 @@ struct Event {
 };
 
 /// Events that are lost: ask for cells again to learn what they reported.
-struct Missed {
+struct MissedEvents {
   std::uint64_t epoch = 0, first = 0, last = 0;
 };
 
-using Happening = std::variant<Event, Missed>;
+using Happening = std::variant<Event, MissedEvents>;
 
 namespace detail {
 
@@ -71,7 +71,7 @@ inline constexpr std::array<KindOfEvent, 17> kinds_of_events{{
     {"retried", {"id", "layer", "code"}},
     {"pressure", {"id", "layer", "code", "refused", "budget_bytes", "used_bytes", "pinned_bytes", "zombie_bytes"}},
     {"prefetch_miss", {"session", "pid", "client", "cells", "id", "layer"}},
-    {"reload", {"map_version", "changed", "added", "removed", "told", "error"}},
+    {"reload", {"map_version", "changed", "added", "removed", "listed", "error"}},
     {"long_turn", {"kind", "cpu_ns"}},
     {"joined", {"session", "pid", "uid", "client"}},
     {"left", {"session", "pid", "client", "bytes"}},
@@ -214,7 +214,7 @@ class EventStream {
   /// Report what is missing up to this number as lost.
   void miss(std::uint64_t last) {
     if (last < expected_) return;
-    ready_.emplace_back(Missed{epoch_, expected_, last});
+    ready_.emplace_back(MissedEvents{epoch_, expected_, last});
     expected_ = last + 1;
   }
 
@@ -233,7 +233,7 @@ class EventStream {
       Page page = recent(after, since_ns, 500);
       if (page.epoch != epoch_) return false;
       if (page.first > after + 1 && since_ns == 0) {
-        ready_.emplace_back(Missed{page.epoch, after + 1, page.first - 1});
+        ready_.emplace_back(MissedEvents{page.epoch, after + 1, page.first - 1});
         after = page.first - 1;
       }
       const bool is_last = page.events.empty();

@@ -209,7 +209,7 @@ inline StatisticsHeader read_statistics_header(const StatisticsFile& file) {
 
 }  // namespace detail
 
-/// Reads an instance's statistics, again and again; the daemon need not run yet.
+/// Reads an instance's statistics as often as it is asked; the daemon need not run yet.
 class StatisticsReader {
  public:
   explicit StatisticsReader(const std::string& instance = "default", const std::string& shm_dir = "/dev/shm")

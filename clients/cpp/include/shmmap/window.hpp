@@ -37,14 +37,14 @@ namespace shmmap {
 
 /// A cell outside of the window that is still attached: metres from the pose to the nearest point of its box, the
 /// bytes of its columns, and the seconds since it left.
-struct Departed {
+struct RetentionCandidate {
   double distance = 0.0;
   std::uint64_t nbytes = 0;
   double age = 0.0;
 };
 
 /// Decides for each departed cell whether to keep it attached.
-using RetentionPolicy = std::function<std::vector<bool>(const std::vector<Departed>&)>;
+using RetentionPolicy = std::function<std::vector<bool>(const std::vector<RetentionCandidate>&)>;
 
 /// Keeps cells up to a distance, a sum of bytes and an age, the nearest first; the default keeps nothing.
 struct Retention {
@@ -52,7 +52,7 @@ struct Retention {
   double max_bytes = std::numeric_limits<double>::infinity();
   double max_age = std::numeric_limits<double>::infinity();
 
-  std::vector<bool> operator()(const std::vector<Departed>& departed) const {
+  std::vector<bool> operator()(const std::vector<RetentionCandidate>& departed) const {
     std::vector<bool> kept(departed.size(), false);
     std::vector<std::size_t> order(departed.size());
     for (std::size_t index = 0; index < order.size(); ++index) order[index] = index;
@@ -473,7 +473,7 @@ class Window {
 
   void retain(Clock::time_point now) {
     if (retained_.empty()) return;
-    std::vector<Departed> departed;
+    std::vector<RetentionCandidate> departed;
     for (const auto& [key, one] : retained_) {
       std::uint64_t nbytes = 0;
       for (const auto& column : one.cell->columns) nbytes += column.nbytes;

@@ -120,15 +120,15 @@ class Backend(Protocol):
     def fault(self) -> DeviceError | None:
         """Why another backend than the one that was asked for computes; None if it does not."""
 
-    most_map_bytes: int
+    max_map_bytes: int
     """Of a map, see `Limits.map_bytes`: less than the limit where a device has not as much memory."""
 
     @property
     def uploads(self) -> UploadStatistics:
-        """What `prepare` and evaluations wrote to a device for maps; one object, which goes on counting."""
+        """Counts of what was written to a device for maps; always the same object, which is updated."""
 
     def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
-        """Do in advance what evaluations with this map would have to wait for.
+        """Prepare this map, so that evaluations with it need not wait.
 
         It may be called in another thread, beside evaluations with the map in use.
         """

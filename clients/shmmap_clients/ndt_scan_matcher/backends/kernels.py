@@ -3,12 +3,12 @@
 
 Importing this module compiles the kernels, or loads them from numba's cache (tenths of a second).
 
-Everything that the loop over points reads again and again is in local variables: a compiler that cannot know
+Everything that the loop over points reads repeatedly is in local variables: a compiler that cannot know
 that a store does not change an array would load it again each time.  So that loop is one long function.
 
-What is computed once a pose (its rotation's derivatives, its sums' contraction, the next step) would be some
-hundred small operations an evaluation in Python, and their code is what has left the processor's caches by
-the time of the next scan.
+Work done once a pose (the rotation's derivatives, the sum of the points' parts, the next step) is compiled,
+too.  In Python it would be some hundred small operations, whose code has left the processor's caches by the
+time of the next scan.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numba import types
 
-from shmmap.compiling import compiled, read_only
+from shmmap.compiling import compiled, inlined, read_only
 from shmmap_clients.elements_at import float64_at, int32_at
 from shmmap_clients.ndt_scan_matcher.backends.crowded_kernel import MAP, SCRATCH, add_nearest, exp_of_negated
 from shmmap_clients.ndt_scan_matcher.matching.evaluation import NEGLIGIBLE_EXPONENT
@@ -432,21 +432,13 @@ def contract(rows: Any, chunks: Any, M: Any, found: Any) -> None:
                 h[i, 3 + j] = h[3 + j, i] = sums[24 + 3 * i + j]
 
 
-@compiled(_STEP, boundscheck=False)
-def step_into(hessian: Any, gradient: Any, steady: Any, step: Any) -> None:
-    """Write `upward_step` if steady, else `newton_step`.
+@inlined
+def _diagonalize(a: Any, v: Any) -> None:
+    """Turn the symmetric ``a`` into a diagonal of its eigenvalues; columns of ``v`` become its eigenvectors.
 
-    A symmetric matrix's singular values are its eigenvalues' magnitudes: both steps come from these, and they
-    from Jacobi's method, which has them to the last digits also where translations and rotations differ by
-    orders of magnitude (Demmel and Veselic 1992).
+    ``v`` is the identity before.  Jacobi's method has them to the last digits also where translations and
+    rotations differ by orders of magnitude (Demmel and Veselic 1992).
     """
-    a = hessian.copy()
-    v = np.eye(6)
-    for i in range(6):
-        for j in range(6):
-            if not np.isfinite(a[i, j]):
-                step[:] = np.nan
-                return
     for _ in range(_SWEEPS):
         rotated = False
         for p in range(5):
@@ -476,6 +468,22 @@ def step_into(hessian: Any, gradient: Any, steady: Any, step: Any) -> None:
                     v[k, p], v[k, q] = c * vkp - s * vkq, s * vkp + c * vkq
         if not rotated:
             break
+
+
+@compiled(_STEP, boundscheck=False)
+def step_into(hessian: Any, gradient: Any, steady: Any, step: Any) -> None:
+    """Write `upward_step` if steady, else `newton_step`.
+
+    A symmetric matrix's singular values are its eigenvalues' magnitudes: both steps come from these.
+    """
+    a = hessian.copy()
+    v = np.eye(6)
+    for i in range(6):
+        for j in range(6):
+            if not np.isfinite(a[i, j]):
+                step[:] = np.nan
+                return
+    _diagonalize(a, v)
     most = 0.0
     for i in range(6):
         most = max(most, abs(a[i, i]))

@@ -47,12 +47,12 @@ class NumbaBackend:
 
     def __init__(self, limits: Limits, threads: int = 1) -> None:
         self._source = ScanBuffer(limits.source_points)
-        self._most_poses = limits.poses
-        self.most_map_bytes = limits.most_map_bytes
+        self._max_poses = limits.poses
+        self.max_map_bytes = limits.max_map_bytes
         self.uploads = UploadStatistics()  # nothing is
         self._map = VoxelMap({})
-        self._most_rows = max(-(-limits.source_points // CHUNK_POINTS), _BATCH_ROWS)
-        self._rows = np.zeros((self._most_rows, SUMS))
+        self._max_rows = max(-(-limits.source_points // CHUNK_POINTS), _BATCH_ROWS)
+        self._rows = np.zeros((self._max_rows, SUMS))
         self._T = np.zeros((limits.poses, 4, 4))
         self._M = np.zeros((limits.poses, 9, 3, 3))
         self._scratch = [
@@ -81,9 +81,9 @@ class NumbaBackend:
 
     def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
         """Return the evaluations of (k, 6) poses; threads share all their chunks."""
-        check_batch(poses, self._most_poses)
+        check_batch(poses, self._max_poses)
         chunks = -(-len(self._source.points) // CHUNK_POINTS)
-        each = max(self._most_rows // max(chunks, 1), 1)
+        each = max(self._max_rows // max(chunks, 1), 1)
         found: list[Evaluation] = []
         for first in range(0, len(poses), each):
             part = np.ascontiguousarray(poses[first : first + each], np.float64)

@@ -86,8 +86,8 @@ class NumpyBackend:
     def __init__(self, limits: Limits, threads: int = 1) -> None:  # noqa: ARG002
         self._source = ScanBuffer(limits.source_points)
         self._most = limits.neighbors
-        self._most_poses = limits.poses
-        self.most_map_bytes = limits.most_map_bytes
+        self._max_poses = limits.poses
+        self.max_map_bytes = limits.max_map_bytes
         self.uploads = UploadStatistics()  # nothing is
         self._gaussians = self._prepared = _Gaussians(VoxelMap({}))
 
@@ -113,7 +113,7 @@ class NumpyBackend:
 
     def evaluate(self, poses: NDArray[np.float64], scoring: Scoring) -> list[Evaluation]:
         """Return the evaluations of (k, 6) poses, one after the other."""
-        check_batch(poses, self._most_poses)
+        check_batch(poses, self._max_poses)
         source = self._source.points
         blocks = [source[at : at + _BLOCK_POINTS] for at in range(0, len(source), _BLOCK_POINTS)]
         derivatives = derivatives_of_poses(poses, scoring.pitch_sign)

@@ -91,8 +91,8 @@ class OpenclBackend:
         self._source_is_new = False
         self._map = VoxelMap({})
         chunks = -(-limits.source_points // CHUNK_POINTS)
-        self._most_rows = max(chunks, _LAUNCH_ROWS)
-        self._rows = np.empty((self._most_rows, SUMS), self._real)
+        self._max_rows = max(chunks, _LAUNCH_ROWS)
+        self._rows = np.empty((self._max_rows, SUMS), self._real)
         self._poses = np.zeros((limits.poses, _POSE), self._real)
         self._places = np.zeros((limits.poses, 3), np.int32)
         self._kernels: dict[Neighbors, Any] = {}
@@ -103,7 +103,7 @@ class OpenclBackend:
         with device_errors(device.info.name, "start"):
             self._context = cl.Context([device.handle])
             self._queue = cl.CommandQueue(self._context, device.handle)
-        self.most_map_bytes = self._room_for_maps()
+        self.max_map_bytes = self._room_for_maps()
         with device_errors(device.info.name, "allocate buffers for scans and results"):
             flags = cl.mem_flags
             size = self._real.itemsize
@@ -119,7 +119,7 @@ class OpenclBackend:
             self.maps = MapInPlace(self._context)
         else:
             # room for a map's second kind of covariance, too
-            self.maps = MapBuffers(self._context, device, 2 * (_TABLES_BYTES + self.most_map_bytes))
+            self.maps = MapBuffers(self._context, device, 2 * (_TABLES_BYTES + self.max_map_bytes))
 
     @property
     def uploads(self) -> UploadStatistics:
@@ -128,14 +128,14 @@ class OpenclBackend:
 
     def _room_for_maps(self) -> int:
         """Return the most bytes that a map may have: as limited, or what two buffers have room for."""
-        wanted = self._limits.most_map_bytes
+        wanted = self._limits.max_map_bytes
         if self.device.in_place:
             return wanted
         info = self.device.info
-        room = min(info.most_bytes, info.memory_bytes // 2) // 2 - _TABLES_BYTES
+        room = min(info.max_bytes, info.memory_bytes // 2) // 2 - _TABLES_BYTES
         if room <= 0:
             raise DeviceMemory(
-                f"device {info.name!r} allocates at most {info.most_bytes} bytes at once, and has"
+                f"device {info.name!r} allocates at most {info.max_bytes} bytes at once, and has"
                 f" {info.memory_bytes}: too little for a map"
             )
         return min(wanted, room)
@@ -178,7 +178,7 @@ class OpenclBackend:
         """Return the evaluations of (k, 6) poses, in one launch where memory allows."""
         check_batch(poses, self._limits.poses)
         found: list[Evaluation] = []
-        each = max(self._most_rows // max(-(-len(self._source.points) // CHUNK_POINTS), 1), 1)
+        each = max(self._max_rows // max(-(-len(self._source.points) // CHUNK_POINTS), 1), 1)
         for first in range(0, len(poses), each):
             found += self._evaluated(np.asarray(poses[first : first + each], np.float64), scoring)
         return found

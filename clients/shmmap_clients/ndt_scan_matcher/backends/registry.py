@@ -80,22 +80,22 @@ class FallbackBackend:
         self._map: VoxelMap | None = None
         self._points: NDArray[np.floating] | None = None
         self._lock = threading.Lock()
-        self.most_map_bytes = min(first.most_map_bytes, second.most_map_bytes)
+        self.max_map_bytes = min(first.max_map_bytes, second.max_map_bytes)
         self.fault: DeviceError | None = None
 
     @property
     def name(self) -> str:
-        """Of the one that computes."""
+        """Name of the backend that computes at present."""
         return self._active.name
 
     @property
     def on_device(self) -> bool:
-        """Of the one that computes."""
+        """Whether the backend that computes at present uses a device."""
         return self._active.on_device
 
     @property
     def uploads(self) -> UploadStatistics:
-        """Of the one on a device."""
+        """Uploads of the backend on a device."""
         return self._first.uploads
 
     def close(self) -> None:
@@ -104,7 +104,7 @@ class FallbackBackend:
         self._second.close()
 
     def prepare(self, voxel_map: VoxelMap, scoring: Scoring) -> None:
-        """Do in advance what evaluations with this map would have to wait for; of both."""
+        """Prepare both backends for this map, so that evaluations need not wait for it."""
         self._second.prepare(voxel_map, scoring)
         if self._active is self._first:
             try:

@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         voxel_map = VoxelMap(
             {args.map: voxel_cell(cloud, args.leaf)},
             max_voxels=matcher.limits.voxels,
-            max_bytes=matcher.limits.most_map_bytes,
+            max_bytes=matcher.limits.max_map_bytes,
         )
         matcher.set_map(matcher.prepare(voxel_map))
         begin = time.perf_counter()

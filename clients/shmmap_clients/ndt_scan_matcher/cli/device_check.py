@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap-ndt device-check``: does a device compute what numpy computes, each time, and how fast?
+"""``shmmap-ndt device-check``: whether a device computes what numpy computes, each time, and how fast.
 
 Scenes are generated, and their Gaussians computed, by numpy alone, so that it also runs where numba has no
 wheel.  Bounds are what separates programs in double precision, and what floats can hold: see `BOUNDS`.
@@ -99,7 +99,7 @@ class _Scene:
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """One comparison: what, in words; the largest difference of each kind; what was not within its bound."""
+    """One comparison: its name, the largest difference of each kind, and the bounds that were exceeded."""
 
     what: str
     equal: bool

@@ -204,7 +204,7 @@ def _map_updater(
         args.lidar_radius,
         args.leaf,
         matcher.limits.voxels,
-        max_bytes=matcher.limits.most_map_bytes,
+        max_bytes=matcher.limits.max_map_bytes,
     )
     return MapUpdater(client, rules, prepare=matcher.prepare, uploads=matcher.uploads, route=route)
 

@@ -30,7 +30,7 @@ __all__ = ["add_parser", "warmup_alignment"]
 _DEVICES_JSON = """\
 JSON (fields may be added, none is removed):
   [{"index", "name", "platform", "driver", "kind": GPU, accelerator, CPU or
-    other, "fp64": double precision, "memory_bytes", "most_bytes": of one
+    other, "fp64": double precision, "memory_bytes", "max_bytes": of one
     buffer, "unified": the processor's memory, "svm_system": reads shared
     memory in place, "unusable": why it cannot be used, else empty}]
 Exit code: 0; 1 when there is no device that can be used."""
@@ -42,7 +42,7 @@ device."""
 _CHECK_EPILOG = """\
 JSON (fields may be added, none is removed):
   {"shmmap", "numpy", "pyopencl": versions, "equal": bool, "devices": [{
-   "device": as `devices --json` has it, "error": why it could not be used, or
+   "device": as in `devices --json`, "error": why it could not be used, or
      null, "precision": double or float, "memory": svm or copy, "checks": [{
      "what", "equal", "worst": {kind: difference}, "failures": [text]}],
    "latencies": {scene: {"points", "voxels", "program_ms", "map_ms",

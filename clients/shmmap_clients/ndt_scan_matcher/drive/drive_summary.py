@@ -63,7 +63,7 @@ def pose_errors(
 
 
 class RunningErrors:
-    """Compares pose after pose with the truth; its size does not depend on how many."""
+    """Compares each pose with the true one, in memory that does not grow with their number."""
 
     def __init__(self) -> None:
         self._ate_m, self._ate_deg = RunningSpread(), RunningSpread()
@@ -93,7 +93,7 @@ class RunningErrors:
 
     @property
     def errors(self) -> TrajectoryErrors | None:
-        """Of the poses so far; None where there is none."""
+        """Errors of all poses so far; None before the first one."""
         if not self._ate_m.count:
             return None
         rte = {metres: running.spread.mean for metres, running in self._rte.items() if running.count}

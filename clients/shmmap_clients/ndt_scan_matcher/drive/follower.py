@@ -3,7 +3,7 @@
 
 A vehicle is followed or lost::
 
-    uncertain --trusted--> tracking --not trusted--> uncertain --not trusted, again and again--> lost
+    uncertain --trusted--> tracking --not trusted--> uncertain --not trusted, repeatedly--> lost
     tracking, uncertain --no map--> lost
     lost --trusted, or relocalized--> tracking
 
@@ -41,12 +41,12 @@ Relocalize = Callable[[NDArray[np.floating], NDArray[np.float64]], Result | None
 
 
 class Tracking:
-    """The state after each result.
+    """Judges after each result whether the vehicle is tracked, uncertain or lost.
 
     Parameters
     ----------
     lost_after
-        Number of results in a row that are not trusted after which it is lost; one without a map suffices.
+        Number of untrusted results in a row that make it lost; a single one without a map does so, too.
     lost
         Whether it is lost at the beginning.
     """
@@ -113,7 +113,7 @@ class Frame:
 
     @property
     def latency_s(self) -> float:
-        """From having the scan to having the pose."""
+        """Time from having the scan to having the pose."""
         return self.thin_s + self.map_s + self.align_s + self.relocalize_s
 
 

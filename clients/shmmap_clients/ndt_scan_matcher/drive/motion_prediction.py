@@ -118,7 +118,7 @@ class ConstantVelocity:
 class Odometry(ConstantVelocity):
     """The next motion is what the odometry says; beyond its last entry, constant velocity.
 
-    Where the odometry's times go back, another run of it begins: what lies between two runs is not known.
+    Where the odometry's times go back, a new run begins; the motion between two runs is not known.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def interpolate(trajectory: Trajectory, stamp_s: float) -> Matrix | None:
 
 
 def _motion(T: Matrix) -> NDArray[np.float64]:
-    """Translation and rotation vector of a transform."""
+    """Return the translation and rotation vector of a transform, (6,)."""
     R = T[:3, :3]
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = float(np.linalg.norm(axis)) / 2.0, (float(np.trace(R)) - 1.0) / 2.0
@@ -228,7 +228,7 @@ def _motion(T: Matrix) -> NDArray[np.float64]:
 
 
 def _moved(motion: NDArray[np.float64]) -> Matrix:
-    """The transform of a translation and a rotation vector (Rodrigues)."""
+    """Return the transform, (4, 4), of a translation and a rotation vector (Rodrigues)."""
     x, y, z = motion[3:]
     angle = math.sqrt(x * x + y * y + z * z)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -54,7 +54,7 @@ _SHARED_PLACES: Final = 4  # at a corner of four cells each has its own voxel in
 
 @dataclass(frozen=True, slots=True)
 class Regularization:
-    """A weak pull towards another estimate of where the vehicle is along its heading, as Autoware has it.
+    """A weak pull towards another estimate of where the vehicle is along its heading, as in Autoware.
 
     It adds -scale * neighbours * (longitudinal distance)^2 to the score.
 
@@ -139,8 +139,8 @@ class NdtMatcher:
             self.settings.device,
             fallback=self.settings.fallback,
         )
-        if self._backend.most_map_bytes < self.limits.most_map_bytes:
-            self.limits = replace(self.limits, map_bytes=self._backend.most_map_bytes)
+        if self._backend.max_map_bytes < self.limits.max_map_bytes:
+            self.limits = replace(self.limits, map_bytes=self._backend.max_map_bytes)
         self.set_map(VoxelMap({}))
 
     def __enter__(self) -> NdtMatcher:
@@ -285,9 +285,9 @@ class NdtMatcher:
             costs.append(clock() - begin)
             per_point = max(at.neighbours / max(len(points), 1), 1.0)
         used = max(min(len(points), self.limits.source_points), 1)
-        most_neighbors = min(self.limits.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
+        max_neighbors = min(self.limits.neighbors, _REACH[self._neighbors] * _SHARED_PLACES)
         # what a point costs grows no faster than its neighbours
-        point_ns = min(costs) / used * max(1.0, most_neighbors / per_point)
+        point_ns = min(costs) / used * max(1.0, max_neighbors / per_point)
         steps = self._rule.max_iterations + (2 if self._variant.stop == "step_late" else 0)
         # a line search ends with the Hessian of where it ended
         evaluations = 1 + steps * (MAX_TRIALS + 2 if self._rule.line_search else 1)

@@ -83,7 +83,7 @@ class Evidence:
     sharpness
         Least curvature of the score per matched point, over all directions: the smallest eigenvalue of the
         negated Hessian's translational block, divided by ``points`` and by the highest score of a point,
-        times leaf^1.5: with that power right poses have about the same at leaves of 1 m to 3 m.
+        times leaf^1.5.  With this power, right poses have about the same sharpness at leaves of 1 m to 3 m.
     spread
         Smallest eigenvalue of the position's covariance divided by its largest, 0 to 1; 0 where the Hessian
         is not definite.  0.04: the position is five times as uncertain in one direction as in another.

@@ -15,7 +15,7 @@ from shmmap_clients.ndt_scan_matcher.matching.newton import StepRule, Variant
 __all__ = ["VOXEL_BYTES", "Cut", "Limits", "Mode", "Settings", "TimeBound", "rule_of"]
 
 VOXEL_BYTES: Final = 96  # 72 for the Gaussian, the rest for the lattice of a street
-_MOST_POSES: Final = 65_536
+_MAX_POSES: Final = 65_536
 Mode = Literal["single", "coarse_fine"]
 
 
@@ -57,13 +57,13 @@ class Limits:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise BadRequest(f"the limit on {name} must be positive, it is {value}")
-        if self.poses > _MOST_POSES:
-            raise BadRequest(f"at most {_MOST_POSES} poses can be evaluated at once, not {self.poses}")
+        if self.poses > _MAX_POSES:
+            raise BadRequest(f"at most {_MAX_POSES} poses can be evaluated at once, not {self.poses}")
         if self.deadline_s is not None and not 0.0 < self.deadline_s < math.inf:
             raise BadRequest(f"a deadline must be a positive number of seconds, it is {self.deadline_s}")
 
     @property
-    def most_map_bytes(self) -> int:
+    def max_map_bytes(self) -> int:
         """The limit ``map_bytes``, or what stands for it."""
         return VOXEL_BYTES * self.voxels if self.map_bytes is None else self.map_bytes
 

@@ -43,7 +43,7 @@ def add_reload(subparsers: Subparsers) -> None:
         "reload",
         run_reload,
         help="read the map again: changed, new and deleted files",
-        description="Have the daemon read the map's list of cells again, as SIGHUP does.  Clients get what "
+        description="Make the daemon read the map's list of cells again, as SIGHUP does.  Clients get what "
         "changed with their next request; cells they have mapped stay readable.",
         output="cells.outputs.Reload",
         epilog=_RELOAD_EXIT,

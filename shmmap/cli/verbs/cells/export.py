@@ -29,7 +29,7 @@ __all__ = ["add_parser", "run"]
 _FORMATS = ("pcd", "npz")
 
 _EXIT = """\
-Exit code: 0; 1 when a cell could not be had, or there is no cell or no point (then nothing is written);
+Exit code: 0; 1 when a cell could not be loaded, or there is no cell or no point (then nothing is written);
 73 a file cannot be written."""
 
 
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _complain_of(found: CellSet, wait_s: float) -> None:
-    """Say which cells could not be had."""
+    """Say which cells could not be loaded."""
     for line in failure_lines(found.failed):
         complain("shmmap", line)
     for pending in found.pending:

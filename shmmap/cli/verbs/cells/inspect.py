@@ -166,7 +166,7 @@ def _directory(args: argparse.Namespace) -> int:
 
 
 def _as_map(path: str, found: list[CloudDescription]) -> outputs.ServedMap | None:
-    """What the metadata says of files as cells of a map, and where it is wrong; None where there is none."""
+    """Describe files as cells of their map, and where its metadata is wrong; None where there is none."""
     import numpy as np
 
     from shmmap.cli.verbs.cells import outputs

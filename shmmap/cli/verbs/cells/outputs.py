@@ -102,7 +102,7 @@ class PendingLayer(msgspec.Struct):
 
 
 class FailedLayer(msgspec.Struct):
-    """A layer of a cell that could not be had; ``holders`` map memory of the full budget."""
+    """A layer of a cell that could not be loaded; ``holders`` map memory of the full budget."""
 
     id: str
     layer: str

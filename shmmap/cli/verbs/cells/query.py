@@ -85,8 +85,8 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="ID[@VERSION]",
         nargs="+",
         action="extend",
-        help="print only what changes for a client that has these cells; without @VERSION: in their current "
-        "version",
+        help="print only what changes for a client that has these cells; a cell without @VERSION counts as "
+        "current",
     )
     parser.add_argument(
         "--wait",

@@ -142,7 +142,7 @@ def _print_fsck(found: CheckedMap) -> None:
     ]
     for title, names in (
         ("unfinished", found.interim),
-        ("quarantined", found.aside),
+        ("quarantined", found.quarantined),
         ("not a chunk", found.strange),
     ):
         lines += [(title, name) for name in names]
@@ -247,8 +247,8 @@ def _run_export(args: argparse.Namespace) -> int:
         print_json(with_more(made, seconds=seconds))
     else:
         print_pairs([*_export_lines(made), ("time", format_duration(seconds))])
-    if made.aside:
-        complain("shmmap", f"left out: {counted(len(made.aside), 'damaged file')} in quarantine")
+    if made.quarantined:
+        complain("shmmap", f"left out: {counted(len(made.quarantined), 'damaged file')} in quarantine")
     return 0
 
 

@@ -84,7 +84,7 @@ def _run_ls(args: argparse.Namespace) -> int:
 
 
 def _problems_of(row: LiveMapRow) -> list[str]:
-    """What is wrong with a live map, a line each."""
+    """List what is wrong with a live map, a line each."""
     found = [row.problem] if row.problem else []
     return [*found, *row.damaged]
 
@@ -213,7 +213,7 @@ def add_save(subparsers: Subparsers) -> None:
         "save",
         _run_save,
         help="write a live map to the disk now",
-        description="Have all changed chunks of a live map written to the disk; ends when everything that "
+        description="Save all changed chunks of a live map to the disk; ends when everything that "
         "was applied before is there.",
         output="live.outputs.Saved",
         epilog=_SAVE_EXIT,

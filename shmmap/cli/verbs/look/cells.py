@@ -239,5 +239,5 @@ def _holder_line(holder: Holder) -> str:
     if not holder.session:
         return "an unidentified process (not through the client library)"
     command = f" ({holder.command})" if holder.command not in ("", holder.client) else ""
-    who = f"{holder.client or 'client'}{command}, pid {holder.pid}, user {user_name(holder.uid)}"
-    return f"{who}, {format_bytes(holder.bytes)}"
+    user = f"{holder.client or 'client'}{command}, pid {holder.pid}, user {user_name(holder.uid)}"
+    return f"{user}, {format_bytes(holder.bytes)}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap map``: the map from above, what of it is in memory, and who is where."""
+"""``shmmap map``: the map from above, what of it is in memory, and where clients are."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk)
 
 
 def _published(counters: dict[str, int]) -> list[str]:
-    """What of a published map is known, and whether its store answers."""
+    """Say how much of a published map is known, and whether its store answers."""
     texts = [text for text, _trouble in published_words(counters)]
     if texts and counters.get("origin_out", 0):
         texts.append(f"its store is out of reach for {outage_so_far(counters)}")

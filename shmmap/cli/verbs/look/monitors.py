@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_hanging, print_json, print_line
-from shmmap.doctor.signed_map import trust_problems
+from shmmap.doctor.verdicts import trust_problems
 from shmmap.errors import DaemonUnreachable, NoSocket
 
 if TYPE_CHECKING:
-    from shmmap.doctor.finding import Finding
+    from shmmap.doctor.verdicts import Finding
     from shmmap.statistics.snapshot import Snapshot
 
 __all__ = ["add_doctor", "add_health", "add_metrics", "run_doctor", "run_health", "run_metrics"]
@@ -77,7 +77,7 @@ def run_health(args: argparse.Namespace) -> int:
 
 
 def _troubles(found: Snapshot) -> list[str]:
-    """What clients lack although the daemon answers."""
+    """List what clients lack although the daemon answers."""
     counts = found.counters
     counted_troubles = (
         (counts.get("refused_over_budget_1min", 0), "cells refused for lack of memory in the last minute"),
@@ -163,9 +163,8 @@ def run_doctor(args: argparse.Namespace) -> int:
     """Print every finding."""
     from shmmap.cli import daemon_address
     from shmmap.daemon.config import installed_config_file, load_config
-    from shmmap.doctor.checks import diagnose
-    from shmmap.doctor.finding import worst
-    from shmmap.doctor.patient import examine
+    from shmmap.doctor.checks import diagnose, examine
+    from shmmap.doctor.verdicts import worst
 
     file = args.config or installed_config_file()
     flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}

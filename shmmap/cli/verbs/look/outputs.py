@@ -13,8 +13,7 @@ from shmmap.cli.json_output import Box, Client, Hex, Holder, LiveMap, Segment, h
 from shmmap.cli.screens.status_parts import over_fetch
 from shmmap.cli.screens.top_screen import budget_parts
 from shmmap.cli.verbs.look.tail import HEX_FIELDS
-from shmmap.doctor.finding import Finding
-from shmmap.doctor.verdicts import cache_verdict
+from shmmap.doctor.verdicts import Finding, cache_verdict
 from shmmap.protocol.messages import ShownCell
 from shmmap.statistics.counters import SPANS
 from shmmap.statistics.identity import DaemonIdentity

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from shmmap.cli.areas import moved_by
@@ -75,22 +76,46 @@ def run_status(args: argparse.Namespace) -> int:
     return DaemonUnreachable.exit_code if found.state == "dead" else 0
 
 
+def _state_text(found: Snapshot, pid: int, uptime_s: float) -> str:
+    return {
+        "healthy": f"healthy, pid {pid}, up {format_duration(uptime_s)}",
+        "starting": f"starting, pid {pid}, for {format_duration(uptime_s)}: it does not listen yet",
+        "stopped": f"PAUSED, pid {pid}: continue it with `kill -CONT {pid}`",
+        "hung": f"HUNG, pid {pid}: no heartbeat for {format_duration(found.beat_age_s)}",
+        "dead": f"DEAD: pid {pid} crashed or was killed; start it again, it keeps the cells in memory",
+    }[found.state]
+
+
+def _occasional_lines(count: Mapping[str, int]) -> list[tuple[str, str]]:
+    """Return the lines that most daemons do not need: what is wrong, old or unusual."""
+    lines = []
+    if problems := count.get("map_problems", 0):
+        lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
+    if outside := count.get("cells_outside_box", 0):
+        cells = f"{counted(outside, 'cell')} with points outside the cell's box"
+        lines.append(("misplaced", f"{cells}: see the daemon's log, or `shmmap inspect` the map"))
+    if count["stale_cells"]:
+        lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
+    if count["zombies"]:
+        retired = f"{count['zombies']:,} segments, {format_bytes(count['bytes_zombie'])}"
+        lines.append(("retired", f"{retired}: freed when no client maps them"))
+    if count["adopted"]:
+        failed = f", {count['adoptions_failed']:,} of them damaged" if count["adoptions_failed"] else ""
+        lines.append(("warm start", f"{count['adopted']:,} segments kept from the previous daemon{failed}"))
+    if count["pin_source"]:
+        source = "the clients' locks" if count["pin_source"] == 1 else "what clients report"
+        lines.append(("use", f"this system grants no leases: memory in use is known from {source} only"))
+    return lines
+
+
 def _status_lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) -> list[tuple[str, str]]:
     count = found.counters
     used = count["bytes_resident"] + count["bytes_zombie"] + count["bytes_reserved"]
     budget = count["budget_bytes"]
     share = f" ({100 * used / budget:.0f} %)" if budget else ""
-    state = {
-        "healthy": f"healthy, pid {identity.pid}, up {format_duration(uptime_s)}",
-        "starting": f"starting, pid {identity.pid}, for {format_duration(uptime_s)}: it does not listen yet",
-        "stopped": f"PAUSED, pid {identity.pid}: continue it with `kill -CONT {identity.pid}`",
-        "hung": f"HUNG, pid {identity.pid}: no heartbeat for {format_duration(found.beat_age_s)}",
-        "dead": f"DEAD: pid {identity.pid} crashed or was killed; start it again, it keeps the "
-        f"cells in memory",
-    }[found.state]
     asked = count["hits"] + count["misses"]
     lines = [
-        ("daemon", state),
+        ("daemon", _state_text(found, identity.pid, uptime_s)),
         ("instance", f"{identity.instance} (shmmap {identity.library_version})"),
         ("endpoint", identity.endpoint),
         ("map", f"{identity.map_path}, {count['map_cells']:,} cells, version {identity.map_version:016x}"),
@@ -108,22 +133,7 @@ def _status_lines(found: Snapshot, identity: DaemonIdentity, uptime_s: float) ->
         out = f"out of reach for {outage_so_far(count)}{since(count)}"
         lines.append(("origin", f"{out}: what is {kept} is served"))
     lines += published_lines(count)
-    if problems := count.get("map_problems", 0):
-        lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
-    if outside := count.get("cells_outside_box", 0):
-        cells = f"{counted(outside, 'cell')} with points outside the cell's box"
-        lines.append(("misplaced", f"{cells}: see the daemon's log, or `shmmap inspect` the map"))
-    if count["stale_cells"]:
-        lines.append(("stale", f"{count['stale_cells']:,} segments whose newer version is not loaded yet"))
-    if count["zombies"]:
-        retired = f"{count['zombies']:,} segments, {format_bytes(count['bytes_zombie'])}"
-        lines.append(("retired", f"{retired}: freed when no client maps them"))
-    if count["adopted"]:
-        failed = f", {count['adoptions_failed']:,} of them damaged" if count["adoptions_failed"] else ""
-        lines.append(("warm start", f"{count['adopted']:,} segments kept from the previous daemon{failed}"))
-    if count["pin_source"]:
-        source = "the clients' locks" if count["pin_source"] == 1 else "what clients report"
-        lines.append(("use", f"this system grants no leases: memory in use is known from {source} only"))
+    lines += _occasional_lines(count)
     lines += [
         (
             "clients",

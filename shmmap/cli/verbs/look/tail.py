@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
             if happening is not None:
                 show(happening)
                 sys.stdout.flush()
-            elif time.monotonic() - stream.heard_s > SILENT_S:
+            elif time.monotonic() - stream.last_message_s > SILENT_S:
                 _wait_for_heartbeat(stream, show)
     return 0
 
@@ -171,8 +171,8 @@ def _pressure(f: dict[str, Any]) -> str:
 
 
 def _prefetch_miss(f: dict[str, Any]) -> str:
-    who = f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}"
-    return f"{who} had to wait for {counted(f['cells'], 'cell')}, such as {f['id']} {f['layer']}"
+    client = f"{f['client'] or 'a client'}, pid {f['pid'] or '?'}"
+    return f"{client} had to wait for {counted(f['cells'], 'cell')}, such as {f['id']} {f['layer']}"
 
 
 def _reload(f: dict[str, Any]) -> str:
@@ -208,7 +208,7 @@ _COLUMN: Final = {
     "prefetch_miss": "miss",
     **dict.fromkeys(("live_started", "live_ended", "live_problem", "live_damaged"), "live"),
 }
-"""Kinds that have another name in the narrow column."""
+"""Shorter names of kinds of events, for the narrow column."""
 
 _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "epoch": _epoch,

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Ended(BaseException):
-    """A signal asks the program to end; raised so that the terminal is put right on the way out."""
+    """A signal asks the program to end; raised so that the terminal is restored before the program exits."""
 
     def __init__(self, number: int) -> None:
         self.number = number

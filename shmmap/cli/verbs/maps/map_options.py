@@ -38,7 +38,7 @@ _SHOWN_FAILURES: Final = 20
 
 
 def add_map_options(parser: argparse.ArgumentParser) -> None:
-    """Add how the map is read, and by how many processes."""
+    """Add the options for reading a map, and the number of processes."""
     parser.add_argument("--metadata", metavar="FILE", help="metadata YAML, if it is not with the map")
     parser.add_argument(
         "--strict", action="store_true", help="accept only what Autoware's own loader accepts"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from typing import TYPE_CHECKING
 
 from shmmap.cli.options import (
     Subparsers,
@@ -37,6 +38,9 @@ from shmmap.cli.verbs.maps.map_options import (
     verified_at,
     worker_count,
 )
+
+if TYPE_CHECKING:
+    from shmmap.publishing.slicing import Sliced
 
 __all__ = ["add_parser", "run"]
 
@@ -213,13 +217,18 @@ def _prepare_slice(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         complain("shmmap", "interrupted", "the same command continues")
         raise
-    seconds = time.monotonic() - began_s
+    return _report_slice(args, store.url, done, time.monotonic() - began_s)
+
+
+def _report_slice(args: argparse.Namespace, url: str, done: Sliced, seconds: float) -> int:
+    """Print what was made; return the exit code."""
+    number, slices = args.shards
     if args.json:
         from shmmap.cli.verbs.maps import outputs
 
         print_json(
             outputs.Slice(
-                store.url,
+                url,
                 done.version,
                 str(done.run),
                 number,
@@ -245,7 +254,7 @@ def _prepare_slice(args: argparse.Namespace) -> int:
     there = ": it had been made before" if done.there else ""
     print_pairs(
         [
-            ("map", f"{store.url}, version {done.version}"),
+            ("map", f"{url}, version {done.version}"),
             ("slice", f"{number} of {slices}, {counted(done.cells, 'cell')}{there}"),
             ("layers", " ".join(done.layers)),
             ("made", f"{done.made:,}, {format_bytes(done.bytes)}"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from shmmap.cli.options import (
     Subparsers,
@@ -37,6 +37,9 @@ from shmmap.cli.verbs.maps.map_options import (
     store_at,
     worker_count,
 )
+
+if TYPE_CHECKING:
+    from shmmap.publishing.publish import Published
 
 __all__ = ["add_parser", "run"]
 
@@ -221,14 +224,20 @@ def _publish(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         complain("shmmap", "interrupted", "the same command continues")
         raise
-    seconds = time.monotonic() - began_s
+    return _report(args, origin.path, store.url, done, catalogue.problems, time.monotonic() - began_s)
+
+
+def _report(
+    args: argparse.Namespace, path: str, url: str, done: Published, problems: Sequence[str], seconds: float
+) -> int:
+    """Print what was published; return the exit code."""
     if args.json:
         from shmmap.cli.verbs.maps import outputs
 
         print_json(
             outputs.PublishedMap(
-                origin.path,
-                store.url,
+                path,
+                url,
                 done.version is not None,
                 done.current,
                 f"{done.map_version:016x}",
@@ -243,11 +252,11 @@ def _publish(args: argparse.Namespace) -> int:
                 done.sent_bytes,
                 seconds,
                 failure_rows(done.failures),
-                list(catalogue.problems),
+                list(problems),
             )
         )
         return 1 if done.failures else 0
-    for problem in catalogue.problems:
+    for problem in problems:
         print_line(f"note: {problem}")
     print_failures(done.failures)
     if done.failures:
@@ -256,8 +265,8 @@ def _publish(args: argparse.Namespace) -> int:
     changed = "" if done.version is not None else ": nothing has changed"
     print_pairs(
         [
-            ("map", f"{origin.path}, {counted(done.cells, 'cell')}"),
-            ("url", store.url),
+            ("map", f"{path}, {counted(done.cells, 'cell')}"),
+            ("url", url),
             ("version", f"{done.current}{changed}"),
             ("layers", " ".join(done.layers)),
             ("ids", f"{done.id_prefix}..."),

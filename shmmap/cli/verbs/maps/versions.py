@@ -31,6 +31,7 @@ from shmmap.cli.verbs.maps.map_options import (
 )
 
 if TYPE_CHECKING:
+    from shmmap.origin.remote.map_versions import Current, Entry
     from shmmap.origin.remote.store import Store
     from shmmap.origin.remote.verify_apart import Verified
     from shmmap.prepare.run import PrepareProgress
@@ -207,30 +208,31 @@ def _numbers(versions: list[int]) -> str:
     return f"versions {', '.join(map(str, versions))}" if versions else "no version"
 
 
-def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
-    from shmmap.errors import MapMissing
-    from shmmap.origin.remote.map_versions import (
-        Entry,
-        earlier_versions,
-        list_entries,
-        read_entry,
-        require_current,
-    )
+def _find_versions(store: Store, current: Current) -> tuple[list[Entry], dict[int, str]]:
+    """Return the entries of all versions that can be found, latest first, and the state of each."""
+    import contextlib
 
-    current = require_current(store) if verified is None else verified.current
+    from shmmap.errors import MapMissing
+    from shmmap.origin.remote.map_versions import Entry, earlier_versions, list_entries, read_entry
+
     # a map that was copied may have no entries
     entries = {current.version: Entry(current.version, current.root, current.bytes, "")}
     entries |= {entry.version: entry for entry in earlier_versions(store, current)}
     states = {version: "current" if version == current.version else "earlier" for version in entries}
     if not store.read_only:
-        import contextlib
-
         for version in list_entries(store):
             if version not in entries:
                 with contextlib.suppress(MapMissing):  # pruned in this moment
                     entries[version] = read_entry(store, version)
                     states[version] = "never served"
-    ordered = sorted(entries.values(), key=lambda entry: -entry.version)
+    return sorted(entries.values(), key=lambda entry: -entry.version), states
+
+
+def _list(store: Store, verified: Verified | None, *, as_json: bool) -> None:
+    from shmmap.origin.remote.map_versions import require_current
+
+    current = require_current(store) if verified is None else verified.current
+    ordered, states = _find_versions(store, current)
     if as_json:
         from shmmap.cli.verbs.maps import outputs
 

@@ -15,7 +15,7 @@ from shmmap.errors import BadRequest, CannotWrite
 
 if TYPE_CHECKING:
     from shmmap.cli.screens.demo import DemoReport
-    from shmmap.demo.progress import Progress
+    from shmmap.demo.program import Progress
 
 __all__ = ["add_parser", "run"]
 

@@ -55,7 +55,7 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
         Add it to a point to get back to that frame, metres.
     fields
         Names and dtypes of the columns.
-    aside
+    quarantined
         Files that are left out because they were quarantined before.
     """
 
@@ -68,7 +68,7 @@ class ExportedVoxels(msgspec.Struct, frozen=True):
     frame_id: str
     origin: tuple[float, float, float]
     fields: list[tuple[str, str]]
-    aside: list[str]
+    quarantined: list[str]
 
 
 def export(
@@ -170,7 +170,7 @@ def _exported(
         frame_id=stored.settings.frame_id,
         origin=origin,
         fields=[(name, row[name].str) for name in row.names or ()],
-        aside=stored.names.quarantined,
+        quarantined=stored.names.quarantined,
     )
 
 

@@ -71,7 +71,7 @@ class CheckedMap(msgspec.Struct):
         ``stale`` if it does not list the chunks as the files have them: as after a daemon was killed.
     interim
         Files that did not get their own names: the daemon takes over the good ones at its next start.
-    aside
+    quarantined
         Files that were quarantined before.
     strange
         Files named like those of chunks, but of chunks that cannot be.
@@ -89,7 +89,7 @@ class CheckedMap(msgspec.Struct):
     missing: list[MissingChunk]
     manifest: Literal["current", "stale", "absent", "unreadable"]
     interim: list[str]
-    aside: list[str]
+    quarantined: list[str]
     strange: list[str]
     rewritten: bool = False
 
@@ -147,7 +147,7 @@ def check(files: FilesToRead, path: str) -> CheckedMap:
         missing=_missing(listed, rows, known) if isinstance(listed, dict) else [],
         manifest=("current" if listed == rows else "stale") if isinstance(listed, dict) else listed,
         interim=interim,
-        aside=stored.names.quarantined,
+        quarantined=stored.names.quarantined,
         strange=stored.names.strange,
     )
 

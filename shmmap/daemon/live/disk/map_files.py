@@ -128,10 +128,10 @@ class MapFiles:
     def begin_run(self) -> int:
         """Return how many times the map was in memory, this time included; on disk when this returns."""
         if not self._begun:
-            self._map.lives += 1
+            self._map.runs += 1
             self._write_map()
             self._begun = True
-        return self._map.lives
+        return self._map.runs
 
     def add_mapper(self, uid: int, name: str) -> Mapper:
         """Give a new mapper its number; it is on the disk when this returns."""

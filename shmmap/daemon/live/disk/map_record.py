@@ -137,7 +137,7 @@ class MapRecord(msgspec.Struct):
     settings: MapSettings
     mappers: list[Mapper] = []
     next_mapper: Annotated[int, msgspec.Meta(ge=1, le=1 << 53)] = 1
-    lives: Annotated[int, msgspec.Meta(ge=0, lt=(1 << 31) - 1)] = 0
+    runs: Annotated[int, msgspec.Meta(ge=0, lt=(1 << 31) - 1)] = msgspec.field(default=0, name="lives")
 
 
 class Manifest(msgspec.Struct):

@@ -96,7 +96,7 @@ def _reading(path: str) -> Iterator[None]:
         cause = "missing" if isinstance(error, FileNotFoundError) else "unreadable"
         raise MapDataError(f"it cannot be read: {error.strerror}", path=path, cause=cause) from error
     except MapDataError as error:
-        error.hint = "`shmmap live fsck` finds all that is damaged, and puts it aside with --repair"
+        error.hint = "`shmmap live fsck` finds all that is damaged, and quarantines it with --repair"
         raise
 
 

@@ -364,7 +364,7 @@ class Residency:
             self._note_missing(chunk.key)
 
     def _note_missing(self, key: ChunkKey) -> None:
-        """Have a chunk that left memory loaded again, after the others, if it is near a client."""
+        """Queue a chunk that left memory to be loaded again, after the others, if it is near a client."""
         if key in self.windows.near:
             self._missing.add(key, self.limits.radius)
 

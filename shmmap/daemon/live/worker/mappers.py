@@ -114,7 +114,7 @@ class Mappers:
             self.by_number[one.number] = ActiveMapper(one, one.scans + 1, last=last)
 
     def open(self, uid: int, name: str, session: int) -> ActiveMapper:
-        """Let a session map under a name, in the place of any other.  Called from any thread.
+        """Give a mapper's name to a session, and take it from any other session.  Called from any thread.
 
         Raises
         ------

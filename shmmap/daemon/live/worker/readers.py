@@ -36,7 +36,7 @@ __all__ = ["Readers"]
 NOTHING: Final = Row(0, 0, 0, 0, 0, 0)
 """Row of a chunk that has no file."""
 TURN_S: Final = 0.001
-"""The readers' part of the worker's time between two of its turns, if there is something else to do."""
+"""Longest time, seconds, that readers get between two turns of the worker if other work waits."""
 KEYS_PER_STEP: Final = 64
 FEW_CHANGES: Final = 1000
 """More chunks than this are not sorted in one step."""

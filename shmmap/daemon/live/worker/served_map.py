@@ -381,7 +381,7 @@ class ServedMap:
 
     @property
     def is_saved(self) -> bool:
-        """Whether nothing is in memory alone."""
+        """Whether all is on the disk, too."""
         return self.live.all_durable
 
     def stop_accepting(self) -> None:

@@ -33,7 +33,7 @@ MEMORY_S: Final = 10.0
 
 
 class Authorization:
-    """Decides who may administer the daemon.
+    """Decides which users may administer the daemon.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A name that somebody else chose writes nothing to the terminal but its letters."""
+"""A name from elsewhere writes nothing to the terminal but its letters."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def test_the_bar_is_as_long_as_there_is_room(width: int) -> None:
     )
 
 
-def test_the_screen_tells_what_an_operator_asks() -> None:
+def test_the_screen_answers_what_an_operator_asks() -> None:
     shown = text(snapshot(FULL, [CLIENT]))
     for piece in (
         "healthy", "pid 77", "1,234 cells", "10 s: 75.0 %", "1 min: –", "large enough", "p50", "p99",
@@ -135,7 +135,7 @@ def test_what_was_prefetched_and_what_of_it_was_used(width: int) -> None:
     assert "origin out of reach for less than a second" in " ".join(away.split())
 
 
-def test_what_programs_are_told_of_prefetching() -> None:
+def test_what_programs_learn_of_prefetching() -> None:
     assert msgspec.to_builtins(Prefetching.of(DRIVING)) == {
         "outage_tolerance_s": 10.0, "origin_out": False, "last_outage_s": 2.0, "prefetch_misses": 7,
         "prefetch_started": 120, "prefetch_used": 100, "prefetch_in_vain": 3, "prefetch_overtaken": 0,
@@ -195,14 +195,14 @@ def test_live_maps_on_the_screen(width: int) -> None:
     shown = text(found, width=width)
     live = shown[shown.index("\nlive ") : shown.index("\nCLIENT")]
     assert max(map(len, live.splitlines())) <= width
-    told = " ".join(live.split())
+    words = " ".join(live.split())
     for piece in (
         "live lidar: 12 chunks 8 clean 3 dirty 1 saving 4.0 MiB of 16.0 MiB 1,234,567 known voxels",
         "scans 100, on disk 93", "radar: 12 chunks", "waiting 1.0 MiB",
         "chunk 1_-2_0 cannot be saved: No space left on device",
         "damaged files, missing chunks: 2;",
     ):  # fmt: skip
-        assert piece in told, piece
+        assert piece in words, piece
     lines = screen(found, IDENTITY, width=width, max_clients=1)
     styles = {piece.split()[-1]: style for line in lines for piece, style in line if piece.strip()}
     assert (styles["clean"], styles["dirty"], styles["saving"]) == ("green", "blue", "cyan")
@@ -274,7 +274,7 @@ def test_the_picture_is_xml_with_tooltips() -> None:
     assert 'rect class="window"' in svg(Scene(**{**vars(SCENE), "clients": [boxed]}))
 
 
-def test_cells_fetched_ahead_are_marked_until_somebody_asks() -> None:
+def test_cells_fetched_ahead_are_marked_until_a_client_asks() -> None:
     ahead = replace(cell("0_0.pcd", 0, 0, "resident"), ahead=True)
     both = replace(cell("80_0.pcd", 80, 0, "resident"), ahead=True, layer="ndt(leaf=2.0)")
     rows = [ahead, both, cell("80_0.pcd", 80, 0, "resident"), cell("40_0.pcd", 40, 0, "stale")]

@@ -37,7 +37,9 @@ def test_plain_table_is_aligned(capsys: pytest.CaptureFixture[str]) -> None:
     )  # fmt: skip
 
 
-def test_table_on_a_terminal_is_styled_unless_told_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_on_a_terminal_is_styled_unless_the_environment_forbids_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setattr("sys.stdout", terminal := Terminal())
@@ -82,7 +84,7 @@ def test_a_table_is_never_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatc
         assert "town_0_0.pcd" in terminal.getvalue(), f"folded at {width} columns"
 
 
-def test_a_narrow_terminal_is_told_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_narrow_terminal_shows_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("COLUMNS", "23")

@@ -18,7 +18,7 @@ from shmmap.protocol.messages import Holder
 
 
 @pytest.mark.parametrize(
-    ("event", "told"),
+    ("event", "text"),
     [
         (e.LiveStarted(1, 2, 3, 2, 0), "2 live maps served"),
         (e.LiveStarted(1, 2, 3, 1, 40), "1 live map served, 40 chunks found in memory"),
@@ -31,20 +31,24 @@ from shmmap.protocol.messages import Holder
          "lidar: 3_-1_0: version 7 is missing"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_with_live_maps(capsys: pytest.CaptureFixture[str], event: Any, told: str) -> None:
+def test_what_is_wrong_with_live_maps(capsys: pytest.CaptureFixture[str], event: Any, text: str) -> None:
     _print_text(event)
     _, _, said = capsys.readouterr().out.partition("  ")
-    assert said == f"live      {told}\n"
+    assert said == f"live      {text}\n"
 
 
 def test_cells_that_a_client_had_to_wait_for(capsys: pytest.CaptureFixture[str]) -> None:
-    late = e.PrefetchMiss(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
-    _print_text(late)
+    miss = e.PrefetchMiss(1, 2, 3, 0xAB, 77, "planning", 4, "0_0.pcd", "points")
+    _print_text(miss)
     said = " ".join(capsys.readouterr().out.split())
     assert said.endswith("miss planning, pid 77 had to wait for 4 cells, such as 0_0.pcd points")
-    _print_json(late)
-    told = json.loads(capsys.readouterr().out)
-    assert (told["event"], told["session"], told["cells"]) == ("prefetch_miss", "00000000000000ab", 4)
+    _print_json(miss)
+    document = json.loads(capsys.readouterr().out)
+    assert (document["event"], document["session"], document["cells"]) == (
+        "prefetch_miss",
+        "00000000000000ab",
+        4,
+    )
 
 
 @pytest.mark.parametrize("ahead", [False, True])
@@ -57,13 +61,13 @@ def test_cells_that_were_fetched_ahead(capsys: pytest.CaptureFixture[str], ahead
     assert json.loads(capsys.readouterr().out)["ahead"] is ahead
 
 
-def test_that_they_change_is_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_changes_of_live_maps_are_printed_only_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     changed = e.LiveChanged(1, 2, 3, "lidar", 77)
     _print_text(changed)
     assert capsys.readouterr().out == ""
     _print_json(changed)
-    told = json.loads(capsys.readouterr().out)
-    assert (told["event"], told["map"], told["change"]) == ("live_changed", "lidar", 77)
+    document = json.loads(capsys.readouterr().out)
+    assert (document["event"], document["map"], document["change"]) == ("live_changed", "lidar", 77)
 
 
 FULL = "the budget of 1.0 MiB is in use"
@@ -72,7 +76,7 @@ NDT = Holder(0xAB, 42, 1000, "ndt", 900 << 10, 30, "python3")
 
 ASKER = Holder(0xCD, 43, 1000, "shmmap", 0, 0, "shmmap")
 
-STRANGER = Holder(0, 0, -1, "unknown", 2048, 1)
+UNKNOWN = Holder(0, 0, -1, "unknown", 2048, 1)
 
 
 def refused(name: str, *holders: Holder, message: str = FULL) -> CellError:
@@ -81,7 +85,7 @@ def refused(name: str, *holders: Holder, message: str = FULL) -> CellError:
 
 
 def test_one_line_a_cause_and_each_holder_once() -> None:
-    failed: list[CellError] = [refused(f"{x}_0.pcd", NDT, ASKER, STRANGER) for x in range(36)]
+    failed: list[CellError] = [refused(f"{x}_0.pcd", NDT, ASKER, UNKNOWN) for x in range(36)]
     failed.append(LoadFailed("/map/bad.pcd (points): cut off", cell_id="/map/bad.pcd", layer="points"))
     assert failure_lines(failed) == [
         f"failed: 36 cells (points): {FULL} [over_budget]: 0_0.pcd, 1_0.pcd, 2_0.pcd, ...",
@@ -91,13 +95,13 @@ def test_one_line_a_cause_and_each_holder_once() -> None:
     ]
 
 
-def test_a_path_is_told_once() -> None:
+def test_a_path_is_printed_once() -> None:
     message = "/map/bad.pcd (points): /map/bad.pcd: cut off"
     failed = LoadFailed(message, cell_id="/map/bad.pcd", layer="points")
     assert failure_lines([failed]) == ["failed: /map/bad.pcd (points): cut off [load_failed]"]
 
 
-def test_who_asks_is_no_holder_of_nothing() -> None:
+def test_a_client_that_holds_nothing_is_not_listed() -> None:
     assert failure_lines([refused("a.pcd", ASKER)]) == [f"failed: /map/a.pcd (points): {FULL} [over_budget]"]
 
 

@@ -50,7 +50,7 @@ def test_a_stage_in_a_pipe_ends_with_all_of_it() -> None:
     ]
 
 
-def test_few_points_are_told_one_by_one() -> None:
+def test_few_points_are_counted_one_by_one() -> None:
     progress = StageProgress(io.StringIO())
     progress.stage("merging", 20_000)
     progress.advance(5_000)

@@ -52,12 +52,12 @@ def test_a_damaged_map_is_checked_and_repaired(directory: Path, capsys: Captured
     assert "hint: --repair" in said.err
     assert contents(directory) == before
     assert main(["live", "fsck", "--repair", "--json", str(directory)]) == 65
-    (told,) = json.loads(capsys.readouterr().out)["damaged"]
-    assert told["file"] == path.name
-    assert told["kept_as"] == f"{path.name}.damaged.1"
-    assert (directory / told["kept_as"]).read_bytes() == before[path.name]
+    (damaged,) = json.loads(capsys.readouterr().out)["damaged"]
+    assert damaged["file"] == path.name
+    assert damaged["kept_as"] == f"{path.name}.damaged.1"
+    assert (directory / damaged["kept_as"]).read_bytes() == before[path.name]
     assert main(["live", "fsck", str(directory)]) == 0
-    assert told["kept_as"] in capsys.readouterr().out
+    assert damaged["kept_as"] in capsys.readouterr().out
 
 
 def test_a_missing_chunk(directory: Path, capsys: Captured) -> None:
@@ -67,7 +67,7 @@ def test_a_missing_chunk(directory: Path, capsys: Captured) -> None:
     assert f"missing: chunk {path.name.removesuffix('.chunk')}: " in capsys.readouterr().out
 
 
-def test_while_somebody_works_with_it(directory: Path, capsys: Captured, tmp_path: Path) -> None:
+def test_while_another_process_works_with_it(directory: Path, capsys: Captured, tmp_path: Path) -> None:
     folder = Folder(directory)
     assert main(["live", "fsck", str(directory)]) == 75
     assert "--read-only" in capsys.readouterr().err
@@ -93,7 +93,7 @@ def test_no_live_map(tmp_path: Path, capsys: Captured, words: list[str]) -> None
     assert contents(tmp_path) == {"mine": b"mine"}
 
 
-def test_a_map_of_which_nobody_knows_what_it_is(directory: Path, capsys: Captured) -> None:
+def test_a_map_whose_record_is_unreadable(directory: Path, capsys: Captured) -> None:
     (directory / "map.json").write_bytes(b"{")
     before = contents(directory)
     assert main(["live", "fsck", "--repair", str(directory)]) == 65
@@ -154,8 +154,8 @@ def test_resets(directory: Path, capsys: Captured) -> None:
     assert "hint: --yes" in said
     assert contents(directory) == before
     assert main(["live", "reset", str(directory), "--yes", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told == {
+    document = json.loads(capsys.readouterr().out)
+    assert document == {
         "path": str(directory), "moved_to": str(directory / "reset.1"), "files": len(before),
         "bytes": sum(map(len, before.values())),
     }  # fmt: skip

@@ -129,7 +129,7 @@ def test_nothing_is_held(memory: ChunkMemory, directory: Path) -> None:
 
 
 def test_what_is_given_up_is_not_served_from_a_copy(memory: ChunkMemory, directory: Path) -> None:
-    """Another chunk may have its key by then: who has a copy asks which one."""
+    """Another chunk may have its key by then: a reader with a copy asks which one."""
     written = made(memory, 100)
     rows = {KEY: info(7)}
     one = reader(directory, rows)
@@ -341,7 +341,7 @@ def test_one_that_says_it_is_longer_than_chunks_are(memory: ChunkMemory, directo
 
 
 def test_another_generation_is_read_instead(memory: ChunkMemory, directory: Path) -> None:
-    """Also where the old one still says that it is in service: its names were removed by somebody."""
+    """Also where the old one still says that it is in service: another process removed its names."""
     old = made(memory, 100)
     rows = {KEY: info(7)}
     one = reader(directory, rows)

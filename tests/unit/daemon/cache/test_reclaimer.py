@@ -118,7 +118,7 @@ def test_a_large_segment_s_memory_counts_until_it_is_free(
     assert os.listdir(memory.directory.path) == []
     assert (ledger.used_bytes, ledger.freeing_bytes, ledger.coming_bytes) == (LARGE, LARGE, LARGE)
     assert memory.reclaimer.collect() == 0
-    assert memory.evictor.free(LARGE, NOW_S), "it is on its way"
+    assert memory.evictor.free(LARGE, NOW_S), "it will come"
     may_close.set()
     assert memory.wait_for_the_thread() == LARGE
     assert (ledger.used_bytes, ledger.freeing_bytes, ledger.retired_bytes) == (0, 0, 0)
@@ -190,7 +190,7 @@ def test_nothing_is_freed_before_its_tick_is_over(memory: Memory) -> None:
 
 
 def test_room_is_made_by_a_few_looks_a_turn(memory: Memory) -> None:
-    """Past whatever is mapped, needed or was just handed out, which is not looked at again and again."""
+    """Past whatever is mapped, needed or was just handed out, which is not looked at each time."""
     memory.ledger.budget_bytes = 0
     used = memory.publish(2 * WORK_PER_TURN)
     mapped = [memory.map(resident) for resident in used]

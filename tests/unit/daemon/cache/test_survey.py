@@ -27,7 +27,7 @@ def resident(number: int) -> Resident:
 
 
 class Memory:
-    """Segments and who maps them; stands for `Holders`."""
+    """Segments and their holders; stands for `Holders`."""
 
     def __init__(self, count: int = SEGMENTS) -> None:
         self.those = [resident(number) for number in range(count)]
@@ -88,7 +88,7 @@ def test_the_gauges_follow_one_walk_behind() -> None:
 def test_the_result_is_of_a_walk_that_began_afterwards(count: int) -> None:
     memory = Memory(count)
     survey = survey_of(memory, superseded=frozenset({"3"}))
-    survey.step()  # a walk is under way
+    survey.step()  # a walk runs
     memory.users = {"47": [7], "3": [7, UNKNOWN_SLOT]}
     results: list[Usage] = []
     assert survey.next_s == float("inf")

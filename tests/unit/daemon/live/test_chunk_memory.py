@@ -56,7 +56,7 @@ def memory(directory: Path) -> Iterator[ChunkMemory]:
 
 
 def fill(chunk: ChunkFile, bricks: int) -> None:
-    """So many bricks, each with its number in all voxels."""
+    """Fill ``bricks`` bricks, each with its number in all voxels."""
     view = chunk.grow(bricks)
     for number in range(bricks):
         view.bricks[number] = number + 1
@@ -84,7 +84,7 @@ def test_a_chunk_is_made_grows_and_is_found_again(memory: ChunkMemory, directory
 def test_what_is_given_up_is_free_at_once_whatever_others_have_of_it(
     memory: ChunkMemory, directory: Path
 ) -> None:
-    """Open, mapped, or looked at: its memory is free, and who looks gets a signal, not a zero."""
+    """Open, mapped, or looked at: its memory is free, and a reader gets a signal, not a zero."""
     chunk = memory.create(new_header(IDENTITY))
     fill(chunk, BRICKS)
     program = f"""
@@ -235,7 +235,7 @@ def test_a_record_is_kept_while_there_are_chunks(memory: ChunkMemory, directory:
 def test_a_record_that_others_could_write_is_refused(
     memory: ChunkMemory, directory: Path, tmp_path: Path, kind: str
 ) -> None:
-    """Who could write it would write chunks."""
+    """An account that could write it could change chunks."""
     path = directory / f"{PREFIX[1:]}undo"
     if kind == "pipe":
         os.mkfifo(path)

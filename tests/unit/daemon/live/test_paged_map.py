@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map with little memory equals an unbounded one, and whoever kills its writer loses nothing of it."""
+"""A live map with little memory equals an unbounded one, and a killed writer loses nothing of it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def run(
 
 
 def said(lines: str, word: str) -> list[int]:
-    """Numbers of the scans of which somebody said that they are applied, or durable."""
+    """Numbers of the scans that were reported as applied, or as durable."""
     return [int(line.split()[1]) for line in lines.splitlines() if line.startswith(word + " ")]
 
 
@@ -135,7 +135,7 @@ def test_a_writer_that_is_killed_at_any_time_loses_nothing(
 def test_what_was_all_but_given_up_comes_back_from_disk(
     monkeypatch: pytest.MonkeyPatch, shm: Path, tmp_path: Path, reference: dict[Voxel, int]
 ) -> None:
-    """Out of service, and its name still there: nobody is to have that; and what cannot be opened stays."""
+    """Out of service, its name still there: no reader may have it; and what cannot be opened stays."""
     run(shm, tmp_path, 1)
     name = max(shm.glob("shmmap-live.*_*"))
     made, folder = opened(shm, tmp_path, 10**9)

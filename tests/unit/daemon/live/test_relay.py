@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests go to the worker and answers come back, whatever becomes of the worker and of who asked."""
+"""Requests go to the worker and answers come back, whatever becomes of the worker and of the client."""
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -63,16 +63,16 @@ class World:
         self.workers: list[socket.socket] = []
         self.watched = WatchedDescriptors()
         self.buffer = packet_buffer()
+        self.wait: Callable[[float], None] = self.pass_time
         monkeypatch.setattr(relay, "start_child", self._start)
         monkeypatch.setattr(relay, "time", SimpleNamespace(monotonic=lambda: self.now_s))
-        self.statistics: list[tuple[str, int]] = []
-        shown = SimpleNamespace(
-            set=lambda name, value: self.statistics.append((name, value)),
-            show_live_maps=lambda _rows: None,
-            beat=lambda: None,
-        )
+        shown = SimpleNamespace(set=lambda *_: None, show_live_maps=lambda _: None, beat=lambda: None)
         events = LiveEvents(EventLog(1), cast("StatisticsWriter", shown))
         self.relay = LiveRelay(BEGIN, self.watched, lambda peer, _now_s: peer.pid != 2, events)
+        monkeypatch.setattr(self.relay, "_wait", lambda seconds: self.wait(seconds))
+
+    def pass_time(self, seconds: float) -> None:
+        self.now_s += seconds
 
     def _start(self, *_: object, **__: object) -> tuple[Any, socket.socket]:
         ours, theirs = channel()
@@ -83,10 +83,10 @@ class World:
     def started(self) -> None:
         """Another worker that has all maps in memory."""
         self.relay.start()
-        assert isinstance(self.heard()[0], messages.Begin)
+        assert isinstance(self.received()[0], messages.Begin)
         self.say(messages.Begun(1, 0))
 
-    def heard(self) -> list[Any]:
+    def received(self) -> list[Any]:
         """Messages that the worker received."""
         found: list[Any] = []
         while True:
@@ -135,13 +135,13 @@ def test_each_gets_its_own_answer(world: World) -> None:
     a, b = Asker(1), Asker(2)
     world.ask(a, 11)
     world.ask(b, 22)
-    first, second = world.heard()
+    first, second = world.received()
     assert (first.session, first.uid, first.maps, first.body) == (1, 1000, True, b"11")
     assert (second.session, second.maps) == (2, False), "that one may not map"
     world.say(messages.Reply(second.ticket, b"for b"))
     world.say(messages.Reply(first.ticket, b"for a"))
     world.say(messages.Reply(first.ticket, b"again"))
-    world.say(messages.Reply(999, b"for nobody"))
+    world.say(messages.Reply(999, b"for no client"))
     assert (a.answered, b.answered) == ([b"for a"], [b"for b"])
     assert len(world.relay._tickets) == 0
 
@@ -149,10 +149,10 @@ def test_each_gets_its_own_answer(world: World) -> None:
 def test_a_session_that_has_ended_is_answered_nothing(world: World) -> None:
     a, silent = Asker(1), Asker(3)
     world.ask(a)
-    (asked,) = world.heard()
+    (asked,) = world.received()
     world.relay.on_disconnect(a)  # type: ignore[arg-type]
     world.relay.on_disconnect(silent)  # type: ignore[arg-type]
-    assert world.heard() == [messages.Disconnected(1)], (
+    assert world.received() == [messages.Disconnected(1)], (
         "of one that asked for nothing the worker knows nothing"
     )
     world.say(messages.Reply(asked.ticket, b"x"))
@@ -164,7 +164,7 @@ def test_a_request_that_is_too_long(world: World) -> None:
     message, asker = LiveMove(1, "lidar", (0.0, 0.0, 0.0)), Asker(1)
     with pytest.raises(BadRequest, match="at most"):
         world.relay.ask(asker, message, bytes(MAX_BYTES + 1), 0.0)  # type: ignore[arg-type]
-    assert world.heard() == []
+    assert world.received() == []
 
 
 def test_a_worker_that_reads_nothing_costs_little(world: World) -> None:
@@ -182,10 +182,10 @@ def test_a_worker_that_reads_nothing_costs_little(world: World) -> None:
     assert len(world.relay._unsent) <= MAX_UNSENT + 1
     asked = 0
     while world.relay._unsent:
-        asked += len(world.heard())
+        asked += len(world.received())
         world.relay.on_readable()
-    asked += len(world.heard())
-    assert asked > MAX_UNSENT, "what was taken is passed on when it hears again"
+    asked += len(world.received())
+    assert asked > MAX_UNSENT, "what was taken is passed on when it reads again"
     world.ask(Asker(5))
 
 
@@ -202,7 +202,7 @@ def test_requests_are_refused_when_the_worker_dies(world: World) -> None:
     world.relay.on_disconnect(a)  # type: ignore[arg-type]
     world.started()
     world.ask(b, 23)
-    assert [message.body for message in world.heard()] == [b"23"]
+    assert [message.body for message in world.received()] == [b"23"]
 
 
 def test_one_that_dies_again_and_again_is_not_started_all_the_time(world: World) -> None:
@@ -240,15 +240,8 @@ def test_settings_refuse_the_start_where_there_is_nothing_else_to_serve(
         starting.relay.wait_until_serving(60.0, alone=True)
 
 
-def test_a_worker_that_says_nothing_keeps_nobody_waiting(
-    starting: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_says_nothing_keeps_nobody_waiting(starting: World) -> None:
     """Points are served; each map is shown with the problem, and clients are asked to come again."""
-
-    def wait(seconds: float) -> None:
-        starting.now_s += seconds
-
-    monkeypatch.setattr(starting.relay, "_wait", wait)
     starting.relay.start()
     starting.relay.wait_until_serving(2.0, alone=False)
     asker = Asker(1)
@@ -288,20 +281,15 @@ def test_the_end(world: World, caplog: pytest.LogCaptureFixture, unsaved: int) -
     world.workers[-1].send(messages.encode(messages.Ended(left)))
     world.workers[-1].shutdown(socket.SHUT_WR)
     world.relay.close(keep=False)
-    assert world.heard() == [messages.End(False)]
+    assert world.received() == [messages.End(False)]
     assert ("stay in memory for the next start map=lidar chunks=3" in caplog.text) == (unsaved > 0)
     assert ("No space left" in caplog.text) == (unsaved > 0)
     assert world.relay.unsaved == ({"lidar": 3} if unsaved else {})
     world.relay.close(keep=False)
 
 
-def test_a_worker_that_does_not_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_does_not_end(world: World) -> None:
     """It is ended; what it had not saved by its last word counts as not saved."""
-
-    def wait(seconds: float) -> None:
-        world.now_s += seconds
-
-    monkeypatch.setattr(world.relay, "_wait", wait)
     row = msgspec.structs.replace(messages.not_served(BEGIN.maps[0], 1, ""), dirty=4, saving=1)
     world.say(messages.Status((row,)))
     world.relay.close(keep=False)
@@ -309,22 +297,20 @@ def test_a_worker_that_does_not_end(world: World, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("started", [False, True], ids=["none", "starting"])
-def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(
-    world: World, monkeypatch: pytest.MonkeyPatch, started: bool
-) -> None:
+def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(world: World, started: bool) -> None:
     world.die()
     if started:
         world.relay.start()
 
     def wait(_seconds: float) -> None:
-        heard = world.heard()
-        if isinstance(heard[0], messages.Begin):
+        received = world.received()
+        if isinstance(received[0], messages.Begin):
             world.workers[-1].send(messages.encode(messages.Begun(1, 5)))
         else:
-            assert heard == [messages.End(False)]
+            assert received == [messages.End(False)]
             world.workers[-1].send(messages.encode(messages.Ended(())))
 
-    monkeypatch.setattr(world.relay, "_wait", wait)
+    world.wait = wait
     world.relay.close(keep=False)
     assert len(world.workers) == 2
     assert world.relay.unsaved == {}
@@ -332,16 +318,16 @@ def test_chunks_of_a_worker_that_ended_are_saved_by_the_next(
 
 @pytest.mark.parametrize("dies", [False, True], ids=["hangs", "dies"])
 def test_memory_stays_where_no_worker_starts_to_save_it(
-    world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, dies: bool
+    world: World, caplog: pytest.LogCaptureFixture, dies: bool
 ) -> None:
     world.die()
 
     def wait(seconds: float) -> None:
         if dies:
             world.workers[-1].close()
-        world.now_s += seconds
+        world.pass_time(seconds)
 
-    monkeypatch.setattr(world.relay, "_wait", wait)
+    world.wait = wait
     begin_s = world.now_s
     world.relay.close(keep=False)
     assert len(world.workers) == 2
@@ -356,17 +342,15 @@ def test_memory_that_is_kept_needs_no_worker(world: World) -> None:
 
 
 def test_a_turn_of_the_loop_takes_a_bounded_number_of_messages(world: World) -> None:
-    """Whatever the worker has to say, clients are heard in between."""
-    worker = world.workers[0]
-    for number in range(relay.MESSAGES_PER_TURN + 3):
-        worker.send(messages.encode(messages.Reply(10_000 + number, b"")))
-    taken: list[object] = []
-    hear = world.relay._take
-    world.relay._take = lambda message: (taken.append(message), hear(message))[1]  # type: ignore[method-assign,func-returns-value]
-    world.relay.on_readable()
-    assert len(taken) == relay.MESSAGES_PER_TURN
-    world.relay.on_readable()
-    assert len(taken) == relay.MESSAGES_PER_TURN + 3
+    """Whatever the worker has to say, clients are served in between."""
+    askers = [Asker(slot) for slot in range(1, relay.MESSAGES_PER_TURN + 4)]
+    for asker in askers:
+        world.ask(asker)
+    for asked in world.received():
+        world.workers[0].send(messages.encode(messages.Reply(asked.ticket, b"x")))
+    for most in (relay.MESSAGES_PER_TURN, len(askers)):
+        world.relay.on_readable()
+        assert sum(len(asker.answered) for asker in askers) == most
 
 
 def test_very_many_that_wait_are_refused_some_at_a_time(world: World) -> None:
@@ -394,7 +378,7 @@ def test_waiting_requests_are_bounded_by_session_by_process_and_in_all(world: Wo
         for asker in askers:
             for number in range(most):
                 world.ask(asker, number)
-                asked.extend(world.heard())
+                asked.extend(world.received())
 
     one = Asker(1)
     ask(one)

@@ -27,7 +27,7 @@ from shmmap.segment.version import Source
 from tests.support.divided_map import random_points, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 
 
 class Store(Files):
@@ -77,7 +77,7 @@ class Loader:
     def __init__(self, path: Path) -> None:
         self.store, self.path = Store(path), path
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.channel.settimeout(PATIENCE_S)
+        self.channel.settimeout(TIMEOUT_S)
         worker = _Worker(theirs, ShmDirectory("/dev/shm"), None, self.store, _light=True)
 
         def run() -> None:
@@ -103,7 +103,7 @@ class Loader:
 
     def end(self) -> None:
         self.channel.close()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(TIMEOUT_S)
         os.close(self.store.fd)
 
 
@@ -118,7 +118,7 @@ def loader(tmp_path: Path) -> Iterator[Loader]:
 def test_all_are_fetched_at_once_and_done_as_they_come(loader: Loader) -> None:
     for number in (1, 2, 3):
         loader.give(number)
-    assert [loader.store.begun.get(timeout=PATIENCE_S) for _ in range(3)] == [1, 2, 3]
+    assert [loader.store.begun.get(timeout=TIMEOUT_S) for _ in range(3)] == [1, 2, 3]
     for number in (3, 1, 2):
         loader.store.come(number)
         begun, done = loader.said(), loader.said()
@@ -129,9 +129,9 @@ def test_all_are_fetched_at_once_and_done_as_they_come(loader: Loader) -> None:
 
 def test_another_job_is_fetched_while_one_waits(loader: Loader) -> None:
     loader.give(1)
-    assert loader.store.begun.get(timeout=PATIENCE_S) == 1
+    assert loader.store.begun.get(timeout=TIMEOUT_S) == 1
     loader.give(2, "voxel(leaf=1.0)")
-    assert loader.store.begun.get(timeout=PATIENCE_S) == 2
+    assert loader.store.begun.get(timeout=TIMEOUT_S) == 2
     loader.store.come(2)
     assert loader.said() == Begun(2)
     assert isinstance(loader.said(), Done)

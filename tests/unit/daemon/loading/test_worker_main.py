@@ -30,7 +30,7 @@ from tests.support.daemon_process import until, wait_ended, wait_readable
 from tests.support.divided_map import random_points, write_ascii, write_pcd
 
 BOX = (0.0, 0.0, 20.0, 20.0)
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
 DAEMON = """
 import os, subprocess, sys
@@ -49,7 +49,7 @@ class Parent:
     def __init__(self, shm_dir: str, memory_bytes: int = 2 << 30, **environment: str) -> None:
         self.shm_dir = shm_dir
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.channel.settimeout(PATIENCE_S)
+        self.channel.settimeout(TIMEOUT_S)
         self.process = subprocess.Popen(
             [*COMMAND, str(theirs.fileno()), str(os.getpid())],
             pass_fds=(theirs.fileno(),),
@@ -73,7 +73,7 @@ class Parent:
         """Close its channel, wait for its end."""
         self.channel.close()
         try:
-            return self.process.wait(PATIENCE_S)
+            return self.process.wait(TIMEOUT_S)
         finally:
             self.process.kill()
             self.process.wait()
@@ -85,7 +85,7 @@ class Loader:
     def __init__(self, parent: Parent) -> None:
         self.shm_dir, self.segments = parent.shm_dir, dict[int, int]()
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.channel.settimeout(PATIENCE_S)
+        self.channel.settimeout(TIMEOUT_S)
         with theirs:
             socket.send_fds(parent.channel, [b"loader"], [theirs.fileno()])
         ready, self.pidfd = self.receive()
@@ -292,7 +292,7 @@ def test_a_cell_that_takes_too_much_memory_fails_alone(shm_dir: str, tmp_path: P
 def test_loaders_die_with_their_parent_and_it_with_the_daemon(shm_dir: str) -> None:
     """Killed, they close nothing; and our end of the loader's channel is still open."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.settimeout(PATIENCE_S)
+    ours.settimeout(TIMEOUT_S)
     daemon = subprocess.Popen(
         [sys.executable, "-c", DAEMON, sys.executable, str(theirs.fileno())],
         pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, text=True, env=ENVIRONMENT,
@@ -305,14 +305,14 @@ def test_loaders_die_with_their_parent_and_it_with_the_daemon(shm_dir: str) -> N
         assert ours.recv(100).decode() == shmmap.__version__
         mine, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with mine, its:
-            mine.settimeout(PATIENCE_S)
+            mine.settimeout(TIMEOUT_S)
             socket.send_fds(ours, [b"loader"], [its.fileno()])
             ready = worker_messages.decode_from_worker(mine.recv(1000))
             assert isinstance(ready, worker_messages.Ready)
             daemon.kill()
             daemon.wait()
-            assert wait_ended(parent, PATIENCE_S)
-            assert wait_ended(ready.pid, PATIENCE_S)
+            assert wait_ended(parent, TIMEOUT_S)
+            assert wait_ended(ready.pid, TIMEOUT_S)
     finally:
         daemon.kill()
         daemon.wait()
@@ -369,7 +369,7 @@ def test_the_first_parent_is_a_fork_of_the_daemon(shm_dir: str) -> None:
         assert (os.getsid(parent), os.readlink(f"/proc/{parent}/cwd")) == (parent, "/")
         assert private_bytes(parent) < 60 << 20
         daemon.kill()
-    assert wait_ended(parent, PATIENCE_S)
+    assert wait_ended(parent, TIMEOUT_S)
 
 
 def test_a_parent_that_started_too_late_ends_at_once() -> None:
@@ -431,9 +431,9 @@ def test_how_a_loader_ended_is_reported_after_all_that_it_sent(parent: Parent, t
     """No other process holds its channel: neither loaders forked before it, nor those after it."""
     before, one, after = parent.fork(), parent.fork(), parent.fork()
     one.load(1, cell(tmp_path / "a.pcd", 10))
-    assert wait_readable([one.channel.fileno()], PATIENCE_S)
+    assert wait_readable([one.channel.fileno()], TIMEOUT_S)
     signal.pidfd_send_signal(one.pidfd, signal.SIGKILL)
-    assert wait_readable([one.pidfd], PATIENCE_S)
+    assert wait_readable([one.pidfd], TIMEOUT_S)
     one.done()
     assert one.ended() == -signal.SIGKILL
     one.close()
@@ -450,7 +450,7 @@ def test_a_loader_that_cannot_be_watched_is_none(parent: Parent) -> None:
     free = min(set(range(64)) - set(parent.descriptors()))
     resource.prlimit(pid, resource.RLIMIT_NOFILE, (free + 1, limits[1]))  # only one more: the channel
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.settimeout(PATIENCE_S)
+    ours.settimeout(TIMEOUT_S)
     with ours:
         with theirs:
             socket.send_fds(parent.channel, [b"loader"], [theirs.fileno()])

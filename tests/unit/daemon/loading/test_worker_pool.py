@@ -170,7 +170,7 @@ def test_a_loader_that_computes_does_not_hinder_points(
     one.run_until(lambda: [worker.layers for worker in one.pool] == [1])
     one.ask(quick, Selected(2, ("20_20.pcd",), wait=900.0))
     assert names(one.cells_of(2)) == ["20_20.pcd"]
-    assert [key.layer for key in one.ended] == ["points"]
+    assert {key.layer for key in one.ledger.by_key} == {"points"}
     one.run_until(lambda: all(worker.ready for worker in one.pool))
     one.offset_s += 301.0
     assert [failure.code for failure in one.cells_of(1).failed] == ["load_timeout"]
@@ -181,7 +181,7 @@ def test_a_dead_loader_gets_no_job(inner: Inner, small_map: DividedMap) -> None:
     one = inner(small_map.root)
     one.everything()
     (worker,) = one.pool
-    stop(one.parent.pid)
+    stop(one.pool.parent.pid)
     os.kill(worker.pid, signal.SIGKILL)
     assert wait_ended(worker.pid)
     small_map.change("0_0.pcd", 7)
@@ -191,14 +191,14 @@ def test_a_dead_loader_gets_no_job(inner: Inner, small_map: DividedMap) -> None:
         one.turn()
     assert list(one.pool) == [worker]
     assert not worker.queue
-    os.kill(one.parent.pid, signal.SIGCONT)
+    os.kill(one.pool.parent.pid, signal.SIGCONT)
     assert names(one.cells_of(2)) == ["0_0.pcd"]
 
 
-def test_a_parent_that_vanishes_again_and_again(
+def test_a_parent_that_vanishes_repeatedly(
     inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The cause is unknown; the load that was under way each time is given up at last."""
+    """The cause is unknown; the load that ran each time is given up at last."""
     monkeypatch.setenv("SHMMAP_TEST_WORKER", "hang:0_0.pcd")
     one = inner(small_map.root)
     wanted = ("0_0.pcd", "20_20.pcd")
@@ -206,7 +206,7 @@ def test_a_parent_that_vanishes_again_and_again(
     for _ in range(3):
         one.run_until(lambda: [worker.ready and len(worker.queue) for worker in one.pool] == [2])
         (worker,) = one.pool
-        os.kill(one.parent.pid, signal.SIGKILL)
+        os.kill(one.pool.parent.pid, signal.SIGKILL)
         one.run_until(lambda gone=worker: gone not in list(one.pool))  # type: ignore[misc]
         assert wait_ended(worker.pid)
     reply: Any = one.cells_of(1)

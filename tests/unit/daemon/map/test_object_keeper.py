@@ -17,7 +17,7 @@ from shmmap.errors import Offline
 from shmmap.origin.remote.object_tier import KeptObjects, ObjectCounts, ObjectTier
 from shmmap.origin.remote.published_object import ObjectName, blob_path
 
-PATIENCE_MS = 60_000
+TIMEOUT_MS = 60_000
 OBJECTS = [random.Random(number).randbytes(5_000 + number) for number in range(20)]
 
 
@@ -63,7 +63,7 @@ class Keeper:
         found: list[Kept] = []
         poll.register(self.keeper.fd, select.POLLIN)
         while len(found) < count:
-            assert poll.poll(PATIENCE_MS)
+            assert poll.poll(TIMEOUT_MS)
             found += self.keeper.take()
         return found
 
@@ -114,7 +114,7 @@ def test_a_disk_without_room_is_said(tmp_path: Path) -> None:
     assert small.keeper.close()
 
 
-def test_without_a_thread_nothing_stays_under_way(one: Keeper, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_thread_nothing_stays_pending(one: Keeper, monkeypatch: pytest.MonkeyPatch) -> None:
     """The system allows no more of them for a while."""
 
     def refuse(_: threading.Thread) -> None:

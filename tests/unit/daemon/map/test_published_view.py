@@ -43,7 +43,7 @@ from shmmap.publishing.shards import CellObjects, divide_into_shards
 
 VOXELS = "voxel(leaf=1.0)"
 OURS = layer_spec(VOXELS).builder_version
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 SIDE = 100.0
 Cells = dict[str, tuple[tuple[float, float, float, float], bytes]]
 """By name: box, and content of the points, 32 bytes."""
@@ -63,7 +63,7 @@ class MemoryStore:
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
         self.asked.append(path)
-        assert self.open.wait(PATIENCE_S)
+        assert self.open.wait(TIMEOUT_S)
         if self.is_out:
             raise Offline("no answer")
         data = self.objects[path]
@@ -163,7 +163,7 @@ def served() -> Iterator[Served]:
 
 def collect(pages: ShardPages) -> tuple[list[int], list[int]]:
     """Wait for news."""
-    assert select.select([pages.fd], [], [], PATIENCE_S)[0], "nothing has come"
+    assert select.select([pages.fd], [], [], TIMEOUT_S)[0], "nothing has come"
     news = pages.collect()
     return list(news.come), list(news.out_of_reach)
 

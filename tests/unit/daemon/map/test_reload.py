@@ -122,14 +122,14 @@ def test_a_directory_that_may_not_be_watched_ends_nothing(watch: FileWatch, tmp_
 
 
 def test_a_directory_that_is_replaced_is_followed(tmp_path: Path) -> None:
-    """Moved aside, it is of no interest any more; what takes its place is, however late it comes."""
-    place, aside = tmp_path / "map", tmp_path / "aside"
+    """Moved away, it no longer counts; what takes its place does, however late it comes."""
+    place, elsewhere = tmp_path / "map", tmp_path / "elsewhere"
     place.mkdir()
     watch = FileWatch([str(place)])
-    place.rename(aside)
+    place.rename(elsewhere)
     watch.drain(10.0)
     assert watch.due(11.0)
-    (aside / "a.pcd").write_bytes(b"a")
+    (elsewhere / "a.pcd").write_bytes(b"a")
     watch.drain(12.0)
     assert not watch.due(13.0)
     place.mkdir()
@@ -193,7 +193,7 @@ def collect(reloader: Reloader) -> None:
     reloader.collect(lambda found: found, lambda _: None)
 
 
-def test_who_asks_meanwhile_gets_the_next_one(reloader: Reloader) -> None:
+def test_a_request_meanwhile_gets_the_next_one(reloader: Reloader) -> None:
     answers: list[tuple[str, Result]] = []
     for name in "abc":
         reloader.ask(lambda result, name=name: answers.append((name, result)))  # type: ignore[misc]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who uses a segment, by each source; and which closes are reported."""
+"""Which processes use a segment, by each source; and which closes are reported."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_one_close_of_a_segment_in_service_is_reported(directory: ShmDirectory) 
 
 
 def test_our_own_look_is_no_close(directory: ShmDirectory) -> None:
-    """Else a load that waits for room would find some again and again, as long as it looks for it."""
+    """Otherwise a load that waits for room would find closes as long as it looks."""
     pins = PinWatch(directory, events=True)
     first = map_segment(directory.path + NAME)
     for _ in range(3):

@@ -1,24 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests for cells: how long they wait, where they lie, what is loaded first, what stays of them."""
+"""Requests for cells: how long they wait, where they lie, what is loaded first, how much one may ask for."""
 
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
+import msgspec
 import pytest
 
-from shmmap.errors import BadRequest
+from shmmap.daemon.cache.holders import Holders
+from shmmap.daemon.records import Resident
+from shmmap.daemon.requests import cell_requests, limits
+from shmmap.daemon.transport.sessions import Session
+from shmmap.errors import BadRequest, Busy
+from shmmap.layers import versions as layer_versions
+from shmmap.protocol.codec import encode_handle, pack_versions
 from shmmap.protocol.messages import (
     Area,
     BoxMessage,
+    Cells,
     CircleMessage,
     Differential,
+    HeldCell,
     Intent,
     Selected,
 )
-from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, finish
+from shmmap.segment.pins import lock_slot
+from tests.support.divided_map import DividedMap, make_map
+from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner, InnerDaemon, finish
 
 
 @pytest.mark.parametrize("warm", [False, True])
@@ -115,10 +128,9 @@ def test_nothing_stays_of_requests_that_are_over(inner: Inner, small_map: Divide
         one.cells.on_disconnect(session)
         assert len(one.cells) == 0
     one.run_until(lambda: one.ledger.resident_count == 16)
-    assert not one.ledger._needed
-    assert one.cells.next_deadline_s() == math.inf
+    one.run_until_nothing_waits()
     assert 9 not in [reply.request for _, reply in one.replies]
-    assert sorted(one.ended) == sorted(one.ledger.by_key), "each load has ended once"
+    assert one.statistics.values["loads_finished"] == 16, "each load has ended once"
 
 
 def test_waiting_requests_are_answered_in_turn(inner: Inner, small_map: DividedMap) -> None:
@@ -129,7 +141,7 @@ def test_waiting_requests_are_answered_in_turn(inner: Inner, small_map: DividedM
     for session in sessions:
         for number in range(4):
             one.ask(session, Selected(number, ("0_0.pcd",), wait=30.0))
-    one.run_until(lambda: one.ended)
+    one.run_until(lambda: one.due)
     assert (len(one.due), one.replies) == (12, [])
     one.cells.answer_overdue(one.now_s() + 60.0)
     assert len(one.due) == 12, "each is due once"
@@ -151,3 +163,216 @@ def test_a_request_whose_time_is_up_is_answered_in_turn(inner: Inner, small_map:
     finish(one.due[0])
     ((_, reply),) = one.replies
     assert [cell.id for cell in reply.pending] == ["0_0.pcd"]
+
+
+def test_cells_of_one_request(inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = inner(small_map.root)
+    monkeypatch.setattr(limits, "MAX_CELLS", 15)
+    with pytest.raises(BadRequest, match="more than 15 cells in one request"):
+        one.ask(one.session(), Area(1, EVERYWHERE))
+    with pytest.raises(BadRequest, match="more than 15 cells"):  # known or not
+        one.ask(one.session(), Selected(2, ("nowhere",) * 16))
+    assert not one.loads.by_key
+    assert not one.ledger.by_key
+    assert one.replies == []
+
+
+def test_what_a_client_says_it_holds(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    many = limits.MAX_HELD
+    for message in (
+        Differential(1, EVERYWHERE, held=(HeldCell("a"),) * (many + 1)),
+        Differential(1, EVERYWHERE, packed=bytes(8 * (many + 1))),
+        Differential(1, EVERYWHERE, held=(HeldCell("a", 1, ("points",) * (many + 1)),)),
+        Differential(
+            1, EVERYWHERE, held=(HeldCell("a", 1, tuple(f"voxel(leaf={1 + n / 100})" for n in range(65))),)
+        ),
+    ):
+        with pytest.raises(BadRequest, match="held"):
+            one.ask(one.session(), message)
+    one.ask(one.session(), Differential(2, EVERYWHERE, packed=bytes(8 * many)))
+    assert len(one.replies) == 1
+
+
+def test_loads_that_one_process_waits_for(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asking again for the same ones is no more of them; others' loads do not count."""
+    monkeypatch.setattr(limits, "MAX_QUEUED", 5)
+    one = inner(small_map.root)
+    with one.loaders_standing_still():
+        greedy, other = one.session(), one.session()
+        one.ask(greedy, Area(1, EVERYWHERE))
+        assert len(one.cells_of(1).pending) == 16
+        one.ask(greedy, Area(2, EVERYWHERE))
+        assert len(one.cells_of(2).pending) == 16
+        with pytest.raises(Busy, match="5 loads"):
+            one.ask(greedy, Area(3, EVERYWHERE, ("voxel(leaf=1.0)",)))
+        one.ask(other, Area(4, EVERYWHERE, ("voxel(leaf=1.0)",)))
+        assert len(one.cells_of(4).pending) == 16
+    one.run_until(lambda: not len(one.loads))
+    one.ask(greedy, Area(5, EVERYWHERE, ("voxel(leaf=2.0)",), 30.0))
+    assert len(one.cells_of(5).cells) == 16
+
+
+def test_layers(inner: Inner, small_map: DividedMap) -> None:
+    one = inner(small_map.root)
+    session = one.session()
+    with pytest.raises(BadRequest, match="17 layers in one request"):
+        one.ask(session, Area(1, EVERYWHERE, ("points",) * 17))
+
+
+def test_a_layer_that_would_look_into_too_many_cells(
+    inner: Inner, small_map: DividedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(layer_versions, "MAX_NEIGHBOURS", 5)
+    one = inner(small_map.root)
+    for message in (
+        Area(1, EVERYWHERE, ("points", "normals(radius=10)")),
+        Differential(2, EVERYWHERE, ("normals(radius=10)",)),
+        Selected(3, ("0_0.pcd",), ("denoise(halo=10)",)),
+    ):
+        with pytest.raises(BadRequest, match="would look into about 9 cells around each one"):
+            one.ask(one.session(), message)
+    assert not one.loads.by_key
+
+
+def test_intents() -> None:
+    limits.check_intent(Intent(1.0, 2.0, route=((3.0, 4.0),)))
+    for wrong in (
+        Intent(math.nan, 0.0),
+        Intent(0.0, 0.0, heading=math.inf),
+        Intent(0.0, 0.0, route=((0.0, math.nan),)),
+    ):
+        with pytest.raises(BadRequest, match="finite"):
+            limits.check_intent(wrong)
+
+
+@pytest.fixture
+def many(inner: Inner, tmp_path: Path) -> InnerDaemon:
+    """Return a daemon of 60 cells."""
+    return inner(make_map(tmp_path / "map", columns=10, rows=6, points=10).root)
+
+
+def ids(many: InnerDaemon, first: int, last: int) -> tuple[str, ...]:
+    return tuple(many.cache.catalogue.id(index) for index in range(first, last))
+
+
+def full(many: InnerDaemon, *, map_them: bool = False) -> tuple[Session, list[int]]:
+    """Return a session that was handed 50 cells, which is all that it may keep; descriptors of them."""
+    session = many.session()
+    many.ask(session, Selected(1, ids(many, 0, 50), wait=30.0))
+    cells = many.cells_of(1).cells
+    opened = [os.open(many.path_of(cell.segment), os.O_RDONLY) for cell in cells] if map_them else []
+    for fd in opened:
+        lock_slot(fd, session.slot)
+    many.cells._quota.nbytes = session.held_bytes
+    many.offset_s += 2.0
+    return session, opened
+
+
+@pytest.mark.usefixtures("short_turns")
+def test_a_few_looks_a_turn(many: InnerDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds 50 and maps none: enough of them are dropped for what it asks for now, the oldest first."""
+    looks, look = 0, Holders.has
+
+    def counted(holders: Holders, resident: Resident, slot: int) -> bool:
+        nonlocal looks
+        looks += 1
+        return look(holders, resident, slot)
+
+    monkeypatch.setattr(Holders, "has", counted)
+    session, _ = full(many)
+    before = 0
+    for _ in many.cells.selected(session, Selected(2, ids(many, 50, 60) + ids(many, 0, 8), wait=30.0)):
+        assert looks - before <= 1
+        before = looks
+    assert len(many.cells_of(2).cells) == 18
+    assert many.statistics.values["refused_quota"] == 0
+    assert 10 <= looks < 50
+    assert {r.key.cell_id for r in session.residents()} >= set(ids(many, 30, 60))
+
+
+def test_what_it_still_maps_counts(many: InnerDaemon) -> None:
+    """It is refused what is too much."""
+    session, opened = full(many, map_them=True)
+    many.ask(session, Selected(2, ids(many, 45, 60), wait=30.0))
+    reply = many.cells_of(2)
+    assert len(reply.cells) + len(reply.failed) == 15
+    assert {failure.code for failure in reply.failed} == {"over_budget"}
+    assert many.statistics.values["refused_quota"] == len(reply.failed) > 0
+    for fd in opened:
+        os.close(fd)
+    many.ask(session, Selected(4, ids(many, 50, 60), wait=30.0))
+    assert len(many.cells_of(4).cells) == 10
+
+
+HALF = BoxMessage(-1e3, -1e3, -1.0, 1e3)
+
+
+class LongWay(Exception):
+    """The request was answered with what covers everything."""
+
+
+def long_way(*_: object) -> NoReturn:
+    raise LongWay
+
+
+@pytest.fixture
+def warm(tmp_path: Path) -> Iterator[tuple[InnerDaemon, Cells]]:
+    """A daemon that has all of its map in memory, and the reply that says so."""
+    made = make_map(tmp_path / "map", columns=3, rows=2, points=20)
+    inner = InnerDaemon(str(made.root), cache_dir=str(tmp_path / "cache"))
+    yield inner, inner.everything()
+    inner.close()
+
+
+def differential(
+    inner: InnerDaemon, request: int, area: BoxMessage, versions: list[int], **more: object
+) -> Cells:
+    message = Differential(request, area, packed=pack_versions(versions), **more)  # type: ignore[arg-type]
+    inner.ask(inner.session(), message)
+    return inner.cells_of(request)
+
+
+def test_handles_are_encoded_once(warm: tuple[InnerDaemon, Cells]) -> None:
+    """Replies carry the bytes that each segment was given when it came into memory."""
+    inner, everything = warm
+    session = inner.session()
+    inner.ask(session, Differential(2, EVERYWHERE))
+    (_, first), *_ = [reply for reply in inner.replies if reply[1].request == 2]
+    residents = session.residents()
+    assert len(residents) == len(first.cells) == len(everything.cells)
+    for resident in residents:  # marked, so that it shows whose bytes they are
+        handle = next(cell for cell in first.cells if cell.version == resident.version)
+        resident.handle = encode_handle(msgspec.structs.replace(handle, points=4711))
+    for request, reply in ((3, differential(inner, 3, EVERYWHERE, [])), (4, inner.everything(4))):
+        assert {cell.points for cell in reply.cells} == {4711}, request
+
+
+def test_what_others_hold_does_not_count(
+    warm: tuple[InnerDaemon, Cells], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is in memory may come to more than one session may have: it is answered from versions, too."""
+    inner, everything = warm
+    monkeypatch.setattr(cell_requests, "difference", long_way)
+    sizes = [cell.bytes for cell in everything.cells]
+    inner.cells._quota.nbytes = sum(sizes[:2])
+    assert inner.ledger.resident_bytes > inner.cells._quota.nbytes
+    held = [cell.version for cell in everything.cells]
+    assert len(differential(inner, 2, EVERYWHERE, held[2:]).cells) == 2
+    with pytest.raises(LongWay):
+        differential(inner, 3, EVERYWHERE, held[3:])
+
+
+def test_what_another_request_got_is_not_forgotten(warm: tuple[InnerDaemon, Cells]) -> None:
+    """Two windows of one client: each says what it holds, and the session has both's until it lets go."""
+    inner, everything = warm
+    session = inner.session()
+    half = Differential(2, HALF)
+    inner.ask(session, half)
+    inner.ask(session, Differential(3, EVERYWHERE))
+    inner.ask(session, half)
+    held = {cell.version for cell in everything.cells}
+    assert session.held.keys() == held
+    assert session.held_bytes == sum(cell.bytes for cell in everything.cells)

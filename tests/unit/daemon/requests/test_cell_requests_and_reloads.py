@@ -211,7 +211,7 @@ def test_an_empty_map(inner: Inner, small_map: DividedMap) -> None:
     empty = Catalogue.from_cells([])
     one.map_switch.switch(empty, empty.changes_from(one.cache.catalogue))
     one.scheduler.map_changed()
-    assert one.everything(2) == Cells(2, 77, empty.map_version, layers=("points",))
+    assert one.everything(2) == Cells(2, one.cache.epoch, empty.map_version, layers=("points",))
     packed = b"".join(cell.version.to_bytes(8, "little") for cell in before.cells)
     one.ask(one.session(), Differential(3, EVERYWHERE, packed=packed))
     assert sorted(one.cells_of(3).removed_packed) == sorted(packed)

@@ -3,9 +3,9 @@
 
 In Autoware (``create_differential_map_load_plan``) the cells of the area are walked in id order: one
 whose id is cached is kept, any other is new; cached ids that were never matched are to be removed, in
-the order given, unknown ones included.  Ours differ in four ways, each in the oracle below: entries carry
+the order given, unknown ones included.  Ours differ in four points, each in the oracle below: entries carry
 versions (a cell held at another version is new and not removed), layers are held one by one, a
-duplicate is told once, and versions alone may stand for cells.
+duplicate is named once, and versions alone may stand for cells.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def test_packed_versions_of_broken_length(served: Served, packed: bytes) -> None
 
 
 def test_very_many_held(served: Served) -> None:
-    """100 000 held entries, all but one of them unknown: told to drop each, in their order."""
+    """100 000 held entries, all but one of them unknown: each is to be dropped, in their order."""
     rows = [HeldCell(f"gone/{number}.pcd", number + 1) for number in range(100_000)]
     rows.insert(50_000, HeldCell("0_0.pcd", served.current["0_0.pcd"]))
     index = served.names.index("0_0.pcd")

@@ -16,8 +16,6 @@ from shmmap.geometry import Area, Box, Circle
 from shmmap.origin.catalogue import Catalogue
 from shmmap.protocol.messages import Metadata, MetadataPage, area_to_message
 from shmmap.segment.layout import SourceStamp
-from tests.support.divided_map import DividedMap
-from tests.unit.daemon.inner_daemon import EVERYWHERE, Inner
 
 SIDE = 12
 
@@ -76,18 +74,3 @@ def test_all_cells_once_in_order(area: Area, limit: int, looked_at: int) -> None
     assert [row.id for page in pages for row in page.rows] == MAP.ids(MAP.query(area)[0])
     assert max(len(page.rows) for page in pages) <= limit
     assert len(pages) <= SIDE * SIDE // looked_at + SIDE * SIDE // limit + 2
-
-
-def test_an_area_s_changes(inner: Inner, small_map: DividedMap) -> None:
-    one = inner(small_map.root)
-    before = one.cache.catalogue.map_version
-    one.everything()
-    for name in ("0_0.pcd", "20_20.pcd"):
-        small_map.change(name, 7)
-    one.reload()
-    everywhere = one.queries.page(Metadata(1, EVERYWHERE, before))
-    assert [row.id for row in cast("MetadataPage", everywhere).rows] == ["0_0.pcd", "20_20.pcd"]
-    near = area_to_message(Circle(1, 1, 2))
-    assert [row.id for row in cast("MetadataPage", one.queries.page(Metadata(1, near, before))).rows] == [
-        "0_0.pcd"
-    ]

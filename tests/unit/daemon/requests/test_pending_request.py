@@ -64,12 +64,12 @@ def test_cells_that_wait_are_limited() -> None:
             waiting.add(request)
             added.append(request)
         assert not waiting.has_room(waiting_request(owner, 1.0, 1))
-    (stranger,) = sessions(1)
-    assert not waiting.has_room(waiting_request(stranger, 1.0, 1))
+    (other,) = sessions(1)
+    assert not waiting.has_room(waiting_request(other, 1.0, 1))
     added[0].found = Found()  # what it asks for has left the map meanwhile
     waiting.remove(added[0])
-    assert waiting.has_room(waiting_request(stranger, 1.0, whole))
-    assert not waiting.has_room(waiting_request(stranger, 1.0, whole + 1))
+    assert waiting.has_room(waiting_request(other, 1.0, whole))
+    assert not waiting.has_room(waiting_request(other, 1.0, whole + 1))
 
 
 def test_many_that_are_overdue_are_taken_some_at_a_time() -> None:

@@ -63,7 +63,7 @@ def test_a_change_is_written_soon_and_what_was_only_used_with_the_next_whole_bea
     assert whole == [1000.0]
     residents: list[Any] = list(one.ledger.residents())
     one.cache.hand_out(residents, now_s)
-    one.events.show(residents[0], "resident")
+    one.cache.events.show(residents[0], "resident")
     written.clear()
     beat(sampler, now_s := 1000.0 + CHANGE_BEAT_S / 2)
     assert written == []
@@ -113,7 +113,7 @@ def test_what_limits_prefetching(inner: Inner, small_map: DividedMap) -> None:
     one.ledger.prefetched_bytes = 0
     one.scheduler.prefetcher.full(1002.0)
     assert short(1002.0) == 2
-    off = inner(small_map.root, name="off")
+    off = inner(small_map.root)
     beat(sampler_of(off), 1000.0)
     assert (off.statistics.values["prefetch_budget_bytes"], off.statistics.values["prefetch_short"]) == (0, 0)
 

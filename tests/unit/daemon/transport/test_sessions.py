@@ -38,8 +38,8 @@ def test_sums_stay_right(steps: list[tuple[str, int, int]]) -> None:
     clients = [sessions.open(connections.of(), str(n), 0.0) for n in range(3)]
     segments = [resident(n, n // 2 + 1, 10**n) for n in range(8)]
     model: list[set[int]] = [set(), set(), set()]
-    for what, who, number in steps:
-        client, has, version = clients[who], model[who], number // 2 + 1
+    for what, index, number in steps:
+        client, has, version = clients[index], model[index], number // 2 + 1
         if what == "hold":
             client.hold([segments[number], segments[number]])
             has.add(number)
@@ -194,7 +194,7 @@ def test_a_route_lasts_until_the_client_says_something_else() -> None:
 
 
 @pytest.mark.parametrize("far", [1e4, 1e9, 1e308])
-def test_however_long_a_route_is_it_counts_as_so_many_places(far: float) -> None:
+def test_a_route_of_any_length_counts_as_a_bounded_number_of_places(far: float) -> None:
     """Also where it leaves the map by far."""
     sessions = Sessions()
     route = tuple((far * (1 + n % 3), far * n * (-1) ** n) for n in range(4096))

@@ -61,7 +61,7 @@ def test_frames_of_any_length(size: int) -> None:
 
 
 def test_what_the_daemon_sends() -> None:
-    """Who it is, after the greeting; and that it is there, when asked."""
+    """Its type, after the greeting; and a PONG, when asked."""
     receiver = Receiver()
     assert receiver.receive(GREETING[:-1]) == []
     assert receiver.sent == []

@@ -198,7 +198,7 @@ def test_harmless_variations_are_silent() -> None:
     assert parse(pcd(WITH, "binary").replace(b"FIELDS ", b" FIELDS\t ")).warnings == ()
 
 
-def test_duplicates_get_numbers_nobody_else_has() -> None:
+def test_duplicates_get_unused_numbers() -> None:
     names = "x y z a a a_2 _ _ a y xyz"
     kinds = {
         "SIZE": "4 " * 11,

@@ -322,7 +322,7 @@ def test_trailing_bytes_are_reported(tmp_path: Path, encoding: str) -> None:
 def test_large_claims_allocate_nothing(tmp_path: Path, encoding: str, points: int) -> None:
     change: dict[str, str | None] = {"POINTS": str(points), "WIDTH": str(points)}
     data = pcd(XYZ, encoding, change=change)
-    refused(tmp_path, data)  # once, so that what is imported and cached on the way does not count
+    refused(tmp_path, data)  # once, so that what it imports and caches does not count
     tracemalloc.start()
     refused(tmp_path, data)
     peak = tracemalloc.get_traced_memory()[1]

@@ -95,15 +95,15 @@ def test_what_cannot_be_read_is_said_and_kept(tmp_path: Path, damage: str) -> No
     wrong = damages(Path(one.path).read_bytes())[damage]
     Path(one.path).write_bytes(wrong)
     assert one.load() is None
-    (aside,) = (tmp_path / "origins").iterdir()
-    assert aside.read_bytes() == wrong
-    assert f"kept as {aside}" in one.problem
+    (kept,) = (tmp_path / "origins").iterdir()
+    assert kept.read_bytes() == wrong
+    assert f"kept as {kept}" in one.problem
     assert ("format is 2" in one.problem) == (damage == "later format")
     assert one.load() is None
     assert one.problem == "", "there is none now"
     one.save(TAKEN)
     assert one.load() == TAKEN
-    assert aside.exists()
+    assert kept.exists()
 
 
 def test_any_flipped_bit_is_noticed(tmp_path: Path) -> None:

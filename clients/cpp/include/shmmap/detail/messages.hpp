@@ -76,7 +76,7 @@ inline void write(Writer& to, const Held& held) {
 
 inline constexpr std::uint64_t protocol_major = 2, protocol_minor = 0;
 
-/// What the daemon says of itself.
+/// What the daemon says about itself.
 struct Welcome {
   std::uint64_t minor = 0, epoch = 0, session = 0;
   std::string instance, shm_dir, id_prefix, segment_prefix, frame_id, events;

@@ -51,10 +51,10 @@ class Descriptor {
 
 inline std::string error_text(int number) { return std::generic_category().message(number); }
 
-/// One connection that speaks ZMTP 3.0 with the NULL mechanism, as PROTOCOL.md has it.
+/// One connection that speaks ZMTP 3.0 with the NULL mechanism, as in PROTOCOL.md.
 class Socket {
  public:
-  static constexpr std::uint64_t most_bytes = std::uint64_t{1} << 30;  // of one message
+  static constexpr std::uint64_t max_bytes = std::uint64_t{1} << 30;  // of one message
   static constexpr std::size_t read_bytes = std::size_t{1} << 16;      // at once, at least
   static constexpr std::size_t keep_bytes = std::size_t{1} << 20;      // of room that is not needed just now
 
@@ -193,7 +193,7 @@ class Socket {
     if (input.size() < head) return false;
     std::uint64_t size = 0;
     for (const char one : input.substr(1, head - 1)) size = (size << 8) | static_cast<unsigned char>(one);
-    if ((flags & ~6U) != 0 || size > most_bytes) lost("what came is no message of a daemon");
+    if ((flags & ~6U) != 0 || size > max_bytes) lost("what came is no message of a daemon");
     if (input.size() - head < size) {
       wanted_ = head + size;
       return false;

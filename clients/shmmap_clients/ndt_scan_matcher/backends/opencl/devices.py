@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenCL devices of this machine: which there are, what they can do, which one is taken, how to wait for it.
 
-The loader of drivers reads files in /etc/OpenCL/vendors, each of which names a driver's library.  Containers
-with NVIDIA's driver often have the library without the file: then a folder with one is made for this process,
-with copies of those that are there.
+OpenCL finds drivers by files in /etc/OpenCL/vendors: each of them names a driver's library.  Containers with
+NVIDIA's driver often have the library, but not its file.  Then this process uses a folder of its own, with
+copies of all these files and one for NVIDIA's library.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _NAP_S: Final = 20e-6
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device says of itself.
+    """What a device says about itself.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class DeviceInfo:
         ``"GPU"``, ``"accelerator"``, ``"CPU"`` or ``"other"``.
     fp64
         Whether it has double precision.
-    memory_bytes, most_bytes
+    memory_bytes, max_bytes
         Its memory, and the most that one buffer may have.
     unified
         Whether that is the processor's memory, too.
@@ -86,7 +86,7 @@ class DeviceInfo:
     kind: str
     fp64: bool
     memory_bytes: int
-    most_bytes: int
+    max_bytes: int
     unified: bool
     svm_system: bool
     unusable: str
@@ -240,7 +240,7 @@ def _info(cl: Any, index: int, platform: Any, handle: Any) -> DeviceInfo:
         kind=kind,
         fp64="cl_khr_fp64" in handle.extensions.split() or bool(asked("double_fp_config", 0)),
         memory_bytes=int(handle.global_mem_size),
-        most_bytes=int(handle.max_mem_alloc_size),
+        max_bytes=int(handle.max_mem_alloc_size),
         unified=bool(asked("host_unified_memory", False)),
         svm_system=bool(svm & cl.device_svm_capabilities.FINE_GRAIN_SYSTEM) and handle.address_bits == 64,
         unusable=unusable,
@@ -283,7 +283,7 @@ def _make_drivers_known() -> None:
 class Waiting:
     """Waits for events of one device.
 
-    It sleeps for most of the time that the last wait took, then looks again and again: a wait costs the
+    It sleeps for most of the time that the last wait took, then polls: a wait costs the
     processor little, and ends microseconds after the event.
 
     Parameters
@@ -339,5 +339,5 @@ def _ended(event: Any) -> bool:
 
 
 def _never_free(event: Any) -> None:
-    """Keep an event: to free one of a hung device is to wait for it, even when the process ends."""
+    """Keep an event for good: freeing it would wait for a hung device, even when the process ends."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(event))

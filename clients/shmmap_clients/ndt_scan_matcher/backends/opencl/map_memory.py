@@ -85,7 +85,7 @@ class MapInPlace:
         self._buffer.release()
 
     def prepare(self, voxel_map: VoxelMap, covariance: Covariance) -> None:
-        """Make the tables of a map beside those of the one in use."""
+        """Make the tables of the next map; those of the map in use stay."""
         self._make(voxel_map, covariance)
 
     def use(self, voxel_map: VoxelMap, covariance: Covariance) -> PlacedMap:
@@ -279,7 +279,7 @@ class MapBuffers:
             )
             queue.flush()
             self._waiting.until(mapped)
-            memory = there.data  # numpy would take three times as long for so many small pieces
+            memory = there.data  # numpy would take three times as long for that many small pieces
             for offset, array in zip(offsets, arrays, strict=True):
                 if array.size:
                     at = offset - first

@@ -24,7 +24,7 @@ from tests.support.live_reference import contents, stored_drive
 
 
 def checked(directory: Path) -> CheckedMap:
-    """Check a map as everybody may, who changes nothing."""
+    """Check a map without changing it, as any account may."""
     before = contents(directory)
     with opened_folder_to_read(str(directory)) as files:
         found = check(files, str(directory))
@@ -56,7 +56,7 @@ def test_a_good_map(tmp_path: Path, codec: str) -> None:
     assert len(found.rows) == len(files) > 5
     assert found.total("bytes") == sum(path.stat().st_size for path in files)
     assert (found.resolution, found.frame_id) == (0.2, "map")
-    assert [*found.interim, *found.aside, *found.strange, *found.unreadable] == []
+    assert [*found.interim, *found.quarantined, *found.strange, *found.unreadable] == []
     before = contents(tmp_path)
     assert repaired(tmp_path).good
     assert contents(tmp_path) == before
@@ -112,8 +112,8 @@ def test_what_is_quarantined_never_takes_the_place_of_another(tmp_path: Path) ->
     found = checked(tmp_path)
     assert found.good
     assert found.manifest == "current"
-    assert found.aside == [f"{path.name}.damaged.{number}" for number in (1, 2, 3)]
-    assert [(tmp_path / name).read_bytes() for name in found.aside] == [b"1", b"2", b"3"]
+    assert found.quarantined == [f"{path.name}.damaged.{number}" for number in (1, 2, 3)]
+    assert [(tmp_path / name).read_bytes() for name in found.quarantined] == [b"1", b"2", b"3"]
     files = MapFiles(folder := Folder(tmp_path), SETTINGS)
     assert files.rows == found.rows
     assert not files.missing
@@ -252,7 +252,7 @@ def test_what_cannot_be_read_is_quarantined(tmp_path: Path, what: str, kind: Cal
     assert not path.exists() or what == "manifest.json"
     assert found.rewritten == (what != ".chunk.abcd.tmp")
     again = checked_as_it_is(tmp_path)
-    assert (again.good, again.manifest, again.aside) == (True, "current", [quarantined.kept_as])
+    assert (again.good, again.manifest, again.quarantined) == (True, "current", [quarantined.kept_as])
     with opened_folder(str(tmp_path), "") as folder:
         MapFiles(folder, SETTINGS)
 
@@ -278,7 +278,7 @@ def test_files_that_are_no_chunks(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"mine")
     found = repaired(tmp_path)
     assert found.good
-    assert (found.interim, found.strange, found.aside) == (names[:1], names[1:2], names[2:3])
+    assert (found.interim, found.strange, found.quarantined) == (names[:1], names[1:2], names[2:3])
     assert all((tmp_path / name).read_bytes() == b"mine" for name in names)
 
 
@@ -312,7 +312,7 @@ def test_another_process_works_with_it(tmp_path: Path) -> None:
 
 
 def test_a_file_that_goes_while_the_map_is_checked(tmp_path: Path) -> None:
-    """A daemon has put it aside: it is missing, and not damaged."""
+    """A daemon has quarantined it: it is missing, and not damaged."""
     stored_drive(tmp_path)
     gone = largest(tmp_path)
 
@@ -348,7 +348,7 @@ def lived_in(directory: Path) -> dict[str, bytes]:
     return own
 
 
-def test_moved_aside(tmp_path: Path) -> None:
+def test_a_reset_moves_the_map_s_files(tmp_path: Path) -> None:
     for number in (1, 2):
         own = lived_in(tmp_path)
         own = {name: data for name, data in own.items() if "/" not in name and name not in OTHERS}
@@ -359,9 +359,9 @@ def test_moved_aside(tmp_path: Path) -> None:
         assert (done.files, done.bytes) == (len(own), sum(map(len, own.values())))
         assert contents(tmp_path / f"reset.{number}") == own
         assert {path.name for path in tmp_path.iterdir() if path.is_file()} == OTHERS.keys()
-        aside = Folder(tmp_path / f"reset.{number}")
-        assert check(aside, "").good
-        aside.close()
+        moved = Folder(tmp_path / f"reset.{number}")
+        assert check(moved, "").good
+        moved.close()
 
 
 def test_deleted(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who maps: one number a name for ever, 32 at a time, and numbers of scans that nobody had."""
+"""Mappers: one permanent number a name, 32 at a time, and unused numbers of scans."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_user_and_a_name_are_one_mapper(mappers: Mappers) -> None:
     assert len({one.mapper.number for one in (first, *others)}) == 3
 
 
-def test_only_who_opened_it_last_maps_under_a_name(mappers: Mappers) -> None:
+def test_only_the_last_to_open_it_maps_under_a_name(mappers: Mappers) -> None:
     number = mappers.open(1000, "front", 1).mapper.number
     assert mappers.expect(number, 1, 1).session == 1
     mappers.open(1000, "front", 2)
@@ -153,7 +153,7 @@ def test_the_next_run_gives_numbers_that_no_scan_had(disk: CutDisk, mappers: Map
     assert later.next_scan(active) == first + 1
 
 
-def test_who_may_map_does_so_on_a_disk_that_is_full(
+def test_a_mapper_goes_on_while_the_disk_is_full(
     monkeypatch: pytest.MonkeyPatch, disk: CutDisk, mappers: Mappers
 ) -> None:
     active = mappers.open(1000, "front", 1)

@@ -160,7 +160,7 @@ def test_the_files_of_a_session_go_with_it(marks: MarksDirectory, path: Path) ->
     (path / "1a.6" / "x").touch()
     marks.on_disconnect(SESSION)
     left = sorted(name.name for name in path.iterdir())
-    assert left == ["1.1", "11a.1", "1a.6", "1a1.1"], "what somebody fills is theirs to empty"
+    assert left == ["1.1", "11a.1", "1a.6", "1a1.1"], "a client's own files are its own to remove"
     (path / "1a.6" / "x").unlink()
 
 

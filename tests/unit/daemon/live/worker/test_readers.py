@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from shmmap.chunks.layout import HEADER_BYTES, new_header
 from shmmap.chunks.voxels import ChunkKey
 from shmmap.daemon.live.disk.map_record import Row
 from shmmap.daemon.live.paging.durability import Scan
-from shmmap.daemon.live.worker import areas, readers, voxel_lists
+from shmmap.daemon.live.worker import readers, voxel_lists
 from shmmap.daemon.live.worker.areas import check_area, inside, key_range, touches
 from shmmap.daemon.live.worker.voxel_lists import KEPT_S, VOXEL_BYTES, Later, VoxelLists
 from shmmap.errors import BadRequest, OverBudget
@@ -33,6 +34,7 @@ from shmmap.protocol.live import (
     LiveVoxelsReply,
 )
 from shmmap.protocol.messages import ErrorReply
+from tests.support.calls import counted_calls
 from tests.support.live_drive import RESOLUTION
 from tests.support.served_map import Served
 
@@ -96,13 +98,15 @@ def test_what_changed_and_what_left(served: Served) -> None:
     assert keys_of(everything) == [a, b, c]
     assert everything.since_known
     assert keys_of(page(served, since=everything.change)) == []
-    served.map.changes.note_changed(b)
+    for key in (b, a, b):
+        served.map.changes.note_changed(key)
     chunk = served.live.chunks.pop(c)
     served.live.residency._forget(c)
     served.map.changes.note_gone(c)
     later = page(served, since=everything.change)
-    assert (keys_of(later), later.gone, later.since_known) == ([b], (c,), True)
-    assert page(served, since=everything.change, after=tuple(a)).gone == (), "they were on the first page"
+    assert (keys_of(later), later.gone, later.since_known) == ([a, b], (c,), True)
+    second = page(served, since=everything.change, after=tuple(a))
+    assert (keys_of(second), second.gone) == ([b], ()), "they were on the first page"
     elsewhere = BoxMessage(-100.0, -100.0, -90.0, -90.0)
     assert page(served, since=everything.change, area=elsewhere).gone == ()
     unknown = page(served, since=later.change + 5)
@@ -111,7 +115,7 @@ def test_what_changed_and_what_left(served: Served) -> None:
 
 
 def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> None:
-    """So many rows, so many that left, and all numbers as long as they get."""
+    """As many rows and as many gone chunks as there may be, with the longest numbers."""
     served.map.changes.note_changed(ChunkKey(0, 0, 0))
     since = served.map.changes.number
     for x in range(20_000):
@@ -124,10 +128,10 @@ def test_the_longest_answer_is_shorter_than_a_packet_may_be(served: Served) -> N
     found = page(served, since=first, saved=True)
     assert found.since_known
     assert len(found.rows) == MAX_CHUNK_ROWS
-    assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes where nobody has raised that"
+    assert len(encode(found)) < 180_000, "a socket takes 212 992 bytes unless that limit was raised"
 
 
-def test_chunks_on_their_way_in_are_listed(served: Served) -> None:
+def test_chunks_that_are_being_loaded_are_listed(served: Served) -> None:
     """But not to a client that asks what changed: it cannot read them yet."""
     there, coming = ChunkKey(2, 0, 0), ChunkKey(3, 0, 0)
     live = served.live
@@ -165,14 +169,8 @@ def test_chunks_are_listed_while_others_are_saved(served: Served, monkeypatch: p
 
     monkeypatch.setattr(readers, "touches", touch_and_save)
     assert keys_of(page(served, saved=True)) == [ChunkKey(x, 0, 0) for x in range(3)]
-
-
-def test_a_file_that_was_quarantined_is_listed_no_more(served: Served) -> None:
-    keys = [ChunkKey(x, 0, 0) for x in range(3)]
-    for key in keys:
-        on_disk(served, key, Row(1, 100, 0, 0, 0, 1))
-    del served.live.files.rows[keys[1]]
-    assert keys_of(page(served, saved=True)) == [keys[0], keys[2]]
+    del served.live.files.rows[ChunkKey(1, 0, 0)]
+    assert keys_of(page(served, saved=True)) == [ChunkKey(x, 0, 0) for x in (0, 2)], "one was quarantined"
 
 
 def test_lists_of_several_readers_are_made_by_turns(served: Served) -> None:
@@ -209,66 +207,42 @@ def test_a_session_that_asks_for_much_waits_for_one_that_asks_for_little(
     assert list(served.answers) == [few]
 
 
-@pytest.mark.parametrize("area", [None, BoxMessage(10.0, 0.0, 20.0, 5.0), SphereMessage(15.0, 0.0, 0.0, 5.0)])
-@pytest.mark.parametrize("saved", [True, False])
-def test_a_step_looks_at_few_chunks_however_many_there_are(
-    served: Served, monkeypatch: pytest.MonkeyPatch, area: LiveArea | None, *, saved: bool
+IN_A_CORNER = BoxMessage(10.0, 0.0, 20.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("asked", "most_in_all"),
+    [
+        ({"saved": True}, 10_000),
+        ({}, 10_000),
+        ({"saved": True, "area": IN_A_CORNER}, 500),
+        ({"saved": True, "area": SphereMessage(15.0, 0.0, 0.0, 5.0)}, 500),
+        ({"saved": True, "after": (19, 50, 0)}, 3_000),
+        ({"since": 200}, 200),
+    ],
+)
+def test_a_turn_is_short_and_what_is_asked_for_is_found_by_an_index(
+    served: Served, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], most_in_all: int
 ) -> None:
+    """However many chunks there are, beyond an area, before the page, and that did not change."""
     monkeypatch.setattr(readers, "TURN_S", 0.0)
     for x in range(20):
         for y in range(100):
             on_disk(served, ChunkKey(x, y, 0), Row(1, 100, 0, 0, 0, 1))
-    bring(served, ChunkKey(1, 0, 0))
-    looked = 0
-
-    def counted(area: LiveArea | None, key: ChunkKey, resolution: float) -> bool:
-        nonlocal looked
-        looked += 1
-        return areas.touches(area, key, resolution)
-
-    monkeypatch.setattr(readers, "touches", counted)
-    ticket = served.ask(lambda n: LiveChunks(n, "lidar", area, saved=saved))
-    most = 0
+    for x in range(200):
+        bring(served, ChunkKey(x, -x, 0))
+    if "since" in asked:
+        asked["since"] = served.map.changes.number
+    for x in (7, 3, 7):
+        served.map.changes.note_changed(ChunkKey(x, -x, 0))
+    ticket = served.ask(lambda n: LiveChunks(n, "lidar", **asked))
+    turns = []
     while ticket not in served.answers:
-        before = looked
-        served.map.readers.run_turn(served.now_s)
-        most = max(most, looked - before)
-    assert most <= 2 * readers.KEYS_PER_STEP
-    if area is not None:
-        assert looked < 60, "an area is found by the index"
-
-
-def test_the_next_page_begins_where_the_last_one_ended(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It does not look at those before again."""
-    for x in range(3000):
-        on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
-    looked: list[ChunkKey] = []
-
-    def touched(_area: object, key: ChunkKey, _resolution: float) -> bool:
-        looked.append(key)
-        return True
-
-    monkeypatch.setattr(readers, "touches", touched)
-    page(served, saved=True, after=(1990, 0, 0))
-    assert looked[0] == (1991, 0, 0)
-    assert len(looked) <= MAX_CHUNK_ROWS + readers.KEYS_PER_STEP + 9
-
-
-def test_what_changed_is_found_without_a_look_at_what_did_not(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Readers ask that with each look at voxels."""
-    keys = [ChunkKey(x, 0, 0) for x in range(300)]
-    for key in keys:
-        bring(served, key)
-    since = served.map.changes.number
-    for key in (keys[7], keys[3], keys[7]):
-        served.map.changes.note_changed(key)
-    monkeypatch.setattr(readers, "merged_part", lambda *_: pytest.fail("all are looked at"))
-    assert keys_of(page(served, since=since)) == [keys[3], keys[7]]
-    assert keys_of(page(served, since=since, after=tuple(keys[3]))) == [keys[7]]
+        with counted_calls() as calls:
+            served.map.readers.run_turn(served.now_s)
+        turns.append(calls.count)
+    assert max(turns) <= 1_000
+    assert sum(turns) <= most_in_all
 
 
 def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path: Path) -> None:
@@ -289,7 +263,7 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
             assert served.answer(served.ask(lambda n: messages.LiveVoxels(n, "lidar"), session)).count == 0
         served.map.on_disconnect(3)
         assert not served.answers.keys() & {*waits, left}
-        assert served.map.readers.next_turn_s(served.now_s) > served.now_s, "nobody turns in vain"
+        assert served.map.readers.next_turn_s(served.now_s) > served.now_s, "no turn in vain"
     finally:
         goes_on.set()
     for ticket in waits:
@@ -299,7 +273,7 @@ def test_a_reader_of_a_slow_disk_keeps_no_other_waiting(served: Served, tmp_path
 
 
 def test_the_end_waits_for_no_reader_s_files(served: Served) -> None:
-    """Of so many that were asked for, at most those that are being read just now are read."""
+    """Of all that were asked for, at most those that are being read just now are read."""
     for x in range(100):
         on_disk(served, ChunkKey(x, 0, 0), Row(1, 100, 0, 0, 0, 1))
     begun, goes_on, read = threading.Event(), threading.Event(), []
@@ -340,23 +314,16 @@ def test_the_busiest_readers_are_named(served: Served, monkeypatch: pytest.Monke
     assert served.map.readers.busiest == ()
 
 
-def test_what_is_known() -> None:
-    one = readers.Changes(100)
-    one.note_changed(ChunkKey(0, 0, 0))
-    assert one.known(100)
-    assert one.known(101)
-    assert not one.known(99), "that was a previous run"
-    assert not one.known(102), "that was another worker's, after which the clock was set back"
-
-
 def test_not_all_that_left_is_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(readers, "MAX_GONE", 3)
-    one = readers.Changes(0)
-    for x in range(5):
+    one = readers.Changes(100)
+    one.note_gone(ChunkKey(0, 0, 0))
+    assert [since for since in range(98, 104) if one.known(since)] == [100, 101], "neither of another run"
+    for x in range(1, 5):
         one.note_gone(ChunkKey(x, 0, 0))
-    assert [since for since in range(6) if one.known(since)] == [2, 3, 4, 5]
-    assert one.gone(2) == [ChunkKey(x, 0, 0) for x in (2, 3, 4)]
-    assert len(one.gone(0)) == 3
+    assert [since for since in range(98, 110) if one.known(since)] == [102, 103, 104, 105]
+    assert one.gone(102) == [ChunkKey(x, 0, 0) for x in (2, 3, 4)]
+    assert len(one.gone(100)) == 3
 
 
 # --- lists of voxels ----------------------------------------------------------------------------

@@ -88,7 +88,7 @@ def test_a_scan_that_is_sent_again_counts_once(serve: Serve) -> None:
     one.end()
 
 
-def test_a_scan_on_its_way_is_answered_to_who_sends_it_again(
+def test_a_running_scan_is_answered_to_the_session_that_sends_it_again(
     serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its mapper lost the connection, and came back as another session."""
@@ -130,7 +130,7 @@ def test_what_waits_when_a_session_ends_is_not_applied(serve: Serve, monkeypatch
 
 
 def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sessions come, send a scan that waits for its chunks again and again, and go."""
+    """Sessions come, resend a scan that waits for its chunks, and go."""
     one = serve(**LATER)
     blocked = Blocked(monkeypatch, one.live.files, "load")
     (marks,) = marked(1)
@@ -148,7 +148,7 @@ def test_tickets_of_a_scan_do_not_pile_up(serve: Serve, monkeypatch: pytest.Monk
     one.end()
 
 
-def test_marks_that_nobody_expected_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unexpected_marks_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     one = serve(**LATER)
     (marks,) = marked(1)
     mapper = one.open().mapper
@@ -193,8 +193,8 @@ def test_places_that_are_nowhere(serve: Serve, place: tuple[float, float, float]
 # --- durable ------------------------------------------------------------------------------------
 
 
-def test_what_an_previous_run_did_not_save_is_not_durable(serve: Serve) -> None:
-    """Nobody knows which scans a chunk that was found in memory has; its mapper may send none again."""
+def test_what_a_previous_run_did_not_save_is_not_durable(serve: Serve) -> None:
+    """Which scans a chunk found in memory has is unknown; its mapper may send none again."""
     one = serve(**LATER)
     (marks,) = marked(1)
     opened = one.open()
@@ -246,7 +246,7 @@ def test_a_save_is_answered_when_all_that_came_before_is_durable(serve: Serve) -
 
 
 def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What changed stays in memory, is told, and saved when there is room; few tries meanwhile."""
+    """What changed stays in memory, is reported, and saved when there is room; few tries meanwhile."""
     one = serve(linger_s=0.0, checkpoint_s=0.1)
     scans = marked(5)  # the last one is far away from the others
     mapper = one.open().mapper
@@ -258,7 +258,9 @@ def test_a_disk_that_is_full_stops_no_mapper(serve: Serve, monkeypatch: pytest.M
         for _ in range(50):
             one.turn()
             one.live.wait(0.01)
-        assert len(calls) <= one.live.limits.saves * (one.now_s - start_s + 2.0), "so many each second"
+        assert len(calls) <= one.live.limits.saves * (one.now_s - start_s + 2.0), (
+            "a bounded number each second"
+        )
         status = one.map.status()
         assert "cannot be saved: No space left" in status.problem
         assert one.voxels() == reference(*scans)
@@ -340,7 +342,7 @@ def test_while_files_are_written_nothing_turns(serve: Serve, monkeypatch: pytest
 
 
 def test_answers_wait_for_a_daemon_that_is_busy() -> None:
-    """It hears nothing for a while, and the channel is full: no answer is lost."""
+    """It reads nothing for a while, and the channel is full: no answer is lost."""
     ours, theirs = channel()
     buffer = packet_buffer()
     with ours, theirs:
@@ -349,13 +351,13 @@ def test_answers_wait_for_a_daemon_that_is_busy() -> None:
         for ticket in range(MESSAGES_PER_TURN):
             message = messages.LiveList(ticket) if ticket % 2 else messages.LiveOpen(ticket, "x" * 60)
             ours.send(worker_messages.encode(worker_messages.Ask(ticket, 1, 0, True, encode(message))))
-        hearing = threading.Thread(target=worker._receive)
-        hearing.start()
-        hearing.join(0.2)  # until it can send no more
+        receiving = threading.Thread(target=worker._receive)
+        receiving.start()
+        receiving.join(0.2)  # until it can send no more
         for ticket in range(MESSAGES_PER_TURN):
             answer = worker_messages.decode_from_live(receive_packet(ours, buffer)[0])
             assert isinstance(answer, worker_messages.Reply)
             assert answer.ticket == ticket
             assert isinstance(decode_reply(answer.body), ErrorReply) != bool(ticket % 2)
-        hearing.join()
+        receiving.join()
         os.close(worker._done)

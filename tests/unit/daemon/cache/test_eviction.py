@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which segments are evicted, against a plain sort; and how little work it takes."""
+"""The order in which segments are evicted: by scores, as a plain sort says, and how little work it takes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,103 @@ import math
 import random
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from shmmap.daemon.cache.eviction_order import BATCH, FRONT, TRIES, EvictionOrder, Score
+from shmmap.daemon.cache.evictor import SOON_S, eviction_scores
 from shmmap.daemon.records import Key, Resident
+from shmmap.daemon.travel.motion import Motion
+from shmmap.daemon.travel.places import NOWHERE, Places, merged_places, places_of, until_needed
+from shmmap.protocol.messages import Intent
+
+coordinates = st.floats(-1e5, 1e5)
+points = st.tuples(coordinates, coordinates)
 
 
-def made(number: int, last_use_s: float = 0.0) -> Resident:
+@st.composite
+def residents(draw: st.DrawFn) -> list[Resident]:
+    found = []
+    for number in range(draw(st.integers(0, 12))):
+        x, y = draw(coordinates), draw(coordinates)
+        found.append(
+            Resident(
+                f"/{number}",
+                Key(f"/{number}.pcd", "points"),
+                number + 1,
+                draw(st.integers(1, 1 << 24)),
+                0,
+                (x, y, x + draw(st.floats(0, 50)), y + draw(st.floats(0, 50))),
+                0.0,
+                0.0,
+                last_use_s=draw(st.floats(0, 1e6)),
+            )
+        )
+    return found
+
+
+def client(x: float, y: float, vx: float = 0.0, vy: float = 0.0, *route: tuple[float, float]) -> Places:
+    """Where a client with a reach of 50 m will be."""
+    motion = Motion()
+    motion.update(Intent(x, y, vx, vy, route=route), 0.0)
+    return places_of(motion, 50.0)
+
+
+def ordered(some: list[Resident], *clients: Places) -> list[Resident]:
+    """Sorted by score, the one that is evicted first in front."""
+    scores = eviction_scores(some, merged_places(clients), 0.0).tolist()
+    ranks = {one: (-score, one.last_use_s) for one, score in zip(some, scores, strict=True)}
+    return sorted(some, key=ranks.__getitem__)
+
+
+@given(residents())
+def test_without_any_client_the_least_recently_used(candidates: list[Resident]) -> None:
+    times = [resident.last_use_s for resident in ordered(candidates)]
+    assert times == sorted(times)
+
+
+@given(residents(), st.lists(points, min_size=1, max_size=4), st.floats(0, 100))
+def test_needed_last(candidates: list[Resident], places: list[tuple[float, float]], now_s: float) -> None:
+    """The time until any client comes to it counts, weighted by size."""
+    clients = merged_places(client(*place, 10.0, 5.0) for place in places)
+    scores = eviction_scores(candidates, clients, now_s)
+    boxes = np.array([resident.box for resident in candidates]).reshape(-1, 4)
+    times = until_needed(boxes, clients, now_s)
+    for resident, score, until_s in zip(candidates, scores.tolist(), times.tolist(), strict=True):
+        assert score == pytest.approx((until_s + SOON_S) * math.sqrt(resident.nbytes))
+
+
+def made(name: str, x: float, y: float = 0.0, nbytes: int = 100, last_use_s: float = 0.0) -> Resident:
+    return Resident(
+        name, Key(name, "points"), 1, nbytes, 0, (x, y, x + 10, y + 10.0), 0.0, 0.0, last_use_s=last_use_s
+    )
+
+
+def test_examples() -> None:
+    near, middle, far = made("near", 60), made("middle", 150), made("far", 500)
+    here = client(5.0, 5.0)
+    assert [r.name for r in ordered([near, far, middle], here)] == ["far", "middle", "near"]
+    assert ordered([near, far, middle], here, client(505.0, 5.0))[0] is middle
+    large = made("large", 450, nbytes=400)
+    assert ordered([near, middle, far, large], here)[0] is large
+    old, new = made("old", 150, last_use_s=1.0), made("new", 150, last_use_s=2.0)
+    assert ordered([new, old], client(0.0, 0.0)) == [old, new]
+    assert ordered([new, old]) == [old, new]
+    near_unused, far_used = made("near, long unused", 0, last_use_s=1.0), made("far, just used", 500)
+    far_used.last_use_s = 2.0
+    assert ordered([near_unused, far_used], here) == [far_used, near_unused]
+    assert ordered([far_used, near_unused]) == [near_unused, far_used]
+
+
+def test_nothing_to_score() -> None:
+    for places in (NOWHERE, client(0.0, 0.0)):
+        assert eviction_scores([], places, 0.0).shape == (0,)
+
+
+def numbered(number: int, last_use_s: float = 0.0) -> Resident:
     return Resident(
         f"/{number}", Key(f"/{number}.pcd", "points"), number, 100, 0, (0.0,) * 4, 0.0, 0.0,
         last_use_s=last_use_s,
@@ -44,7 +131,6 @@ class Worth:
         return bool(one.sessions), -self.of_number[one.version], one.last_use_s
 
 
-@settings(max_examples=100, stateful_step_count=60, deadline=None)
 def offered(order: EvictionOrder, worth: Worth, now_s: float) -> list[Resident]:
     """What should go first, once there are enough in order."""
     while order.fill(worth.score, now_s):
@@ -71,7 +157,7 @@ class Machine(RuleBasedStateMachine):
     @rule(score=st.integers(0, 5), last_use_s=st.integers(0, 5))
     def enter(self, score: int, last_use_s: int) -> None:
         self.number += 1
-        one = made(self.number, last_use_s)
+        one = numbered(self.number, last_use_s)
         self.worth.of_number[self.number] = score
         self.known[one] = -math.inf
         self.order.new[one] = None
@@ -132,6 +218,7 @@ class Machine(RuleBasedStateMachine):
 
 
 TestOrder = Machine.TestCase
+TestOrder.settings = settings(max_examples=100, stateful_step_count=60, deadline=None)
 
 
 @pytest.mark.parametrize("count", [100, 5000])
@@ -139,11 +226,11 @@ def test_all_of_many_in_order(count: int) -> None:
     """While nothing moves, exactly as a sort says, also what came in between and was used since."""
     random.seed(count)
     order, worth = EvictionOrder(), Worth()
-    some = [made(number, random.random()) for number in range(count)]
+    some = [numbered(number, random.random()) for number in range(count)]
     for one in some:
         worth.of_number[one.version] = random.random() * 100
         order.new[one] = None
-    while not order.settled:
+    while not order.all_scored:
         order.score_new(worth.score)
     for one in random.sample(some, count // 3):
         one.last_use_s += 1.0
@@ -156,11 +243,11 @@ def test_all_of_many_in_order(count: int) -> None:
 
 
 def settled(count: int, worth: Worth) -> tuple[EvictionOrder, list[Resident]]:
-    order, some = EvictionOrder(), [made(number) for number in range(count)]
+    order, some = EvictionOrder(), [numbered(number) for number in range(count)]
     for one in some:
         worth.of_number[one.version] = float(one.version)
         order.new[one] = None
-    while not order.settled:
+    while not order.all_scored:
         order.score_new(worth.score)
     return order, some
 
@@ -199,7 +286,7 @@ def test_the_work_for_a_victim_does_not_depend_on_how_many_there_are(count: int)
 
 
 def test_few_come_back_at_a_time() -> None:
-    """Of those whose time has come, and of all that are reconsidered."""
+    """Of those that are due, and of all that are reconsidered."""
     worth = Worth()
     order, some = settled(4 * BATCH, worth)
     for one in some:

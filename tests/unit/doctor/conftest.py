@@ -7,9 +7,11 @@ import dataclasses
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
+
 import shmmap
 from shmmap.daemon.config import DaemonConfig
-from shmmap.doctor.patient import Machine, Patient
+from shmmap.doctor.diagnosis import Diagnosis, Machine
 from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
@@ -45,7 +47,7 @@ def snapshot(state: str = "healthy", *, version: str = shmmap.__version__, **cou
 
 
 class Ward:
-    """Makes patients; files of their machine are given by name."""
+    """Makes diagnoses; files of their machine are given by name."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -55,9 +57,17 @@ class Ward:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
 
-    def patient(
+    def diagnosis(
         self, seen: Snapshot | None = None, *, uid: int = USER, file: str = "", **settings: object
-    ) -> Patient:
+    ) -> Diagnosis:
         (self.root / "dev/shm").mkdir(parents=True, exist_ok=True)
         config = DaemonConfig(**settings)  # type: ignore[arg-type]
-        return Patient(Machine(self.root), config, file, config.endpoint, seen or snapshot("absent"), uid=uid)
+        return Diagnosis(
+            Machine(self.root), config, file, config.endpoint, seen or snapshot("absent"), uid=uid
+        )
+
+
+@pytest.fixture
+def ward(tmp_path: Path) -> Ward:
+    """Return a machine without files."""
+    return Ward(tmp_path / "machine")

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is examined: a machine, the daemon's settings on it, and what its daemon tells."""
+"""What the checks look at: a machine, the daemon's settings on it, and what its daemon reports."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import pwd
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,12 +14,10 @@ from typing import Final
 from shmmap.daemon.config import DaemonConfig
 from shmmap.doctor.store_probe import StoreAnswer, StoreQuestion, ask_store
 from shmmap.errors import ShmmapError
-from shmmap.segment.directory import DEFAULT_SHM_DIR
-from shmmap.segment.names import usual_directory
-from shmmap.statistics.reader import read_statistics
+from shmmap.statistics.identity import DaemonIdentity
 from shmmap.statistics.snapshot import Snapshot
 
-__all__ = ["Machine", "Patient", "answering_at", "examine"]
+__all__ = ["Diagnosis", "Machine", "answering_at"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,33 +39,29 @@ class Machine:
 
 
 @dataclass(frozen=True)
-class Patient:
-    """What the checks look at.
-
-    Attributes
-    ----------
-    machine
-        The machine's files.
-    config, file
-        The daemon's settings, and the file they are from (empty: none).
-    socket
-        Path of the request socket.
-    seen
-        The daemon's statistics; None where they cannot be read, and ``unreadable`` says why.
-    uid
-        The account that asks.
-    answering
-        Process of a daemon of this instance that answers although it has no statistics; 0: none.
-    """
+class Diagnosis:
+    """A machine and an instance of the daemon, as the account ``uid`` sees them."""
 
     machine: Machine
     config: DaemonConfig
     file: str
+    """The file that the settings are from; empty: none."""
     socket: str
     seen: Snapshot | None
+    """The daemon's statistics; None where they cannot be read, and ``unreadable`` says why."""
     unreadable: str = ""
     uid: int = field(default_factory=os.geteuid)
     answering: int = 0
+    """Process of a daemon of this instance that answers although it has no statistics; 0: none."""
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """The living daemon's counters; empty where none lives."""
+        return self.seen.counters if self.seen is not None and self.alive else {}
+
+    @property
+    def _identity(self) -> DaemonIdentity | None:
+        return self.seen.identity if self.seen is not None and self.alive else None
 
     @property
     def alive(self) -> bool:
@@ -76,9 +70,9 @@ class Patient:
 
     @property
     def awaits_first_client(self) -> bool:
-        """Whether no daemon lives, and somebody else (the service manager) listens for it.
+        """Whether no daemon lives, and another process (the service manager) listens for it.
 
-        Connecting would start it, and who only looks must not do that.
+        Connecting would start it, and a diagnosis must not do that.
         """
         if self.alive or self.seen is None or self.answering:
             return False
@@ -93,29 +87,25 @@ class Patient:
     @property
     def shm_dir(self) -> str:
         """Where the segments are."""
-        told = self.seen.identity.shm_dir if self.seen is not None and self.seen.identity else ""
-        return told if self.alive and told else self.config.shm_dir
+        identity = self._identity
+        return (identity.shm_dir if identity else "") or self.config.shm_dir
 
     @property
     def map_path(self) -> str:
         """The map that is served, or would be."""
-        told = self.seen.identity.map_path if self.seen is not None and self.seen.identity else ""
-        return told if self.alive and told else self.config.map_path
+        identity = self._identity
+        return (identity.map_path if identity else "") or self.config.map_path
 
     @property
     def budget_bytes(self) -> int:
         """The budget in force; the configured one (0: chosen at start) where no daemon runs."""
-        if self.alive and self.seen is not None:
-            return self.seen.counters.get("budget_bytes", 0)
-        return self.config.budget_bytes
+        return self.counters.get("budget_bytes", 0) if self.alive else self.config.budget_bytes
 
     @property
     def pid(self) -> int:
         """The daemon's process, 0 where none lives or it is in another pid namespace."""
-        if not self.alive or self.seen is None or self.seen.identity is None:
-            return 0
-        pid = self.seen.identity.pid
-        return pid if self.machine.path(f"/proc/{pid}").exists() else 0
+        pid = self._identity.pid if self._identity else 0
+        return pid if pid and self.machine.path(f"/proc/{pid}").exists() else 0
 
     @cached_property
     def environment(self) -> dict[str, str] | None:
@@ -132,12 +122,11 @@ class Patient:
     @cached_property
     def store(self) -> StoreAnswer:
         """What the store of a published map answers, asked once."""
-        counters = self.seen.counters if self.alive and self.seen is not None else {}
         question = StoreQuestion(
             self.map_path,
             self.config.insecure_http or self.alive,  # a daemon that serves it was allowed to
             self.config.instance_credentials,
-            counters.get("published_version", 0),
+            self.counters.get("published_version", 0),
         )
         return ask_store(question, self.environment)
 
@@ -148,7 +137,7 @@ class Patient:
 
     @property
     def runs_as(self) -> int:
-        """Account of the daemon: the living one's, else the installed service's, else who asks."""
+        """Account of the daemon: the running one's, else the installed service's, else ``uid``."""
         if self.pid:
             return self.machine.path(f"/proc/{self.pid}").stat().st_uid
         if self.is_service:
@@ -164,26 +153,6 @@ _UNIT: Final = "/etc/systemd/system/shmmapd.service"
 _LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
 
-def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Patient:
-    """Look at the machine and at what the instance's daemon tells."""
-    if config.shm_dir == DEFAULT_SHM_DIR:
-        config = dataclasses.replace(config, shm_dir=usual_directory(config.instance))
-    try:
-        seen, unreadable = read_statistics(config.instance, config.shm_dir), ""
-    except ShmmapError as error:
-        seen, unreadable = None, error.message
-    except OSError as error:
-        seen, unreadable = None, f"{config.shm_dir}: {error.strerror}"
-    if seen is not None and seen.identity is not None and not (config.endpoint or config.runtime_dir):
-        path = seen.identity.endpoint
-    else:
-        path = _socket(config)
-    patient = Patient(machine or Machine(), config, file, path, seen, unreadable)
-    if patient.alive:
-        return patient
-    return dataclasses.replace(patient, answering=answering_at(path).get(config.instance, 0))
-
-
 def answering_at(path: str) -> dict[str, int]:
     """Ask the process that listens at a socket: the process of the daemon there, by its instance."""
     from shmmap.client.client import connect
@@ -196,12 +165,3 @@ def answering_at(path: str) -> dict[str, int]:
             return {client.welcome.instance: client.welcome.pid}
     except ShmmapError:
         return {}
-
-
-def _socket(config: DaemonConfig) -> str:
-    from shmmap.protocol.endpoint import runtime_dirs, socket_path
-
-    if config.endpoint or config.runtime_dir:
-        return config.socket()
-    places = [socket_path(place, config.instance) for place in runtime_dirs()]
-    return next((place for place in places if os.path.exists(place)), places[-1])
