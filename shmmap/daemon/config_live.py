@@ -31,7 +31,7 @@ class LiveSettings:
     """Settings of one live map, which clients call ``name``.
 
     Those of voxels are fixed when the map is made, see `shmmap.chunks.occupancy.Occupancy`.  What stays in
-    memory, and for how long changes are there alone: see `shmmap.daemon.live.paging.durability.Limits`.
+    memory, and for how long changes are there alone: see `shmmap.daemon.live.paging.residency.Limits`.
     """
 
     name: str

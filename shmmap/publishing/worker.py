@@ -69,7 +69,7 @@ _XYZ: Final = "xyz"
 
 
 class RoundedFiles(Files):
-    """A `shmmap.layers.source_reader.SourceReader`: rows and coordinates as a reader of the map has them."""
+    """A `shmmap.layers.sources.SourceReader`: rows and coordinates as a reader of the map has them."""
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
         """Read the file, its points rounded and in their new order."""
