@@ -19,6 +19,7 @@ from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import compiled
 from tests.support.skips import (  # noqa: F401  hooks
     NEEDS_ROOT,
+    programs_or_skip,
     pytest_collectreport,
     pytest_runtest_logreport,
     pytest_sessionfinish,
@@ -110,8 +111,7 @@ def layer_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
 @pytest.fixture(scope="session")
 def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the client in C++, compiled once for all processes of the tests; needs g++."""
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is missing")
+    programs_or_skip("g++")
     program = built_once(tmp_path_factory, "cpp_client", compiled)
     assert program is not None
     return program

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import zlib
@@ -23,6 +22,7 @@ from tests.support.compiled_programs import built_once
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import DaemonProcess, stop
 from tests.support.divided_map import DividedMap, make_map, random_points
+from tests.support.skips import programs_or_skip
 
 EVERYTHING = (0.0, 0.0, 500.0)
 FIELDS = "x:0:7:1 y:4:7:1 z:8:7:1 intensity:12:7:1 "
@@ -32,8 +32,7 @@ NAMES = {"f4": 7, "f8": 8, "i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6}
 @pytest.fixture(scope="module", params=TYPES)
 def node_program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the compiled node."""
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is missing")
+    programs_or_skip("g++")
     types = request.param
     program = built_once(tmp_path_factory, f"node-{types}", lambda folder: compiled_with(types, NODE, folder))
     if program is None:
@@ -391,6 +390,5 @@ def test_a_voxel_without_an_inverse(node: AutowareNode) -> None:
 )
 def test_other_compilers(compiler: str, standard: str) -> None:
     """They find nothing to warn of, either."""
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is missing")
+    programs_or_skip(compiler)
     subprocess.run([compiler, f"-std={standard}", "-fsyntax-only", *FLAGS, str(NODE)], check=True)

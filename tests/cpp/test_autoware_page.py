@@ -23,6 +23,7 @@ from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap
 from tests.support.pages import Reader, read_page
+from tests.support.skips import programs_or_skip
 
 PAGE = read_page("clients/cpp/AUTOWARE.md")
 
@@ -115,8 +116,7 @@ def block(name: str) -> str:
 
 def check(source: str, folder: Path) -> None:
     """Have the compiler look at a source, with every warning an error."""
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is missing")
+    programs_or_skip("g++")
     path = folder / "source.cpp"
     path.write_text(source)
     support = ROOT / "tests" / "support"
@@ -149,9 +149,7 @@ def test_the_proposed_lines_compile(tmp_path: Path) -> None:
 
 
 def test_the_examples_run_beside_a_daemon(divided_map: DividedMap, tmp_path: Path) -> None:
-    for tool in ("g++", "pkg-config"):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} is missing")
+    programs_or_skip("g++", "pkg-config")
     programs = tmp_path / "bin"
     programs.mkdir()
     script = programs / "shmmap"
@@ -184,8 +182,7 @@ EXAMPLES = CPP / "examples"
 
 def built_as_it_says(name: str, folder: Path) -> Path:
     """Compile an example by the line in its head."""
-    if shutil.which("g++") is None or shutil.which("pkg-config") is None:
-        pytest.skip("g++ or pkg-config is missing")
+    programs_or_skip("g++", "pkg-config")
     (command,) = re.findall(r"^//   (g\+\+ .*)$", (EXAMPLES / f"{name}.cpp").read_text(), re.MULTILINE)
     library = re.findall(r"--cflags (\w+)", command)[0]
     if subprocess.run(["pkg-config", "--exists", library], check=False).returncode:
@@ -248,8 +245,7 @@ def test_requesters_of_the_service(
     daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path, types: str
 ) -> None:
     """Each gets everything once, also of requests at the same time; two of one name share what they hold."""
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is missing")
+    programs_or_skip("g++")
     program = compiled_with(types, ROOT / "tests" / "support" / "requesters.cpp", tmp_path)
     if program is None:
         pytest.skip("ROS 2's generator of messages is missing (rosidl-generator-c-cpp, python3-rosidl)")

@@ -7,7 +7,6 @@ What both clients do alike is tested with both in ``tests/process``.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import zlib
 from pathlib import Path
@@ -22,7 +21,7 @@ from tests.cpp.conftest import DaemonFactory
 from tests.support.cpp_client import FLAGS, SOURCE, CppClient, CppProgram, compiled
 from tests.support.daemon_process import Deadline
 from tests.support.divided_map import DividedMap
-from tests.support.skips import open3d_or_skip
+from tests.support.skips import open3d_or_skip, programs_or_skip
 
 LAYERS = (
     "points",
@@ -207,16 +206,14 @@ def test_messages_that_are_wrong(program: CppProgram) -> None:
 @pytest.mark.parametrize(("compiler", "standard"), [("g++", "c++20"), ("clang++", "c++17")])
 def test_other_compilers(compiler: str, standard: str) -> None:
     """They find nothing to warn of, either."""
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is missing")
+    programs_or_skip(compiler)
     subprocess.run([compiler, f"-std={standard}", "-fsyntax-only", *FLAGS, str(SOURCE)], check=True)
 
 
 def test_by_another_compiler_and_standard(
     tmp_path: Path, daemon: DaemonFactory, divided_map: DividedMap
 ) -> None:
-    if shutil.which("clang++") is None:
-        pytest.skip("clang++ is missing")
+    programs_or_skip("clang++")
     program = compiled(tmp_path, compiler="clang++", standard="c++20", optimize="-O0")
     assert equal_bytes(program, daemon(divided_map.root).endpoint, QUICK_LAYERS) == 36 * 500
 

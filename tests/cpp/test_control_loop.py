@@ -16,6 +16,7 @@ from tests.cpp.conftest import DaemonFactory
 from tests.support.compiled_programs import ControlLoop, built_once, compiled_loop
 from tests.support.daemon_process import DaemonProcess
 from tests.support.divided_map import DividedMap
+from tests.support.skips import programs_or_skip
 
 RADIUS = 25.0
 LONG_S = 120.0
@@ -24,8 +25,7 @@ LONG_S = 120.0
 @pytest.fixture(scope="session")
 def loop_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the program, compiled once for all processes of the tests."""
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is missing")
+    programs_or_skip("g++")
     program = built_once(tmp_path_factory, "control_loop", compiled_loop)
     assert program is not None
     return program

@@ -9,7 +9,6 @@ of some 100 m and some 100 points in a voxel its sum is up to a millimetre off.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from tests.support.compiled_programs import PclLeaves, build_pcl_leaves, built_o
 from tests.support.cpp_client import FLAGS
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
+from tests.support.skips import programs_or_skip
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,7 @@ def test_a_street(program: Path, daemon: DaemonFactory, data_dir: Path, tmp_path
 
 
 def test_points_of_layers(daemon: DaemonFactory, divided_map: DividedMap, tmp_path: Path) -> None:
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is missing")
+    programs_or_skip("g++")
     program = tmp_path / "point_cloud2"
     source = ROOT / "tests" / "support" / "point_cloud2.cpp"
     subprocess.run(["g++", "-std=c++17", *FLAGS, "-Wuseless-cast", source, "-o", program], check=True)

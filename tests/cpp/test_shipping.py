@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from tests.cpp.conftest import DaemonFactory
 from tests.support.daemon_process import ROOT
 from tests.support.divided_map import DividedMap, make_map
 from tests.support.pages import Reader, Terminal, read_page
+from tests.support.skips import programs_or_skip
 
 PAGE = read_page("clients/cpp/README.md")
 CPP = ROOT / "clients" / "cpp"
@@ -32,13 +32,6 @@ ament_auto_find_build_dependencies()
 ament_auto_add_executable(first_cells ../first_cells/first_cells.cpp)
 ament_auto_package()
 """
-
-
-def needs(*programs: str) -> None:
-    """Skip the test where one of these is missing."""
-    for program in programs:
-        if shutil.which(program) is None:
-            pytest.skip(f"{program} is missing")
 
 
 @pytest.fixture(scope="module")
@@ -101,21 +94,21 @@ def terminal(
 
 @pytest.mark.parametrize("compiler", ["g++", "clang++"])
 def test_one_line_of_a_compiler(terminal: Terminal, installed: Path, expected: str, compiler: str) -> None:
-    needs(compiler)
+    programs_or_skip(compiler)
     assert terminal.run("shmmap cpp --includes").startswith(f"-I{installed}/")
     terminal.run(COMPILE.replace("g++", compiler, 1))
     assert terminal.run(RUN) == expected
 
 
 def test_the_line_that_the_command_line_prints(terminal: Terminal, expected: str) -> None:
-    needs("g++")
+    programs_or_skip("g++")
     (line,) = (one for one in terminal.run("shmmap cpp").splitlines() if "g++" in one)
     terminal.run(line.replace("PROGRAM.cpp", EXAMPLE.name))
     assert terminal.run(RUN.replace("first_cells", "a.out")) == expected
 
 
 def test_pkg_config(terminal: Terminal, expected: str) -> None:
-    needs("g++", "pkg-config")
+    programs_or_skip("g++", "pkg-config")
     for command in PAGE.commands("pkg-config"):
         terminal.run(command)
     assert terminal.run("pkg-config --modversion shmmap") == f"{shmmap.__version__}\n"
@@ -125,7 +118,7 @@ def test_pkg_config(terminal: Terminal, expected: str) -> None:
 @pytest.mark.parametrize("compiler", ["g++", "clang++"])
 def test_cmake(terminal: Terminal, home: Path, expected: str, compiler: str) -> None:
     """The target brings the standard, too: Clang 14 would take C++14."""
-    needs(compiler, "cmake")
+    programs_or_skip(compiler, "cmake")
     terminal.run(f"export CXX={compiler}")
     (home / "CMakeLists.txt").write_text("\n".join(PAGE.blocks["cmake-lists"]), encoding="utf-8")
     for command in PAGE.commands("cmake"):
@@ -135,7 +128,7 @@ def test_cmake(terminal: Terminal, home: Path, expected: str, compiler: str) -> 
 
 def test_a_prefix_may_be_moved(terminal: Terminal, home: Path, made: DividedMap, expected: str) -> None:
     """CMake compiles examples; what it installs names no path."""
-    needs("g++", "cmake", "pkg-config")
+    programs_or_skip("g++", "cmake", "pkg-config")
     terminal.run(
         f"cmake -S '{CPP}' -B all -DSHMMAP_EXAMPLES=ON && cmake --build all --target first_cells window"
         " && cmake --install all --prefix was"
@@ -175,7 +168,7 @@ def test_the_page_shows_the_window_as_it_is() -> None:
 
 
 def test_part_of_a_larger_project(terminal: Terminal, home: Path, expected: str) -> None:
-    needs("g++", "cmake")
+    programs_or_skip("g++", "cmake")
     text = "\n".join(PAGE.blocks["cmake-lists"])
     (home / "CMakeLists.txt").write_text(
         text.replace("find_package(shmmap REQUIRED)", f'add_subdirectory("{CPP}" shmmap)')
@@ -186,7 +179,7 @@ def test_part_of_a_larger_project(terminal: Terminal, home: Path, expected: str)
 
 def test_colcon(terminal: Terminal, home: Path, expected: str) -> None:
     """Beside the page's package there is one that has the header by its `<depend>` alone."""
-    needs("g++", "cmake", "colcon")
+    programs_or_skip("g++", "cmake", "colcon")
     if not Path("/usr/share/ament_cmake_auto").is_dir():
         pytest.skip("ament_cmake is missing")
     manifest = "\n".join(PAGE.blocks["package-xml"])
@@ -216,7 +209,7 @@ def test_colcon(terminal: Terminal, home: Path, expected: str) -> None:
     ],
 )
 def test_versions_that_cmake_takes_it_for(tmp_path: Path, wanted: str, *, found: bool) -> None:
-    needs("cmake")
+    programs_or_skip("cmake")
     (tmp_path / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(any LANGUAGES NONE)\n"
         f'find_package(shmmap {wanted} REQUIRED PATHS "{CPP}" NO_DEFAULT_PATH)\n'

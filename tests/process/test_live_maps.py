@@ -157,7 +157,7 @@ def test_a_worker_killed_at_any_step_loses_nothing(
     assert (tmp_path / "reached").exists(), "the step was never reached"
 
 
-def test_a_daemon_killed_again_and_again_loses_nothing(live_daemon: LiveDaemon) -> None:
+def test_a_daemon_killed_repeatedly_loses_nothing(live_daemon: LiveDaemon) -> None:
     """Its worker dies with it; chunks in memory are found by the next, and the mapper goes on."""
     scans = drive(12)
     one = live_daemon(checkpoint=60.0)  # memory alone has what was applied

@@ -164,7 +164,7 @@ def test_old_versions_stay_while_a_process_maps_them(
     one.until_segments(1, lambda: client.ask("stats"))
 
 
-def test_reload_again_and_again_while_clients_ask(
+def test_reload_repeatedly_while_clients_ask(
     daemon: DaemonFactory, connect: Connect, divided_map: DividedMap
 ) -> None:
     """Whatever a reply names is one whole state of its file, and the last one comes in the end."""

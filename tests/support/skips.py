@@ -9,6 +9,7 @@ Any other account may skip what needs root: it is marked so, and `.ci/run` runs 
 from __future__ import annotations
 
 import os
+import shutil
 from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -75,7 +76,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             terminalreporter.write_line(f"{test}: {reason}")
 
 
-# -- open3D, where its package and the libraries of the system that it needs are there
+# -- what a test needs and a machine may lack
+
+
+def programs_or_skip(*names: str) -> None:
+    """Skip the test where one of these programs is missing."""
+    for name in names:
+        if shutil.which(name) is None:
+            pytest.skip(f"{name} is missing")
 
 
 def open3d_or_skip() -> Any:

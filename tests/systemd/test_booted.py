@@ -384,7 +384,7 @@ def test_what_can_get_better_is_tried_again_until_it_has(
         fresh.shell("mount -o remount,size=50% /dev/shm")
 
 
-def test_a_client_that_waits_does_not_start_for_ever_what_stays_down(fresh: BootedSystemd) -> None:
+def test_a_waiting_client_does_not_keep_starting_what_stays_down(fresh: BootedSystemd) -> None:
     fresh.shell("cp /etc/shmmap/shmmap.toml /etc/shmmap/kept; echo 'bugdet = 3' >>/etc/shmmap/shmmap.toml")
     try:
         fresh.run("systemctl", "start", "shmmapd.socket")

@@ -134,7 +134,7 @@ def test_what_cannot_get_better_is_not_started_again(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", SERVICES)
-def test_what_can_get_better_is_tried_for_ever_after_a_growing_pause(path: Path, tmp_path: Path) -> None:
+def test_what_can_get_better_is_tried_without_end_after_a_growing_pause(path: Path, tmp_path: Path) -> None:
     """On every version of systemd: by a line of the unit, which is run here."""
     unit = parsed(path)
     assert (unit["Unit"]["StartLimitIntervalSec"], unit["Service"]["Restart"]) == ("0", "on-failure")
@@ -201,7 +201,7 @@ def test_the_service_is_one_group_of_the_scheduler(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [*(UNITS / "system").glob("*.socket"), *(UNITS / "user").glob("*.socket")])
-def test_a_waiting_client_does_not_start_for_ever_what_stays_down(path: Path) -> None:
+def test_a_waiting_client_does_not_keep_starting_what_stays_down(path: Path) -> None:
     """Pauses between starts that may help make at most five starts in this time."""
     socket = parsed(path)["Socket"]
     assert (socket["TriggerLimitIntervalSec"], socket["TriggerLimitBurst"]) == ("10s", "5")

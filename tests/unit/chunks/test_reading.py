@@ -96,7 +96,7 @@ def test_a_writer_that_died_in_the_middle_is_not_waited_for(
     assert len(copy.data) == chunk_bytes(FILLED)
 
 
-def test_one_that_changes_all_the_time_is_not_read_for_ever(
+def test_one_that_changes_all_the_time_is_read_a_bounded_number_of_times(
     monkeypatch: pytest.MonkeyPatch, chunk: tuple[ChunkFile, Path], opened: int
 ) -> None:
     view, tries, pread = chunk[0].view, 0, os.pread

@@ -6,12 +6,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from shmmap.demo.demo_town import DemoSettings, HeightImage, fit, free_memory_bytes
+from shmmap.demo.demo_town import DemoSettings, fit, free_memory_bytes
 from shmmap.errors import ConfigError
-from tests.support.pictures import png_pixels
 
 GIB = 1 << 30
 ROOMY = {"memory_bytes": 64 * GIB, "copies": 8}
@@ -58,18 +56,3 @@ def test_memory_that_processes_can_still_have() -> None:
 def test_no_room_at_all(shm_bytes: int, disk_bytes: int) -> None:
     with pytest.raises(ConfigError, match="too little room"):
         fit(DemoSettings(), shm_bytes=shm_bytes, disk_bytes=disk_bytes, **ROOMY)
-
-
-def test_height_image_shows_the_highest_point_north_up() -> None:
-    image = HeightImage((0.0, 0.0, 4.0, 2.0), pixel=1.0)
-    xyz = np.array(
-        [[0.5, 1.5, 0.0], [3.5, 0.5, 0.0], [3.5, 0.5, 12.0], [3.5, 0.5, 6.0], [9.0, 9.0, 9.0]], np.float32
-    )
-    image.add(xyz, np.array([20, 20, 30, 200, 200], np.float32))
-    colours = png_pixels(image.png(lambda x, y: 0.0 * (x + y)), "RGB").astype(int)
-    assert colours.shape == (2, 4, 3)
-    seen = (colours != 255).any(axis=2)
-    assert seen.tolist() == [[True, False, False, False], [False, False, False, True]]
-    red, _, blue = colours[1, 3]
-    assert red > blue + 40, "a roof, not the leaf below it"
-    assert np.ptp(colours[0, 0]) < 10, "grey road"

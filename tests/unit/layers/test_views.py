@@ -59,7 +59,7 @@ def split_mix(row: int, seed: int) -> int:
     return state ^ (state >> 31)
 
 
-def test_the_random_choice_is_for_ever() -> None:
+def test_the_random_choice_never_changes() -> None:
     assert sorted(sorted(range(20), key=lambda row: split_mix(row, 1))[:6]) == [4, 5, 6, 11, 13, 18]
     xyz = np.arange(60, dtype=np.float64).reshape(20, 3)
     found = (build_layer("sample(count=6,seed=1)", xyz)["xyz"][:, 0] / 3).astype(int).tolist()

@@ -135,7 +135,7 @@ def test_one_that_comes_between_the_look_and_the_renaming_keeps_the_name(
         os.close(fd)
 
 
-def test_a_name_that_is_made_again_and_again_is_an_error_after_some_time(
+def test_a_name_that_is_made_repeatedly_is_an_error_after_some_time(
     shm: ShmDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours = held_file(shm)

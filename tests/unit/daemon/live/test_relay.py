@@ -205,7 +205,7 @@ def test_requests_are_refused_when_the_worker_dies(world: World) -> None:
     assert [message.body for message in world.received()] == [b"23"]
 
 
-def test_one_that_dies_again_and_again_is_not_started_all_the_time(world: World) -> None:
+def test_one_that_dies_repeatedly_is_not_started_all_the_time(world: World) -> None:
     """The first time at once; then there are pauses, also where it dies just after it began."""
     world.now_s += STABLE_S
     for number, pause_s in enumerate([*PAUSES_S, PAUSES_S[-1]]):

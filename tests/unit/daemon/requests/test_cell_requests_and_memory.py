@@ -86,7 +86,7 @@ def test_looking_for_room_where_others_map_everything_comes_to_an_end(
                 one.scheduler.room.on_closes(one.now_s())
 
 
-def test_what_is_mapped_and_asked_for_again_and_again_is_no_reason_to_wait(
+def test_what_is_mapped_and_asked_for_repeatedly_is_no_reason_to_wait(
     inner: Inner, small_map: DividedMap
 ) -> None:
     """Another client is refused at once, though each answer begins another grace for what it hands out."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import socket
 import ssl
 import subprocess
@@ -21,6 +20,7 @@ import pytest
 
 from shmmap.errors import BadRequest, CannotWrite, ConfigError, MapDataError, MapMissing, Offline
 from tests.support.map_stores import BucketServer
+from tests.support.skips import programs_or_skip
 
 pytest.importorskip("zstandard", reason="zstandard is not installed")
 
@@ -291,8 +291,7 @@ def test_answers_become_errors_without_secrets(
 
 def test_a_certificate_that_no_authority_vouches_for(tmp_path: Path) -> None:
     pytest.importorskip("obstore", reason="obstore is not installed")
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is missing")
+    programs_or_skip("openssl")
     key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
@@ -338,8 +337,7 @@ for url in sys.argv[1:]:
 def test_no_address_but_the_given_one_is_asked(tmp_path: Path) -> None:
     """Without credentials in sight: what the kernel saw of connections is written down by strace."""
     pytest.importorskip("obstore", reason="obstore is not installed")
-    if shutil.which("strace") is None:
-        pytest.skip("strace is missing")
+    programs_or_skip("strace")
     listener = socket.create_server(("127.0.0.1", 0))
     listener.listen()
     endpoint = f"http://127.0.0.1:{listener.getsockname()[1]}"
