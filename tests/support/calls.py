@@ -23,8 +23,9 @@ def counted_calls() -> Iterator[Calls]:
     def note(_frame: FrameType, event: str, _argument: object) -> None:
         calls.count += event == "call"
 
+    before = sys.getprofile()
     sys.setprofile(note)
     try:
         yield calls
     finally:
-        sys.setprofile(None)
+        sys.setprofile(before)

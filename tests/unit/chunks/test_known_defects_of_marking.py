@@ -2,7 +2,7 @@
 """What was wrong in Bonxai and in Rolling-Bonxai's keys, each with the defect put back: that must be found.
 
 Bonxai is as of 3e8e63f, Rolling-Bonxai v2 as of 1a489e7; what they do was seen by running them.  Defects of
-chunks in memory and on disk are in ``tests/unit/daemon/live/test_known_defects.py``.
+chunks in memory and on disk are found by ``tests/unit/daemon/live/test_paged_map.py``.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class _RemembersEnds(Marker):
 def test_lost_rays(kind: type[Marker], *, right: bool) -> None:
     """Bonxai: to the end of a ray that it took for seen already it cast none; 1738 voxels stayed unknown.
 
-    (Rays that Rolling-Bonxai lost are in ``test_known_defects.py``.)
+    (Rays that Rolling-Bonxai lost are found by ``test_paged_map.py``.)
     """
     wall = np.array([[9.1, 0.3 * number + 0.05, 0.1] for number in range(-20, 20)])
     ends = [(x, y, z) for x, y, z in voxel_indices(wall, 0.2).tolist()]

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from shmmap import AutowareSquare, Box, MapWindow, Offline, connect
 from shmmap.daemon.loading.loads import PREFETCH
@@ -39,7 +40,7 @@ PAGES = np.array([[-40.0, -40.0, 0.0, 40.0], [0.0, -40.0, 40.0, 40.0]])
 EVERYWHERE = m.BoxMessage(-35.0, -35.0, 35.0, 35.0)
 IN_THE_WEST = m.BoxMessage(-35.0, -35.0, -5.0, 35.0)
 IN_THE_EAST = m.BoxMessage(5.0, -35.0, 35.0, 35.0)
-LONG_S = 30.0
+LONG_S = 200.0
 HALO = "denoise"
 
 
@@ -122,15 +123,31 @@ class Paged:
         assert len(self.pages.needed) <= most or any(map(is_needed, self.pages.needed))
         self.pages.most = len(self.pages)
 
-    def read_again(self) -> None:
+    def next_version(self) -> None:
+        """Have the origin serve the map as it is on the disk now, once it is asked again."""
         self.origin.whole = open_map(str(self.directory.root), cache_dir=self.cache_dir).load()
+
+    def read_again(self) -> None:
+        self.next_version()
         assert isinstance(self.ask(m.Reload), m.Reloaded)
 
 
 @pytest.fixture
-def paged(whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path) -> Paged:
-    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), PAGES, {WEST})
-    return Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+def in_pages(
+    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path
+) -> Callable[..., Paged]:
+    """Serve a map in pages: ``in_pages(boxes, known)``."""
+
+    def serve(boxes: NDArray[np.float64], known: set[int]) -> Paged:
+        origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), boxes, known)
+        return Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+
+    return serve
+
+
+@pytest.fixture
+def paged(in_pages: Callable[..., Paged]) -> Paged:
+    return in_pages(PAGES, {WEST})
 
 
 # --- requests for cells ----------------------------------------------------------------------------
@@ -149,45 +166,10 @@ def test_without_waiting_what_is_known_comes_and_the_reply_says_that_more_may(pa
     assert paged.ask(lambda n: m.Area(n, EVERYWHERE)).covered, "warm, too"
 
 
-def test_a_waiting_request_waits_for_its_pages_and_known_cells_are_loaded_meanwhile(paged: Paged) -> None:
-    paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
-    assert paged.pages.wanted == {EAST: 0.0}
-    paged.daemon.turn_until(lambda: paged.count("loads_finished") == len(WESTERN))
-    assert not paged.daemon.answered()
-    paged.pages.come(EAST)
-    reply = paged.answer()
-    assert (names(reply.cells), reply.covered, reply.pending) == (ALL, True, ())
-
-
-def test_when_time_is_up_it_says_what_is_known_by_then(paged: Paged) -> None:
-    reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=0.3))
-    assert (reply.covered, reply.reason) == (False, "")
-    assert set(names(reply.cells)) | {Path(cell.id).name for cell in reply.pending} == set(WESTERN)
-
-
-@pytest.mark.parametrize("before", [True, False])
-def test_pages_out_of_reach_are_not_waited_for(paged: Paged, before: bool) -> None:
-    if before:
-        paged.pages.fail(EAST)
-        paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
-        reply = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
-    else:
-        paged.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
-        paged.pages.fail(EAST)
-        reply = paged.answer()
-    assert (names(reply.cells), reply.covered, reply.reason) == (WESTERN, False, "offline")
-    paged.pages.come(EAST)  # by itself, when its origin is back
-    paged.daemon.turn_until(lambda: paged.pages.is_here(EAST))
-    assert paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).reason == ""
-
-
-def test_pages_come_one_after_the_other(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path
-) -> None:
+def test_pages_come_one_after_the_other(in_pages: Callable[..., Paged]) -> None:
     """Of four, in any order; the request is answered with the last one."""
     quarters = np.array([[x, y, x + 40.0, y + 40.0] for x in (-40.0, 0.0) for y in (-40.0, 0.0)])
-    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), quarters, set())
-    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    one = in_pages(quarters, set())
     one.begin(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S))
     for number, page in enumerate((2, 0, 3), 1):
         one.pages.come(page)
@@ -223,7 +205,7 @@ def test_another_state_of_the_map_while_a_request_waits_for_a_page(paged: Paged)
     paged.directory.remove_cell("20_20.pcd")
     paged.directory.change("-40_0.pcd", 5)
     paged.directory.write_metadata()
-    paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+    paged.next_version()
     before = paged.view.map_version
     paged.daemon.service._reload()
     paged.daemon.turn_until(lambda: paged.view.map_version != before)
@@ -245,39 +227,6 @@ def test_an_area_is_refused_by_the_pages_that_lie_wholly_in_it(
     assert reply.code == "bad_request"
     assert paged.pages.wanted == {}
     assert names(paged.ask(lambda n: m.Area(n, IN_THE_WEST, wait=LONG_S)).cells) == WESTERN
-
-
-@pytest.mark.parametrize("by_name", [False, True])
-def test_nothing_that_may_lie_in_the_unknown_part_is_removed(paged: Paged, by_name: bool) -> None:
-    paged.know(WEST, EAST)
-    held = paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).cells
-    version_of = {Path(cell.id).name: cell.version for cell in held}
-    strange = 12345
-
-    def differential(n: int, wait: float | None = None) -> m.Differential:
-        named = tuple(HeldCell(name, version) for name, version in version_of.items())
-        if by_name:
-            return m.Differential(n, IN_THE_EAST, held=(*named, HeldCell("nowhere.pcd", strange)), wait=wait)
-        return m.Differential(
-            n, IN_THE_EAST, packed=pack_versions([*version_of.values(), strange]), wait=wait
-        )
-
-    def removed(reply: m.Cells) -> list[str]:
-        name_of = {version: name for name, version in version_of.items()} | {strange: "nowhere.pcd"}
-        return sorted([*reply.removed, *(name_of[v] for v in unpack_versions(reply.removed_packed))])
-
-    for resident in list(paged.daemon.memory.cache.ledger.residents()):
-        paged.daemon.memory.cache.reclaimer.retire(resident, 0.0)
-    paged.know(WEST)
-    reply = paged.ask(differential)
-    assert not reply.covered
-    assert removed(reply) == WESTERN, "known, and outside of the area"
-    paged.begin(lambda n: differential(n, LONG_S))
-    paged.pages.come(EAST)
-    reply = paged.answer()
-    assert reply.covered
-    assert removed(reply) == sorted([*WESTERN, "nowhere.pcd"])
-    assert names(reply.cells) == [], "a client that kept the cells lacks nothing"
 
 
 def test_an_id_that_is_not_known_may_be_somewhere(paged: Paged) -> None:
@@ -318,16 +267,33 @@ def _absent(one: Paged, area: m.CircleMessage) -> list[int]:
     return [page for page in one.pages.of_area(around) if not one.pages.is_here(page)]
 
 
+STRIPS = np.array([[x, y, x + 40.0, y + 20.0] for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)])
+
+
+def difference(
+    number: int, area: m.CircleMessage, held: dict[str, int], chance: random.Random, **more: Any
+) -> m.Differential:
+    """Ask for an area; what is held is named, or packed."""
+    if chance.random() < 0.5:
+        return m.Differential(
+            number, area, held=tuple(HeldCell(name, version) for name, version in held.items()), **more
+        )
+    return m.Differential(number, area, packed=pack_versions(held.values()), **more)
+
+
+def removed(reply: m.Cells, held: dict[str, int]) -> set[str]:
+    """Return what of it is to be dropped."""
+    of_version = {version: name for name, version in held.items()}
+    return {*reply.removed, *(of_version[version] for version in unpack_versions(reply.removed_packed))}
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, seed: int
+    in_pages: Callable[..., Paged], seed: int
 ) -> None:
-    """While pages come, fail and are given up, and the map changes; what is held is packed or named."""
+    """While pages come, fail and are given up, and the map changes."""
     chance = random.Random(seed)
-    corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
-    strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
-    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), strips, set())
-    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    one = in_pages(STRIPS, set())
     held: dict[str, int] = {}
     covered = 0
     for step in range(100):
@@ -341,30 +307,26 @@ def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
             one.ask(m.Evict)
             one.give_up(chance.randrange(4))
         elif action < 0.54:
-            small_map.change(chance.choice(ALL), step)
+            one.directory.change(chance.choice(ALL), step)
             one.read_again()
         one.daemon.turn_until(lambda: one.pages.settled)
         area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
         while True:
-            by_name = chance.random() < 0.5
-            named = tuple(HeldCell(name, version) for name, version in held.items()) if by_name else ()
-            packed = b"" if by_name else pack_versions(held.values())
             known = [one.view.id(i) for page in one.pages.needed for i in one.pages.cells(page)]
-            reply = one.ask(partial(m.Differential, area=area, held=named, packed=packed))
-            of_version = {version: name for name, version in held.items()}
-            removed = {*reply.removed, *(of_version[v] for v in unpack_versions(reply.removed_packed))}
+            reply = one.ask(partial(difference, area=area, held=held, chance=chance))
+            gone = removed(reply, held)
             box_of = {Path(cell).name: one.origin.whole.box(i) for i, cell in enumerate(_all_ids(one))}
             inside = {name for name in ALL if _touches(area, box_of[name])}
             now_known = {Path(cell).name for cell in known}
             assert reply.covered is (not _absent(one, area))
-            assert removed == {
+            assert gone == {
                 name for name in held if name not in inside and (name in now_known or reply.covered)
             }
             fresh = {cell.id: cell.version for cell in reply.cells if not cell.stale}
             want = {name for name in inside & now_known if held.get(name) != _version(one, name)}
             assert set(fresh) | {cell.id for cell in reply.pending} == want
             assert all(version == _version(one, name) for name, version in fresh.items())
-            held = {name: version for name, version in held.items() if name not in removed} | fresh
+            held = {name: version for name, version in held.items() if name not in gone} | fresh
             if not reply.pending:
                 break
         covered += reply.covered
@@ -375,16 +337,13 @@ def test_along_a_drive_every_reply_is_the_set_difference_of_what_is_known(
 
 @pytest.mark.parametrize("layer", ["points", HALO])
 def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
-    whole: Callable[..., WholeDaemon], small_map: DividedMap, tmp_path: Path, layer: str
+    in_pages: Callable[..., Paged], layer: str
 ) -> None:
     """Pages come in any order while it waits, some cannot be had, and the map may change meanwhile."""
     if layer == HALO:
         open3d_or_skip()
     chance = random.Random(7)
-    corners = [(x, y) for x in (-40.0, 0.0) for y in (-40.0, -20.0, 0.0, 20.0)]
-    strips = np.array([[x, y, x + 40.0, y + 20.0] for x, y in corners])
-    origin = PagedOrigin(open_map(str(small_map.root), cache_dir=str(tmp_path)).load(), strips, set())
-    one = Paged(whole(small_map.root, origin=origin), origin, small_map, str(tmp_path))
+    one = in_pages(STRIPS, set())
     held: dict[str, int] = {}
     reasons: list[str] = []
     for step in range(40):
@@ -394,16 +353,15 @@ def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
             one.give_up(0)
         area = m.CircleMessage(chance.uniform(-40, 40), chance.uniform(-40, 40), chance.uniform(5, 30))
         one.requests += 1
-        named = tuple(HeldCell(name, version) for name, version in held.items())
-        one.daemon.send(m.Differential(one.requests, area, (layer,), held=named, wait=LONG_S))
+        one.daemon.send(difference(one.requests, area, held, chance, layers=(layer,), wait=LONG_S))
         changes = layer == "points" and chance.random() < 0.15
         while not one.daemon.answered():
             one.daemon.turn()
             one.let_come(chance, failing=0.15)
             if changes and len(one.daemon.service._loop.cells):
                 changes = False
-                small_map.change(chance.choice(ALL), step)
-                one.origin.whole = open_map(str(small_map.root), cache_dir=str(tmp_path)).load()
+                one.directory.change(chance.choice(ALL), step)
+                one.next_version()
                 one.daemon.service._reload()
         reply = one.daemon.received()
         if reply.map_version != one.origin.whole.map_version:
@@ -426,12 +384,12 @@ def test_along_a_drive_a_waiting_request_has_all_that_can_be_reached(
         assert fresh == {name: current[name] for name in fresh}
         if reply.covered:
             assert set(fresh) | lost == {name for name in inside if held.get(name) != current[name]}
-            assert set(reply.removed) == {name for name in held if name not in inside}
+            assert removed(reply, held) == {name for name in held if name not in inside}
         else:
             assert reply.reason == "offline"
             assert set(fresh) | lost <= inside
-            assert not inside & set(reply.removed)
-        held = {name: v for name, v in held.items() if name not in reply.removed} | fresh
+            assert not inside & removed(reply, held)
+        held = {name: v for name, v in held.items() if name not in removed(reply, held)} | fresh
     assert reasons.count("") > 10
     assert "offline" in reasons
 
@@ -464,16 +422,6 @@ def test_sizes_that_the_catalogue_knows_are_taken(paged: Paged, monkeypatch: pyt
     guessed = cache.estimate(0, "points")
     monkeypatch.setattr(PagedView, "ready", lambda view, index, _: Ready(20_000, view.version(index)))
     assert (guessed, cache.estimate(0, "points"), cache.estimate(0, "ndt(leaf=2.0)")) == (12288, 20480, 20480)
-
-
-def test_how_many_cells_are_known_is_counted(paged: Paged) -> None:
-    def known() -> tuple[int, int]:
-        counters = paged.ask(m.Stats).counters
-        return counters["map_cells"], counters["map_cells_known"]
-
-    assert known() == (16, 8)
-    paged.know(WEST, EAST)
-    assert known() == (16, 16)
 
 
 def test_a_page_goes_when_nothing_needs_it_and_no_sooner(paged: Paged) -> None:
@@ -530,7 +478,7 @@ def test_another_version_is_served_when_it_knows_what_is_known_of_this_one(paged
     before = {cell.id: cell.version for cell in paged.ask(lambda n: m.Area(n, EVERYWHERE, wait=LONG_S)).cells}
     served = paged.view
     paged.directory.change("20_20.pcd", 5)
-    paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+    paged.next_version()
     paged.origin.sharing = {WEST}
     paged.requests += 1
     paged.daemon.send(m.Reload(paged.requests))
@@ -627,21 +575,13 @@ def test_the_list_of_an_area_asks_for_no_other_page(paged: Paged) -> None:
     assert paged.pages.wanted == {}
 
 
-@pytest.mark.parametrize("before", [True, False])
-def test_a_list_that_cannot_be_had_is_an_error(
-    paged: Paged, monkeypatch: pytest.MonkeyPatch, before: bool
-) -> None:
+def test_a_list_that_cannot_be_had_is_an_error(paged: Paged, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_queries, "METADATA_WAIT_S", LONG_S)
-    if before:
-        paged.pages.fail(EAST)
-        paged.daemon.turn_until(lambda: paged.pages.is_out_of_reach(EAST))
-        reply = paged.ask(lambda n: m.Metadata(n, start=EAST << 32))
-    else:
-        paged.requests += 1
-        paged.daemon.send(m.Metadata(paged.requests, start=EAST << 32))
-        paged.daemon.turn_until(lambda: paged.paging.queries._waiting)
-        paged.pages.fail(EAST)
-        reply = paged.answer()
+    paged.requests += 1
+    paged.daemon.send(m.Metadata(paged.requests, start=EAST << 32))
+    paged.daemon.turn_until(lambda: paged.pages.wanted)
+    paged.pages.fail(EAST)
+    reply = paged.answer()
     assert isinstance(reply, m.ErrorReply)
     assert reply.code == "offline"
 
@@ -693,7 +633,7 @@ def test_segments_of_unknown_cells_are_kept_unjudged(
     paged.daemon.close(keep=True)
     if change:
         paged.directory.change("20_20.pcd", 5)
-        paged.origin.whole = open_map(str(paged.directory.root), cache_dir=paged.cache_dir).load()
+        paged.next_version()
     paged.origin.known = {WEST}
     paged.daemon = whole(paged.directory.root, origin=paged.origin)
     ledger, loaded = paged.daemon.memory.cache.ledger, paged.count("loads_finished")
@@ -854,4 +794,4 @@ def test_an_origin_out_of_reach_does_not_change_the_map(paged: Paged) -> None:
         with pytest.raises(Offline, match="does not answer") as refused:
             client.reload()
         assert refused.value.exit_code == 75
-        assert len(client.area(AutowareSquare(-30.0, 0.0, 20.0))) == len(WESTERN)
+        assert len(client.area(AutowareSquare(-30.0, 0.0, 20.0), wait=LONG_S)) == len(WESTERN)

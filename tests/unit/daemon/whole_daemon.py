@@ -30,7 +30,7 @@ from shmmap.segment.directory import ShmDirectory
 from shmmap.segment.pins import prepare_process
 
 HELLO = m.Hello(1, *m.PROTOCOL_VERSION, "walker")
-TIMEOUT_S = 60.0
+TIMEOUT_S = 240.0
 
 
 class WholeDaemon:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shmmap.demo.demo_town import HeightImage
 
 from shmmap.errors import BadRequest
 from shmmap.origin.map_directory import open_map
-from shmmap.simulation.height_image import HeightImage
 from shmmap.simulation.town import Town
 from tests.support.divided_map import read_pcd
 from tests.support.pictures import png_pixels

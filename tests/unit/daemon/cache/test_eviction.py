@@ -266,7 +266,7 @@ def test_when_clients_move_nothing_goes_by_an_old_score() -> None:
     assert set(offered(order, worth, 0.0)) == set(far)
 
 
-@pytest.mark.parametrize("count", [1000, 100_000])
+@pytest.mark.parametrize("count", [1000, 20_000])
 def test_the_work_for_a_victim_does_not_depend_on_how_many_there_are(count: int) -> None:
     worth = Worth()
     order, _ = settled(count, worth)

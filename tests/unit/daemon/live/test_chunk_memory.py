@@ -30,6 +30,7 @@ from shmmap.daemon.live import chunk_memory
 from shmmap.daemon.live.chunk_memory import ChunkFile, ChunkMemory, live_prefix
 from shmmap.errors import CannotStart, SegmentCorrupt
 from tests.support.accounts import MEMBER
+from tests.support.odd_files import failing
 
 PREFIX = live_prefix("test", "lidar")
 IDENTITY = ChunkIdentity(bytes(16), ChunkKey(3, -1, 0), 0.1, -1992, 3476, 0, 0, 7, "map")
@@ -157,11 +158,8 @@ except OSError as error:
 def test_where_nothing_more_can_be_mapped_no_name_stays(
     monkeypatch: pytest.MonkeyPatch, memory: ChunkMemory, directory: Path
 ) -> None:
-    def no_room(*_: object, **__: object) -> int:
-        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
-
     with monkeypatch.context() as patch:
-        patch.setattr(chunk_memory, "map_chunk", no_room)
+        patch.setattr(chunk_memory, "map_chunk", failing(errno.ENOMEM))
         with pytest.raises(OSError, match="Cannot allocate memory"):
             memory.create(new_header(IDENTITY))
     assert list(directory.iterdir()) == []

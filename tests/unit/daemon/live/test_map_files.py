@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import random
 import re
-import socket
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -22,6 +23,7 @@ from shmmap.daemon.live.disk.map_files import SCANS_AHEAD, MapFiles
 from shmmap.daemon.live.disk.map_record import MapSettings, Row
 from shmmap.errors import ConfigError, MapDataError
 from tests.support.disks import CutDisk, PowerCut
+from tests.support.odd_files import ODD_FILES, failing
 
 SETTINGS = MapSettings(resolution=0.1)
 KEYS = [ChunkKey(0, 0, 0), ChunkKey(-1, 2, 0), ChunkKey(5, 5, -5)]
@@ -144,7 +146,7 @@ def test_a_full_disk_leaves_what_there_was(monkeypatch: pytest.MonkeyPatch, what
             made.save(key, chunk(made, key, version))
         made.flush()
     with monkeypatch.context() as patch:
-        patch.setattr(disk, what, _full)
+        patch.setattr(disk, what, failing(errno.ENOSPC))
         with pytest.raises(OSError, match="No space"):
             made.save(KEYS[0], chunk(made, KEYS[0], 9))
     assert sorted(disk.names()) == sorted([*(key.text + ".chunk" for key in KEYS), "map.json"])
@@ -217,7 +219,7 @@ def test_what_a_disk_does_not_flush_is_kept_and_written_again(
         def at_the_second(*arguments: str) -> None:
             calls[0] += 1
             if calls[0] == 2 or what == "sync_names":
-                _full()
+                failing(errno.ENOSPC)()
             getattr(CutDisk, what)(disk, *arguments)
 
         patch.setattr(disk, what, at_the_second)
@@ -257,7 +259,7 @@ def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch, *, a
     made.save(KEYS[0], chunk(made, KEYS[0], 1))
     if again:
         with monkeypatch.context() as patch:
-            patch.setattr(disk, "sync_names", _full)
+            patch.setattr(disk, "sync_names", failing(errno.ENOSPC))
             with pytest.raises(OSError, match="No space"):
                 made.flush()
 
@@ -275,10 +277,6 @@ def test_what_is_saved_while_it_is_flushed(monkeypatch: pytest.MonkeyPatch, *, a
     made.remove_spare()
     assert sorted(disk.names()) == ["0_0_0.chunk", "manifest.json", "map.json"]
     assert version_of(MapFiles(disk, SETTINGS), KEYS[0]) == 2
-
-
-def _full(*_: object) -> None:
-    raise OSError(28, os.strerror(28))
 
 
 def noted(monkeypatch: pytest.MonkeyPatch, disk: CutDisk, what: str) -> list[str]:
@@ -502,20 +500,12 @@ def test_what_is_no_regular_file_keeps_the_map_closed(tmp_path: Path, name: str,
     path = tmp_path / name
     if path.exists():
         path.rename(tmp_path / "kept")
-    if kind == "directory":
-        path.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "loop":
-        path.symlink_to(path)
-    else:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(f"/proc/self/fd/{folder._fd}/{name}")
+    ODD_FILES[kind](path)
     before = sorted(os.listdir(tmp_path))
     with pytest.raises(OSError, match=f"{re.escape(name)} cannot be read: "):
         MapFiles(folder, SETTINGS)
     assert sorted(os.listdir(tmp_path)) == before
-    path.rmdir() if kind == "directory" else path.unlink()
+    shutil.rmtree(path) if kind == "directory" else path.unlink()
     if (tmp_path / "kept").exists():
         (tmp_path / "kept").rename(path)
     assert list(MapFiles(folder, SETTINGS).rows) == [KEYS[0]]

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live map with little memory equals an unbounded one, and a killed writer loses nothing of it."""
+"""A live map with little memory equals an unbounded one, and nothing of it is lost when its writer is killed.
+
+Rolling-Bonxai fails here.  At 8936187 it updated the chunks around the sensor's and not that one, put the
+scan of a crossing one chunk off, dropped scans while a chunk was loaded, and left 29 changed chunks unwritten
+at its end.  At 1a489e7 it dropped the rays that end in a chunk that is not there (3 % of a drive's points),
+and read a chunk from its file before that was written (90 % of its voxels were lost).
+"""
 
 from __future__ import annotations
 
@@ -18,11 +24,10 @@ from shmmap.daemon.live.chunk_memory import ChunkMemory
 from tests.support.chunk_memory import ChunkMemory as Unbounded
 from tests.support.forked_programs import run_verb
 from tests.support.live_drive import RESOLUTION, SCANS, Voxel, marked, opened, voxels_on_disk
+from tests.support.odd_files import failing
 
 LITTLE = "1500000", "0.05"
 """Of about eight megabytes that the whole map takes, and more than one chunk can; saved all the time."""
-PLENTY = "30000000", "1e9"
-"""Nothing is saved that stays in memory: what a scan said is there alone until the end."""
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +39,9 @@ def reference() -> dict[Voxel, int]:
     return unbounded.voxels()
 
 
-def run(
-    shm: Path, disk: Path, first: int, memory: tuple[str, str] = LITTLE, crash: str = "", code: int = 0
-) -> str:
+def run(shm: Path, disk: Path, first: int, crash: str = "", code: int = 0) -> str:
     """Drive from a scan to the end, or until it is killed; what it says."""
-    words = [str(shm), str(disk), *memory, str(first)]
+    words = [str(shm), str(disk), *LITTLE, str(first)]
     environment = {**os.environ, **({"SHMMAP_TEST_CRASH": crash} if crash else {})}
     done = run_verb(words, environment, module="tests.support.live_drive")
     assert done.returncode == code, done.stderr
@@ -82,27 +85,24 @@ def finish(shm: Path, disk: Path, lines: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("label", "times", "memory"),
+    ("label", "times"),
     [
-        ("live.copied", 60, LITTLE),
-        ("live.odd", 61, LITTLE),
-        ("live.applied", 1, LITTLE),
-        ("live.applied", 90, LITTLE),
-        ("live.even", 97, LITTLE),
-        ("live.map", 1, LITTLE),
-        ("live.written", 9, LITTLE),
-        ("live.synced", 1, LITTLE),
-        ("live.renamed", 12, LITTLE),
-        ("live.flushed", 1, LITTLE),
-        ("live.odd", 61, PLENTY),
-        ("live.applied", 90, PLENTY),
-        ("live.written", 9, PLENTY),
+        ("live.copied", 60),
+        ("live.odd", 61),
+        ("live.applied", 1),
+        ("live.applied", 90),
+        ("live.even", 97),
+        ("live.map", 1),
+        ("live.written", 9),
+        ("live.synced", 1),
+        ("live.renamed", 12),
+        ("live.flushed", 1),
     ],
 )
 def test_a_writer_that_is_killed_at_any_step_loses_nothing(
-    shm: Path, tmp_path: Path, reference: dict[Voxel, int], label: str, times: int, memory: tuple[str, str]
+    shm: Path, tmp_path: Path, reference: dict[Voxel, int], label: str, times: int
 ) -> None:
-    lines = run(shm, tmp_path, 1, memory, crash=f"{label}:{times}", code=-signal.SIGKILL)
+    lines = run(shm, tmp_path, 1, crash=f"{label}:{times}", code=-signal.SIGKILL)
     finish(shm, tmp_path, lines)
     assert_equal_to(reference, shm, tmp_path)
 
@@ -145,7 +145,7 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
     folder.close()
     left = sorted(shm.iterdir())
     with monkeypatch.context() as patch:
-        patch.setattr(ChunkMemory, "open", _too_many_files)
+        patch.setattr(ChunkMemory, "open", failing(errno.EMFILE))
         with pytest.raises(OSError, match="Too many open files"):
             opened(shm, tmp_path, 10**9)
     assert sorted(shm.iterdir()) == left
@@ -155,7 +155,3 @@ def test_what_was_all_but_given_up_comes_back_from_disk(
     made.close()
     folder.close()
     assert_equal_to(reference, shm, tmp_path)
-
-
-def _too_many_files(*_: object) -> None:
-    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))

@@ -57,16 +57,6 @@ def test_it_is_tried_again_after_a_pause(inner: Inner, small_map: DividedMap, ou
     assert not one.loads.failures
 
 
-def test_others_are_not_concerned(inner: Inner, small_map: DividedMap, out_of_reach: Path) -> None:
-    assert out_of_reach.exists()
-    one = inner(small_map.root)
-    reply = one.everything()
-    assert len(reply.cells) == 15
-    (failed,) = reply.failed
-    assert (Path(failed.id).name, failed.code, failed.holders) == (CELL, "offline", ())
-    assert reply.covered, "where the cell lies is known"
-
-
 def test_an_old_version_stays_until_the_new_one_can_be_reached(
     inner: Inner, small_map: DividedMap, out_of_reach: Path
 ) -> None:

@@ -32,14 +32,6 @@ from tests.support.divided_map import random_points, write_ascii, write_pcd
 BOX = (0.0, 0.0, 20.0, 20.0)
 TIMEOUT_S = 60.0
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in sys.path if part)}
-DAEMON = """
-import os, subprocess, sys
-program, channel, *rest = sys.argv[1:]
-command = [program, "-m", "shmmap.daemon.loading.parent_main", channel, str(os.getpid()), *rest]
-child = subprocess.Popen(command, pass_fds=[int(channel)])
-print(child.pid, flush=True)
-child.wait()
-"""
 COMMAND = [sys.executable, "-m", "shmmap.daemon.loading.parent_main"]
 
 
@@ -287,38 +279,6 @@ def test_a_cell_that_takes_too_much_memory_fails_alone(shm_dir: str, tmp_path: P
         one.close()
     finally:
         parent.end()
-
-
-def test_loaders_die_with_their_parent_and_it_with_the_daemon(shm_dir: str) -> None:
-    """Killed, they close nothing; and our end of the loader's channel is still open."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.settimeout(TIMEOUT_S)
-    daemon = subprocess.Popen(
-        [sys.executable, "-c", DAEMON, sys.executable, str(theirs.fileno())],
-        pass_fds=(theirs.fileno(),), stdout=subprocess.PIPE, text=True, env=ENVIRONMENT,
-    )  # fmt: skip
-    theirs.close()
-    try:
-        assert daemon.stdout is not None
-        parent = int(daemon.stdout.readline())
-        ours.send(f"{shm_dir}\0{2 << 30}".encode())
-        assert ours.recv(100).decode() == shmmap.__version__
-        mine, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with mine, its:
-            mine.settimeout(TIMEOUT_S)
-            socket.send_fds(ours, [b"loader"], [its.fileno()])
-            ready = worker_messages.decode_from_worker(mine.recv(1000))
-            assert isinstance(ready, worker_messages.Ready)
-            daemon.kill()
-            daemon.wait()
-            assert wait_ended(parent, TIMEOUT_S)
-            assert wait_ended(ready.pid, TIMEOUT_S)
-    finally:
-        daemon.kill()
-        daemon.wait()
-        if daemon.stdout is not None:
-            daemon.stdout.close()
-        ours.close()
 
 
 FORKED = """

@@ -344,17 +344,23 @@ def test_few_shards_are_kept_whatever_they_take(served: Served) -> None:
     assert small.pages.spare() is None
 
 
-def test_what_is_out_of_reach_is_tried_when_that_is_asked_for(served: Served) -> None:
+@pytest.mark.parametrize("wrong", ["away", "damaged"])
+def test_what_cannot_be_had_is_tried_when_that_is_asked_for(served: Served, wrong: str) -> None:
     root = publish(served.store, some_cells(np.random.default_rng(7), 30, width=100.0))
-    served.store.is_out = True
+    right = dict(served.store.objects)
+    served.store.is_out = wrong == "away"
+    if wrong == "damaged":
+        served.store.objects = {path: data[:-1] + bytes([data[-1] ^ 1]) for path, data in right.items()}
     view = served.view(root)
-    view.pages.want(range(len(view.pages)), 0.0)
+    pages = range(len(view.pages))
+    view.pages.want(pages, 0.0)
     lost: list[int] = []
     while len(lost) < len(view.pages):
         lost += collect(view.pages)[1]
-    assert all(map(view.pages.is_out_of_reach, range(len(view.pages))))
-    assert served.failed
-    served.store.is_out = False
+    assert all(map(view.pages.is_out_of_reach, pages))
+    assert not any(map(view.pages.is_here, pages))
+    assert served.failed or wrong == "damaged"
+    served.store.is_out, served.store.objects = False, right
     asked = len(served.store.asked)
     view.pages.want([0], 0.0)
     assert view.pages.is_out_of_reach(0)
@@ -363,22 +369,6 @@ def test_what_is_out_of_reach_is_tried_when_that_is_asked_for(served: Served) ->
     while not view.complete:
         collect(view.pages)
     assert not view.pages.is_out_of_reach(0)
-
-
-def test_a_damaged_shard_is_not_used(served: Served) -> None:
-    root = publish(served.store, some_cells(np.random.default_rng(8), 30, width=100.0))
-    path = f"blobs/sha256/{root.shard_sha256(0).hex()}"
-    right = served.store.objects[path]
-    served.store.objects[path] = right[:-1] + bytes([right[-1] ^ 1])
-    view = served.view(root)
-    view.pages.want([0], 0.0)
-    while not view.pages.is_out_of_reach(0):
-        collect(view.pages)
-    assert not view.pages.is_here(0)
-    served.store.objects[path] = right
-    view.pages.try_again()
-    while not view.complete:
-        collect(view.pages)
 
 
 def test_a_version_that_is_served_no_more_goes(served: Served) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,13 +20,19 @@ from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_r
 from shmmap.errors import InstanceBusy, MapDataError, MapMissing
 from tests.support.live_drive import SETTINGS
 from tests.support.live_reference import contents, stored_drive
+from tests.support.odd_files import ODD_FILES
+
+
+def checked_as_it_is(directory: Path) -> CheckedMap:
+    """Check a map as everybody may."""
+    with opened_folder_to_read(str(directory)) as files:
+        return check(files, str(directory))
 
 
 def checked(directory: Path) -> CheckedMap:
-    """Check a map without changing it, as any account may."""
+    """Check a map, which changes nothing."""
     before = contents(directory)
-    with opened_folder_to_read(str(directory)) as files:
-        found = check(files, str(directory))
+    found = checked_as_it_is(directory)
     assert contents(directory) == before
     return found
 
@@ -210,36 +215,18 @@ def test_the_manifest(tmp_path: Path, change: Callable[[Path], None], manifest: 
     assert checked(tmp_path).good
 
 
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def folder_with_something(path: Path) -> None:
-    path.mkdir()
-    (path / "mine").write_text("kept")
-
-
-def loop(path: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def device(path: Path) -> None:
-    os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))  # /dev/zero
-
-
 @pytest.mark.parametrize("what", [".chunk", "manifest.json", ".chunk.abcd.tmp"])
 @pytest.mark.parametrize(
-    "kind", [pipe, folder_with_something, loop, pytest.param(device, marks=pytest.mark.root)]
+    "kind", ["pipe", "directory", "loop", pytest.param("device", marks=pytest.mark.root)]
 )
-def test_what_cannot_be_read_is_quarantined(tmp_path: Path, what: str, kind: Callable[[Path], None]) -> None:
+def test_what_cannot_be_read_is_quarantined(tmp_path: Path, what: str, kind: str) -> None:
     """It may be as good as ever: a check changes nothing, and a repair gives it another name."""
     stored_drive(tmp_path)
     path = largest(tmp_path) if what == ".chunk" else tmp_path / what
     if path.exists():
         path.rename(tmp_path / "elsewhere")
-    kind(path)
-    with opened_folder_to_read(str(tmp_path)) as files:
-        found = check(files, str(tmp_path))
+    ODD_FILES[kind](path)
+    found = checked_as_it_is(tmp_path)
     if what == "manifest.json":
         assert found.manifest == "unreadable"
     else:
@@ -255,11 +242,6 @@ def test_what_cannot_be_read_is_quarantined(tmp_path: Path, what: str, kind: Cal
     assert (again.good, again.manifest, again.quarantined) == (True, "current", [quarantined.kept_as])
     with opened_folder(str(tmp_path), "") as folder:
         MapFiles(folder, SETTINGS)
-
-
-def checked_as_it_is(directory: Path) -> CheckedMap:
-    with opened_folder_to_read(str(directory)) as files:
-        return check(files, str(directory))
 
 
 def test_what_is_only_there_to_be_written_over_is_not_reported(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import errno
-import os
 
 import pytest
 
@@ -14,6 +13,7 @@ from shmmap.daemon.live.disk.map_record import MapSettings
 from shmmap.daemon.live.worker.mappers import APPLIED_BYTES, AppliedScans, Mappers
 from shmmap.errors import BadRequest, Busy, LiveInterrupted
 from tests.support.disks import CutDisk
+from tests.support.odd_files import failing
 
 SETTINGS = MapSettings(resolution=0.1)
 
@@ -158,12 +158,8 @@ def test_a_mapper_goes_on_while_the_disk_is_full(
 ) -> None:
     active = mappers.open(1000, "front", 1)
     number = active.mapper.number
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     with monkeypatch.context() as patch:
-        patch.setattr(CutDisk, "write", full)
+        patch.setattr(CutDisk, "write", failing(errno.ENOSPC))
         for scan in range(1, 3000):
             mappers.expect(number, scan, 1)
         for _ in range(2):
@@ -184,12 +180,8 @@ def test_a_mapper_that_cannot_be_forgotten_stays(
 ) -> None:
     for number in range(MAPPERS):
         mappers.open(1000, f"m{number}", 0)
-
-    def broken(*_: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
     with monkeypatch.context() as patch:
-        patch.setattr(CutDisk, "write", broken)
+        patch.setattr(CutDisk, "write", failing(errno.EIO))
         for _ in range(2):
             with pytest.raises(OSError, match="Input/output"):
                 mappers.open(1000, "new", 1)

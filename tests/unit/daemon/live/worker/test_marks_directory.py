@@ -14,6 +14,7 @@ import pytest
 from shmmap.daemon.live.worker.marks_directory import MAX_MARKS_BYTES, MarksDirectory
 from shmmap.errors import BadRequest
 from tests.support.accounts import MEMBER
+from tests.support.odd_files import ODD_FILES
 
 SESSION = 0x1A
 MINE = "1a.7"
@@ -62,42 +63,25 @@ def test_sizes_that_cannot_be(marks: MarksDirectory, path: Path, nbytes: int) ->
         take(marks, nbytes=nbytes)
 
 
-def fifo(path: Path) -> None:
-    os.mkfifo(path)
-
-
 def link(path: Path) -> None:
     other = path.with_name("1b.1")
     other.write_bytes(CONTENT)
     path.symlink_to(other)
 
 
-def folder(path: Path) -> None:
-    path.mkdir()
-
-
-def nothing(path: Path) -> None:
-    """No file of that name."""
-
-
-def shorter(path: Path) -> None:
-    path.write_bytes(CONTENT[:-1])
-
-
-def longer(path: Path) -> None:
-    path.write_bytes(CONTENT + b"x")
-
-
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (fifo, "no regular file"), (link, "cannot be opened"), (folder, "no regular file"),
-        (nothing, "cannot be opened: No such file"), (shorter, "has 14 bytes, not 15"),
-        (longer, "has 16 bytes, not 15"),
+        (ODD_FILES["pipe"], "no regular file"),
+        (ODD_FILES["directory"], "no regular file"),
+        (link, "cannot be opened"),
+        (lambda _path: None, "cannot be opened: No such file"),
+        (lambda path: path.write_bytes(CONTENT[:-1]), "has 14 bytes, not 15"),
+        (lambda path: path.write_bytes(CONTENT + b"x"), "has 16 bytes, not 15"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_file_of_marks(
-    marks: MarksDirectory, path: Path, make: Callable[[Path], None], said: str
+    marks: MarksDirectory, path: Path, make: Callable[[Path], object], said: str
 ) -> None:
     make(path / MINE)
     with pytest.raises(BadRequest, match=said):
@@ -154,7 +138,7 @@ def test_the_files_of_a_session_go_with_it(marks: MarksDirectory, path: Path) ->
     for name in ("1a.1", "1a.2", "1.1", "1a1.1", "11a.1"):
         (path / name).write_bytes(CONTENT)
     (path / "1a.3").mkdir()
-    fifo(path / "1a.4")
+    os.mkfifo(path / "1a.4")
     (path / "1a.5").symlink_to("/etc/passwd")
     (path / "1a.6").mkdir()
     (path / "1a.6" / "x").touch()

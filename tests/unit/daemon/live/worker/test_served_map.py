@@ -7,7 +7,10 @@ import errno
 import os
 import socket
 import threading
+import tracemalloc
 from collections.abc import Callable
+from itertools import count, islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -164,6 +167,48 @@ def test_unexpected_marks_end_nothing(serve: Serve, monkeypatch: pytest.MonkeyPa
     assert isinstance(refused, ErrorReply)
     assert refused.code == "internal"
     assert one.answer(one.send(marks, mapper, 1)).scan == 1
+    one.end()
+
+
+def test_a_chunk_whose_file_is_damaged_is_not_written_over(serve: Serve, tmp_path: Path) -> None:
+    """Nothing is known of it from now on; the file stays, under another name."""
+    (marks,) = marked(1)
+
+    def map_it() -> None:
+        one = serve(**LATER)
+        opened = one.open()
+        one.answer(one.send(marks, opened.mapper, opened.next_scan))
+        one.end()
+
+    map_it()
+    victim = tmp_path / "map" / f"{marks.chunks[0].text}.chunk"
+    damaged = bytearray(victim.read_bytes())
+    damaged[-1] ^= 1
+    victim.write_bytes(damaged)
+    map_it()
+    assert victim.read_bytes() != damaged
+    assert damaged in [path.read_bytes() for path in victim.parent.iterdir() if path.is_file()]
+
+
+def test_scans_of_a_place_that_is_known_take_no_memory(serve: Serve) -> None:
+    """Each is gone when it is in its chunks and on the disk."""
+    one = serve()
+    (marks,) = marked(1)
+    mapper, numbers = one.open().mapper, count(1)
+
+    def after(scans: int) -> int:
+        for number in islice(numbers, scans):
+            one.answer(one.send(marks, mapper, number))
+        one.until(lambda: one.map.is_saved, save_all=True)
+        one.answers.clear()
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    after(4)
+    before = after(30)
+    more = after(30) - before
+    tracemalloc.stop()
+    assert more < 10 * (marks.bits.nbytes + marks.words.nbytes)
     one.end()
 
 
