@@ -23,6 +23,7 @@ from shmmap_clients.rolling_map.cli import main as rolling
 
 from shmmap import read_cloud, write_pcd
 from shmmap.errors import CannotWrite
+from tests.support.forked_programs import run_verb
 
 
 def test_numbers_that_make_no_sense_are_refused() -> None:
@@ -167,40 +168,25 @@ def test_a_pipe_among_scans_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_names_that_are_no_text_are_printed_escaped(tmp_path: Path) -> None:
     """As arguments of a process: what is not UTF-8 comes as surrogates."""
-    odd = os.fsencode(tmp_path) + b"/scan_\xff.npz"
+    odd, missing, bad = f"{tmp_path}/scan_\udcff.npz", f"{tmp_path}/none_\udcff.npz", "\udcfe"
     with open(odd, "wb") as file:
         np.savez(file, xyz=np.random.default_rng(0).uniform(1, 9, (500, 3)))
-    missing = os.fsencode(tmp_path) + b"/none_\xff.npz"
-    for program, verb, option in (
-        ("ndt_scan_matcher", "align", b"--map"),
-        ("compare_map_filter", "apply", b"--map"),
-        ("ndt_scan_matcher", "follow", b"--truth"),
-        ("rolling_map", "run", b"--poses"),
+    for program, words in (
+        ("ndt_scan_matcher", ["align", "--scan", odd, "--map"]),
+        ("compare_map_filter", ["apply", "--scan", odd, "--map"]),
+        ("ndt_scan_matcher", ["follow", "--scans", str(tmp_path), "--truth"]),
+        ("rolling_map", ["run", "--live", "lidar", "--scans", str(tmp_path), "--poses"]),
     ):
-        base = [sys.executable, "-m", f"shmmap_clients.{program}", verb]
-        scans: list[str | bytes] = ["--scan" if option == b"--map" else "--scans", odd]
-        if option != b"--map":
-            scans = ["--scans", os.fsencode(tmp_path)]
-        if program == "rolling_map":
-            scans += ["--live", "lidar"]
-        for value in (missing, b"\xfe"):
-            done = subprocess.run([*base, *scans, option, value], capture_output=True)
+        for value in (missing, bad):
+            done = run_verb([*words, value], module=f"shmmap_clients.{program}")
             assert done.returncode in (65, 66), done.stderr
-            assert b"Traceback" not in done.stderr
-            assert b"\\udcf" in done.stderr
+            assert "Traceback" not in done.stderr
+            assert "\\udcf" in done.stderr
     for program, verb in (("ndt_scan_matcher", "align"), ("compare_map_filter", "apply")):
-        base = [
-            sys.executable,
-            "-m",
-            f"shmmap_clients.{program}",
-            verb,
-            "--backend",
-            "numpy",
-            "--allow-empty",
-        ]
-        done = subprocess.run([*base, "--map", odd, "--scan", odd], capture_output=True)
+        words = [verb, "--backend", "numpy", "--allow-empty", "--map", odd, "--scan", odd]
+        done = run_verb(words, module=f"shmmap_clients.{program}")
         assert done.returncode in (0, 1), done.stderr
-        assert b"Traceback" not in done.stderr
+        assert "Traceback" not in done.stderr
 
 
 PROGRAMS = {

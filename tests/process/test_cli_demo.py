@@ -85,9 +85,7 @@ def _check_round(count: int, shared: dict[str, float], private: dict[str, float]
     ("stage", "number"),
     [
         ("Building a town", signal.SIGHUP),
-        ("Simulating", signal.SIGTERM),
-        ("Driving, 2 processes on the copy", signal.SIGINT),
-        ("  The daemon is killed", signal.SIGINT),
+        ("  The daemon is killed", signal.SIGTERM),
         ("Localizing", signal.SIGINT),
     ],
 )

@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import shmmap
 from tests.process.conftest import DaemonFactory
 from tests.support.command_line import doctor
-from tests.support.daemon_process import ROOT, DaemonProcess, Deadline
+from tests.support.daemon_process import DaemonProcess, Deadline
 from tests.support.divided_map import DividedMap
+from tests.support.forked_programs import run_verb
 
 
 def test_from_health_to_death(daemon: DaemonFactory, divided_map: DividedMap) -> None:
@@ -91,12 +90,6 @@ def test_entries_without_a_file_are_a_problem_of_the_map(
 
 def test_a_configuration_with_a_mistake(daemon: DaemonFactory, divided_map: DividedMap) -> None:
     one: DaemonProcess = daemon(divided_map.root, start=False)
-    done = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", "doctor", "--config", one.runtime_dir + "/none.toml"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_verb(["doctor", "--config", one.runtime_dir + "/none.toml"])
     assert done.returncode == 78
     assert "none.toml" in done.stderr

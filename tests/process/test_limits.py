@@ -105,13 +105,13 @@ def test_statistics_that_cannot_be_written_end_no_process(
     said = 'statistics not written error="File too large"'
     waiting = Deadline()
     while waiting(said not in one.log):
-        os.sched_yield()
+        pass
     asked = client.ask("stats")[4]["requests"]
     assert [handle.segment for handle in client.area(circle(0, 0, 5)).cells] == warm
     resource.prlimit(one.pid, resource.RLIMIT_FSIZE, (soft, hard))
     waiting = Deadline()
     while waiting(read_statistics(one.instance, one.shm_dir).counters["requests"] <= asked):
-        os.sched_yield()
+        pass
     assert one.log.count(said) == 1
 
 
@@ -188,13 +188,7 @@ def outcomes(code: str, one: DaemonProcess) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.fixture
-def one(daemon: Factory, tmp_path: Path) -> DaemonProcess:
-    served: DaemonProcess = daemon(make_map(tmp_path / "map", columns=2, rows=2).root)
-    return served
-
-
-def test_few_descriptors(one: DaemonProcess) -> None:
+def test_few_descriptors(standing: DaemonProcess) -> None:
     """With 0 to 12 of them left, for a client and for a window."""
     lines = outcomes(
         """
@@ -213,7 +207,7 @@ for act in client, window:
         free_files()
         print(left, result)
 """,
-        one,
+        standing,
     )
     assert len(lines) == 26
     for line in lines:
@@ -227,12 +221,12 @@ for act in client, window:
             ), line
 
 
-def test_none_to_load_the_library_with(one: DaemonProcess) -> None:
-    (line,) = outcomes("leave_files(0); print(tried(lambda: shmmap.connect(endpoint)))", one)
+def test_none_to_load_the_library_with(standing: DaemonProcess) -> None:
+    (line,) = outcomes("leave_files(0); print(tried(lambda: shmmap.connect(endpoint)))", standing)
     assert line.startswith("LimitReached: shmmap.connect cannot be loaded: this process has as many files")
 
 
-def test_none_for_a_segment_and_for_a_window_of_a_client_that_is_there(one: DaemonProcess) -> None:
+def test_none_for_a_segment_and_for_a_window_of_a_client_that_is_there(standing: DaemonProcess) -> None:
     lines = outcomes(
         """
 shmmap.MapWindow
@@ -247,7 +241,7 @@ print(tried(lambda: f"{type(window.error).__name__}: {window.error}"))
 free_files()
 print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 50).complete else "no"))
 """,
-        one,
+        standing,
     )
     for line in lines[:2]:
         assert line.startswith(
@@ -256,8 +250,9 @@ print(window.wait_until_current(60), tried(lambda: None if client.around(0, 0, 5
     assert lines[2:] == ["True works"]
 
 
-def test_none_to_connect_again_with(one: DaemonProcess) -> None:
+def test_none_to_connect_again_with(daemon: Factory, divided_map: DividedMap) -> None:
     """The daemon is back, and this process may not open a socket: the error does not blame the daemon."""
+    one = daemon(divided_map.root)
     program = subprocess.Popen(
         [
             sys.executable,
@@ -296,7 +291,7 @@ print(tried(lambda: None if shmmap.connect(endpoint).around(0, 0, 50).complete e
 
 
 @pytest.mark.parametrize("left", range(5))
-def test_few_threads(one: DaemonProcess, left: int) -> None:
+def test_few_threads(standing: DaemonProcess, left: int) -> None:
     """Stacks of threads need address space, which an ordinary user can limit, too."""
     client, window = outcomes(
         f"""
@@ -309,7 +304,7 @@ def window():
 print(tried(client))
 print(tried(window))
 """,
-        one,
+        standing,
     )
     assert client == "works" if left >= 3 else client.startswith("LimitReached: ")
     assert window == "works" if left >= 4 else window.startswith("LimitReached: ")
@@ -320,9 +315,9 @@ print(tried(window))
 
 @pytest.mark.root
 @pytest.mark.parametrize("left", range(4))
-def test_few_threads_of_a_user(one: DaemonProcess, left: int) -> None:
+def test_few_threads_of_a_user(standing: DaemonProcess, left: int) -> None:
     """Root is not limited: the program becomes a user that has no other processes."""
-    for path in (one.endpoint, str(Path(one.endpoint).parent)):
+    for path in (standing.endpoint, str(Path(standing.endpoint).parent)):
         os.chmod(path, 0o777)
     (line,) = outcomes(
         f"""
@@ -334,7 +329,7 @@ resource.setrlimit(resource.RLIMIT_NPROC, (threads + {left}, threads + {left}))
 os.setresuid(uid, uid, uid)
 print(tried(lambda: shmmap.connect(endpoint).close()))
 """,
-        one,
+        standing,
     )
     if left == 3:
         assert line == "works"

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import numpy as np
 
 from shmmap.chunks.voxels import voxel_centers
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT
+from tests.support.forked_programs import run_verb
 from tests.support.live_drive import RESOLUTION
 from tests.support.live_reference import stored_drive
 from tests.support.raw_client import RawClient, circle
@@ -24,8 +22,8 @@ Connect = Callable[..., RawClient]
 def test_what_was_mapped_is_served(daemon: DaemonFactory, connect: Connect, tmp_path: Path) -> None:
     voxels = stored_drive(tmp_path / "lidar")
     occupied = sorted(voxel for voxel, value in voxels.items() if value > 0)
-    words = ["live", "export", str(tmp_path / "lidar"), "-o", str(tmp_path / "map")]
-    subprocess.run([sys.executable, "-m", "shmmap.cli", *words], cwd=ROOT, check=True)
+    done = run_verb(["live", "export", str(tmp_path / "lidar"), "-o", str(tmp_path / "map")])
+    assert done.returncode == 0, done.stderr
     client = connect(daemon(tmp_path / "map"))
     reply = client.area(circle(0.0, 0.0, 1000.0))
     assert (reply.pending, reply.failed) == ([], [])

@@ -7,8 +7,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -24,7 +22,8 @@ from shmmap.failpoints import LIVE_STEPS
 from shmmap.protocol import live as messages
 from shmmap.statistics.reader import StatisticsReader
 from tests.process.conftest import DaemonFactory
-from tests.support.daemon_process import ROOT, Deadline
+from tests.support.daemon_process import Deadline
+from tests.support.forked_programs import run_verb
 from tests.support.live_drive import FILTER, RESOLUTION, drive, marked, walk
 from tests.support.live_reference import LiveDaemon, held, mapped_around, reference, worker_of
 
@@ -152,8 +151,7 @@ def test_a_worker_killed_at_any_step_loses_nothing(
                 mapper.add(points, pose)
             mapper.wait_applied()
             mapper.wait_durable()
-        assert held(live) == reference(scans)
-        assert held(live, "disk") == reference(scans)
+        assert held(live) == held(live, "disk") == reference(scans)
     assert (tmp_path / "reached").exists(), "the step was never reached"
 
 
@@ -341,18 +339,16 @@ def test_an_operator_looks_and_saves(live_daemon: LiveDaemon) -> None:
         assert known == len(reference(drive(3)))
         box = found["chunks"][0]["box"]
         assert box[3] - box[0] == pytest.approx(64 * RESOLUTION)
-    refused = subprocess.run(
-        [sys.executable, "-m", "shmmap.cli", "live", "show", "radar", *address],
-        capture_output=True, text=True, cwd=ROOT,
-    )  # fmt: skip
+    refused = run_verb(["live", "show", "radar", *address])
     assert refused.returncode == BadRequest.exit_code
     assert "there is no live map 'radar'" in refused.stderr
 
 
 def shmmap_command(*words: str) -> str:
     """What a command prints, which is to succeed."""
-    command = [sys.executable, "-m", "shmmap.cli", *words]
-    return subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    done = run_verb(words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon, tmp_path: Path) -> None:
@@ -367,16 +363,6 @@ def test_a_daemon_whose_kernels_are_compiled_is_starting(live_daemon: LiveDaemon
             seen = statistics.snapshot(tables=False)
         assert seen.state in ("absent", "starting")
         beats |= {seen.beat_monotonic_ns} - {0}
-    words = [
-        sys.executable,
-        "-m",
-        "shmmap.cli",
-        "health",
-        "--instance",
-        one.instance,
-        "--shm-dir",
-        one.shm_dir,
-    ]
-    health = subprocess.run(words, capture_output=True, text=True)
+    health = run_verb(["health", "--instance", one.instance, "--shm-dir", one.shm_dir])
     assert (health.returncode, health.stdout.split(":")[0]) == (1, "starting")
     one.kill()

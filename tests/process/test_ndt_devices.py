@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,12 @@ import numpy as np
 import pytest
 
 from tests.process.conftest import DaemonFactory
+from tests.support.forked_programs import run_verb
 from tests.support.ndt_programs import TownDrive, make_town_drive
 from tests.support.opencl_device import need_device
 
-NDT = ["-m", "shmmap_clients.ndt_scan_matcher"]
-POSE_INIT = ["-m", "shmmap_clients.pose_initializer"]
+NDT = "shmmap_clients.ndt_scan_matcher"
+POSE_INIT = "shmmap_clients.pose_initializer"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,8 +29,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> TownDrive:
     return make_town_drive(tmp_path_factory.mktemp("drive"), blocks=(2, 2), density=5.0, frames=12, step=2.0)
 
 
-def run(*words: str) -> tuple[int, Any, str]:
-    done = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+def run(module: str, *words: str) -> tuple[int, Any, str]:
+    done = run_verb(words, module=module)
     return done.returncode, json.loads(done.stdout) if done.stdout else None, done.stderr
 
 
@@ -54,7 +53,7 @@ def test_a_drive_is_followed_on_a_device_as_without(
     for variant, options in variants.items():
         backend = [] if variant == "numba" else ["--backend", "opencl", *options]
         lines = tmp_path / f"{variant}.jsonl"
-        code, summary, err = run(*NDT, *follow(drive, one, lines), *backend)
+        code, summary, err = run(NDT, *follow(drive, one, lines), *backend)
         assert code == 0, err
         assert summary["trustworthy"] == 12
         assert summary["backend"] == ("numba" if variant == "numba" else "opencl")
@@ -77,7 +76,7 @@ def test_a_drive_goes_on_without_a_device_that_hangs(
     drive: TownDrive, daemon: DaemonFactory, tmp_path: Path
 ) -> None:
     one = daemon(drive.map_dir)
-    hanging = ["-m", "tests.support.opencl_device", "program"]
+    hanging = ("tests.support.opencl_device", "program")
     words = [*follow(drive, one, tmp_path / "lines"), "--backend", "opencl", "--deadline", "2"]
     code, summary, err = run(*hanging, *words, "--fallback", "numba")
     assert summary is not None, err
@@ -107,7 +106,7 @@ def test_the_first_pose_is_the_same_on_a_device(
     words += ["--endpoint", one.endpoint, "--shm-dir", one.shm_dir]
     found = {}
     for backend in ("numba", "opencl"):
-        code, document, err = run(*POSE_INIT, *words, "--backend", backend)
+        code, document, err = run(POSE_INIT, *words, "--backend", backend)
         assert code == 0, err
         assert document["reliable"] is True
         found[backend] = document

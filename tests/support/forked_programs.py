@@ -2,8 +2,9 @@
 """Runs ``shmmap``, its programs and daemons in forks of a process that has imported them, which is quicker.
 
 Whatever a process does after its imports is done: arguments, environment, directory, exit code, a crash at a
-step.  Command lines of the pages, programs other than the daemon that are sent signals, and what depends on
-the interpreter's start (``PYTHONPATH``, ``LD_PRELOAD``, the locale) are processes of their own elsewhere.
+step, other modules on the path.  Command lines of the pages, programs other than the daemon that are sent
+signals, and what depends on the interpreter's start (another ``shmmap`` on the path, ``LD_PRELOAD``, the
+locale) are processes of their own elsewhere.
 
 As a program: ``python -m tests.support.forked_programs FD`` serves requests on a socket until its end.
 """
@@ -14,6 +15,7 @@ import contextlib
 import ctypes
 import gc
 import importlib
+import importlib.util
 import json
 import os
 import pkgutil
@@ -210,11 +212,23 @@ def _ready_for(environment: Mapping[str, str]) -> _Server | None:
 
 
 def _at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    """What an interpreter reads once, less the path of this project."""
+    """What an interpreter reads once, less a module path that a fork can add to its own."""
     found = {name: value for name, value in environment.items() if name.startswith(_AT_START)}
-    if found.get("PYTHONPATH") in ("", str(ROOT)):
-        del found["PYTHONPATH"]
+    if not any(map(_hides_a_module, _other_paths(environment))):
+        found.pop("PYTHONPATH", None)
     return found
+
+
+def _other_paths(environment: Mapping[str, str]) -> list[str]:
+    """Return the module path that an environment gives, less this project's."""
+    path = environment.get("PYTHONPATH", "").split(os.pathsep)
+    return [one for one in path if one not in ("", str(ROOT))]
+
+
+def _hides_a_module(folder: str) -> bool:
+    """Whether a folder has a module of a name that a fork may have imported from elsewhere."""
+    names = {path.stem for path in Path(folder).glob("[!_]*") if path.stem.isidentifier()}
+    return "sitecustomize" in names or any(importlib.util.find_spec(name) is not None for name in names)
 
 
 def _import_all() -> None:
@@ -240,6 +254,7 @@ def _become(request: dict[str, Any], fds: list[int]) -> None:
     tempfile.tempdir = None
     os.chdir(request["cwd"])
     sys.argv[1:] = request["words"]
+    sys.path[1:1] = _other_paths(os.environ)
     from shmmap import failpoints
 
     old = failpoints.step

@@ -66,7 +66,7 @@ def test_help_is_a_page_or_two() -> None:
 PACKAGE = """\
 from typing import TYPE_CHECKING
 
-from shmmap.lazy_names import lazy_names
+from shmmap.lazy_imports import lazy_names
 
 if TYPE_CHECKING:
     from lazy_one.inner import first, second

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shmmap.demo.demo_town import HeightImage
 
+from shmmap.demo.demo_town import HeightImage
 from shmmap.errors import BadRequest
 from shmmap.origin.map_directory import open_map
 from shmmap.simulation.town import Town
