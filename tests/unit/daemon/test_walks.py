@@ -18,8 +18,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, cast
 
+import pytest
+
 import shmmap
 from shmmap.chunks.marks import encode_marks
+from shmmap.daemon import turns
 from shmmap.daemon.config_live import LiveSettings
 from shmmap.daemon.live import messages as live
 from shmmap.daemon.live.worker.main import _Worker
@@ -38,6 +41,12 @@ NOT_COUNTED = ("failpoints", "statistics/")
 EVERYWHERE = m.BoxMessage(-1e4, -1e4, 1e4, 1e4)
 LEFT_OUT = {"_poll", "_poll_timeout_s", "_do_what_is_due", "follow_moves"}
 """Functions that the loop calls by the clock: what they enter belongs to no walk."""
+
+
+@pytest.fixture(autouse=True)
+def long_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no turn end for what the profiler costs."""
+    monkeypatch.setattr(turns, "TURN_S", 60.0)
 
 
 class Walker:
