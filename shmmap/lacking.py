@@ -154,7 +154,7 @@ def pending_lines(pending: Iterable[PendingLayer]) -> list[str]:
 
 
 def failure_lines(failed: Iterable[CellError]) -> list[str]:
-    """Return one line for each cause, and below it what to do and who uses the memory."""
+    """Return one line for each cause, and below it what to do and the users of the memory."""
     causes: dict[tuple[str, str, str], list[CellError]] = {}
     for error in failed:
         # a file's message begins with its path, which the cell's id is

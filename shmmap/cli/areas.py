@@ -132,7 +132,7 @@ def act_on_cells(
     nothing: Answer,
     optional: bool = False,
 ) -> int:
-    """Have the daemon do something with the cells that `add_cells_argument` names; returns the exit code.
+    """Ask the daemon to do something with the cells that `add_cells_argument` names; returns the exit code.
 
     Parameters
     ----------

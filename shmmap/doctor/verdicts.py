@@ -108,7 +108,7 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
             True,
             f"{refused:,} cells refused in the last 10 min; clients use {format_bytes(in_use)} of"
             f" {format_bytes(budget)}",
-            "raise --budget; `shmmap clients` says who uses the memory",
+            "raise --budget; `shmmap clients` lists the users of memory",
         )
     if again >= RELOADED_COUNT and again > RELOADED_SHARE * misses:
         share = 100 * again / misses

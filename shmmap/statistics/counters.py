@@ -59,7 +59,7 @@ TURN_KINDS: Final = {
     "answers": "another part of a large request was served, or one that waited was answered",
     "loaders": "a loader was read, and what it loaded published",
     "memory": "loads were handed out, room made and memory freed",
-    "usage": "the kernel was asked who uses segments",
+    "usage": "the kernel was asked which processes use segments",
     "statistics": "the statistics were written",
     "map": "another state of the map was taken over",
 }

@@ -63,7 +63,7 @@ class _Answer:
     handles, pending
         Cells that `encode` has not encoded yet.
     failed
-        Failed cells; who holds the memory is added later.
+        Failed cells; the holders of memory are added later.
     """
 
     residents: list[Resident] = field(default_factory=list)

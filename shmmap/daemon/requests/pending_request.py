@@ -346,7 +346,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def map_changed(self) -> None:
-        """Have requests that wait for pages find their cells again: the map has other pages now."""
+        """Make requests that wait for pages find their cells again: the map has other pages now."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:

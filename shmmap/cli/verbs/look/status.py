@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap status`` and ``shmmap clients``: one screen about the daemon, and who is connected to it."""
+"""``shmmap status`` and ``shmmap clients``: one screen about the daemon, and its clients."""
 
 from __future__ import annotations
 

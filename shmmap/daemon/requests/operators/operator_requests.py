@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What operators alone may ask: read the map again, evict, pin, stop; and who is one.
+"""What operators alone may ask: read the map again, evict, pin, stop; and which users are operators.
 
 Judged by what the kernel says of the peer (`Peer`), never of anything a client says.  Root and the
 daemon's own user always may; so may members of the configured administrators' group.
