@@ -75,6 +75,14 @@ def test_differential_is_the_set_difference_at_every_step(
         assert set(held) == wanted
 
 
+def test_versions_that_are_not_known_are_removed(standing: DaemonProcess, connect: Connect) -> None:
+    """Also where all of the area is in memory, which is answered another way."""
+    client = connect(standing)
+    versions = [handle.version for handle in client.area(circle(0, 0, 5)).cells]
+    reply = client.differential(circle(0, 0, 5), packed=[5, *versions, versions[0], 6, 5])
+    assert (reply.cells, reply.removed_versions) == ([], [5, 6])
+
+
 NONSENSE: list[list[Any]] = [
     ["area", 1, ["circle", float("nan"), 0, 1]],
     ["area", 1, ["circle", 0, 0, -1]],
