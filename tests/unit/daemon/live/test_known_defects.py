@@ -2,7 +2,7 @@
 """What was wrong in Rolling-Bonxai, each with the defect put back: the test of it must then find something.
 
 v1 is Rolling-Bonxai at 8936187, v2 at 1a489e7; what they do was seen by running them.  Defects of marking
-and of adding evidence are in ``tests/unit/chunks/test_known_defects_of_marking.py``.
+and of adding evidence are in ``tests/unit/chunks``, in ``test_marking.py`` and ``test_applying.py``.
 """
 
 from __future__ import annotations
