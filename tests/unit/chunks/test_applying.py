@@ -116,6 +116,15 @@ def test_a_scan_that_comes_twice_counts_once() -> None:
     assert (int(state["version"]), int(state["sequence"]), int(state["changed_ns"])) == (3, 6, 6)
 
 
+@pytest.mark.parametrize("period", range(1, 8))
+def test_evidence_counts_whatever_number_of_scans_lies_between(period: int) -> None:
+    """Bonxai passed over a voxel that it saw again after exactly three scans."""
+    memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
+    for number in range(4):
+        memory.apply(one_word(key, {0: 1}, {}), scan=1 + number * period)
+    assert memory.voxels() == {(0, 0, 0): 4 * 847}
+
+
 def test_a_chunk_remembers_the_mappers_that_the_map_knows() -> None:
     memory, key = ChunkMemory(0.1), ChunkKey(0, 0, 0)
     all_mappers = tuple(range(1, MAPPERS + 1))

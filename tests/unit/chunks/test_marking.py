@@ -83,9 +83,12 @@ def test_a_scan(sensor: tuple[float, float, float], resolution: float, max_range
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_points_on_the_borders_of_voxels_and_chunks(dtype: type) -> None:
+    """And as near to the borders as floats can be: Rolling-Bonxai had such a voxel in one of two chunks."""
     rng = np.random.default_rng(3)
     marker = Marker(0.1, ScanFilter(0.0, 20.0, -20.0, 20.0))
     points: Points = (rng.integers(-70, 70, (300, 3)) * 0.1).astype(dtype)
+    beside = [np.nextafter(points[:100], points.dtype.type(side)) for side in (-np.inf, np.inf)]
+    points = np.concatenate([points, *beside])
     for sensor in ((0.0, 0.0, 0.0), (6.4, 6.4, 6.4), (-6.4, 0.1, -0.1), (0.3, 0.7, 0.6)):
         assert_equal_to_the_slow_one(marker, points, pose_at(sensor))
 
@@ -130,6 +133,17 @@ def test_the_order_of_points_does_not_count() -> None:
     assert all(
         np.array_equal(getattr(straight, name), getattr(turned, name)) for name in straight.__struct_fields__
     )
+
+
+@pytest.mark.parametrize("between", range(6))
+def test_a_scan_is_marked_the_same_however_many_came_between(between: int) -> None:
+    """Bonxai cast no ray to the end of one that it had seen exactly three scans before."""
+    marker = Marker(0.2, ScanFilter(0.0, 30.0, -40.0, 40.0))
+    points = np.random.default_rng(5).normal(0.0, 4.0, (100, 3))
+    first = sets_of(marker.mark(points, pose_at((0.1, 0.1, 0.1)))[0])
+    for number in range(between):
+        marker.mark(np.array([[-8.0, 0.1, 0.1 + number]]), pose_at((0.1, 0.1, 0.1)))
+    assert sets_of(marker.mark(points, pose_at((0.1, 0.1, 0.1)))[0]) == first
 
 
 def test_what_becomes_of_each_point_is_counted() -> None:
