@@ -67,6 +67,7 @@ class InnerDaemon:
         self.shm_dir = tempfile.mkdtemp(prefix="shmmap-inner-", dir="/dev/shm")
         self.directory = ShmDirectory(self.shm_dir)
         self.origin = open_map(map_path, cache_dir=cache_dir)
+        values: dict[str, Any] = {"budget_bytes": 64 << 20, "outage_tolerance_s": 10.0, **settings}
         config = DaemonConfig(
             map_path=map_path,
             instance="inner",
@@ -74,7 +75,7 @@ class InnerDaemon:
             workers=workers,
             load_timeout_s=load_timeout_s,
             prefetch_share=prefetch_share,
-            **{"budget_bytes": 64 << 20, "outage_tolerance_s": 10.0, **settings},
+            **values,
         )
         self.offset_s = 0.0
         self.stopped_at_s: float | None = None

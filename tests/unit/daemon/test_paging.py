@@ -715,6 +715,7 @@ def test_the_client_library_says_so(paged: Paged) -> None:
         assert (found.covered, found.complete, found.layers) == (True, True, ("points",))
         with pytest.raises(Offline):
             client.metadata()
+        assert client.stats().counters["map_cells_known"] == 8
         paged.pages.come(EAST)
         while client.stats().counters["map_cells_known"] < 16:
             pass

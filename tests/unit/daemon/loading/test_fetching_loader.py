@@ -127,16 +127,6 @@ def test_all_are_fetched_at_once_and_done_as_they_come(loader: Loader) -> None:
         assert (done.number, done.points) == (number, 100)
 
 
-def test_another_job_is_fetched_while_one_waits(loader: Loader) -> None:
-    loader.give(1)
-    assert loader.store.begun.get(timeout=TIMEOUT_S) == 1
-    loader.give(2, "voxel(leaf=1.0)")
-    assert loader.store.begun.get(timeout=TIMEOUT_S) == 2
-    loader.store.come(2)
-    assert loader.said() == Begun(2)
-    assert isinstance(loader.said(), Done)
-
-
 def test_what_does_not_come_is_offline_and_the_others_are_not(loader: Loader) -> None:
     loader.store.lost.add("cell 1")
     for number in (1, 2):
