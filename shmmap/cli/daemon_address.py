@@ -7,7 +7,7 @@ import argparse
 import os
 from typing import TYPE_CHECKING, Final
 
-from shmmap.errors import NoSocket, ShmmapError
+from shmmap.errors import NoSocket, ProtocolMismatch, ShmmapError
 from shmmap.protocol.endpoint import DEFAULT_INSTANCE, endpoint_path, runtime_dirs, socket_path
 from shmmap.segment.names import usual_directory
 
@@ -72,17 +72,25 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
     ------
     NoSocket
         No daemon has this socket, and the one of that name has another.
+    ProtocolMismatch
+        The daemon at this socket is of another version, and no statistics name it.
     """
     named, by_name = _named_socket(args), (instance(args), shm_dir(args))
     if _is_at(*by_name, named if _endpoint_setting(args) or _setting(args, "runtime_dir") else ""):
         return by_name
-    found = _asked(args, named) if named else None
+    found, mismatch = None, None
+    try:
+        found = _asked(args, named) if named else None
+    except ProtocolMismatch as error:
+        mismatch = error
     if found is None and named:  # it does not answer, or this user may not ask: whose statistics name it?
         places = dict.fromkeys((by_name[1], usual_directory("")))
         found = next(
             ((name, place) for place in places for name in _instances(place) if _is_at(name, place, named)),
             None,
         )
+    if found is None and mismatch is not None:
+        raise mismatch
     if found is None and named and (other := _endpoint_of(*by_name)):
         raise NoSocket(
             f"no daemon has the socket {named}; instance {by_name[0]!r} listens at {other}",
@@ -131,6 +139,8 @@ def _asked(args: argparse.Namespace, socket: str) -> tuple[str, str] | None:
     try:
         with shmmap.connect(socket, timeout=ASKED_S, connect_timeout=ASKED_S, name="shmmap") as client:
             return client.welcome.instance, _setting(args, "shm_dir") or client.welcome.shm_dir
+    except ProtocolMismatch:
+        raise
     except ShmmapError:
         return None
 

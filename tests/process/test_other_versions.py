@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import threading
 from pathlib import Path
@@ -18,6 +19,9 @@ from tests.support.plain_client import PlainClient
 
 HELLO_OF_1_5 = bytes.fromhex("95 a568656c6c6f 07 01 05 a36f6c64")
 """What a client of 1.5 that is called "old" begins with, as request 7."""
+VERBS = (("query", "--circle", "0,0,5"), ("status",), ("ls",))
+"""Verbs that ask the daemon, and verbs that read its statistics, where it can be found only by its socket."""
+TIMEOUT_S = 60.0
 
 
 def test_a_client_of_1_x_is_refused_and_stays_connected(
@@ -37,21 +41,35 @@ def test_a_daemon_of_1_x_is_named(shmmap: Verbs, short_path: Path) -> None:
     asked: list[Any] = []
 
     def refuse() -> None:
-        client, hello = router.recv_multipart()
-        asked.extend(unpack(hello))
-        refusal = ["error", asked[1], "protocol_mismatch", said, "update the older of the two"]
-        router.send_multipart([client, pack(refusal)])
+        with (
+            context.socket(zmq.ROUTER) as router,
+            context.socket(zmq.XPUB) as events,
+            contextlib.suppress(zmq.ContextTerminated),
+        ):
+            router.linger = events.linger = 0
+            router.bind(f"ipc://{path}")
+            events.bind(f"ipc://{path.with_suffix('.events.sock')}")
+            listens.set()
+            while True:
+                client, message = router.recv_multipart()
+                hello = unpack(message)
+                asked.append((hello[0], hello[2:4]))
+                refusal = ["error", hello[1], "protocol_mismatch", said, "update the older of the two"]
+                router.send_multipart([client, pack(refusal)])
 
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
-        router.linger = 0
-        router.bind(f"ipc://{path}")
-        daemon = threading.Thread(target=refuse)
-        daemon.start()
-        printed = shmmap("query", "--circle", "0,0,5", "--endpoint", str(path), code=76)
+    context, listens = zmq.Context(), threading.Event()
+    daemon = threading.Thread(target=refuse)
+    daemon.start()
+    try:
+        assert listens.wait(TIMEOUT_S)
+        printed = [shmmap(*words, "--endpoint", str(path), code=76) for words in VERBS]
+    finally:
+        context.term()
         daemon.join()
-    assert (asked[0], asked[2:4]) == ("hello", [2, 0])
-    assert said in printed
-    assert "update the older of the two" in printed
+    assert {(tag, *version) for tag, version in asked} == {("hello", 2, 0)}
+    for text in printed:
+        assert said in text
+        assert "update the older of the two" in text
 
 
 def test_statistics_of_an_older_daemon_are_named(

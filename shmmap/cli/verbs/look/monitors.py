@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from shmmap.cli.options import Subparsers, add_statistics_options, add_verb
 from shmmap.cli.screens.output import counted, format_duration, print_hanging, print_json, print_line
 from shmmap.doctor.verdicts import trust_problems
-from shmmap.errors import DaemonUnreachable, NoSocket
+from shmmap.errors import DaemonUnreachable, NoSocket, ProtocolMismatch
 
 if TYPE_CHECKING:
     from shmmap.doctor.verdicts import Finding
@@ -169,7 +169,7 @@ def run_doctor(args: argparse.Namespace) -> int:
     file = args.config or installed_config_file()
     flags = {"instance": args.instance, "endpoint": daemon_address.endpoint(args), "shm_dir": args.shm_dir}
     if flags["endpoint"]:
-        with contextlib.suppress(NoSocket):
+        with contextlib.suppress(NoSocket, ProtocolMismatch):
             flags["instance"], flags["shm_dir"] = daemon_address.locate(args)
     findings = diagnose(examine(load_config(flags, file=file), file))
     if args.json:
