@@ -247,7 +247,7 @@ class Survey:
         return self._walk
 
     def _slots_of(self, resident: Resident) -> list[int]:
-        """Return the slots that have a segment locked; none if the time is used up: its pin is then unknown."""
+        """Return the slots that have a segment locked; none if time is up: its pin is then unknown."""
         if self._asking_s > ASKING_S:
             return []
         begin_s = time.thread_time()

@@ -321,7 +321,7 @@ class Reclaimer:
         return retired.probe_after_s if retired is not None else math.inf
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Schedule a check of segments that a client has dropped: those without other users are freed soon."""
+        """Schedule a check of segments that a client has dropped: those without other users are freed."""
         for resident in residents:
             retired = self.ledger.retired.get(resident.name)
             if retired is None:
