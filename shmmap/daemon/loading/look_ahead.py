@@ -271,7 +271,7 @@ SLOW_LOADS: Final = 1.6
 SLACK_S: Final = 3.0
 """Added to the measured times: requests and steps along the path are not continuous."""
 SPARE: Final = 1.25
-"""Factor on the outage: cells used up in it are replaced slowly, and until then others arrive just in time."""
+"""Factor on the outage: cells used up in it are replaced slowly; until then others arrive just in time."""
 AFTER_S: Final = 2.0
 """Time until loads are known to succeed again after an outage, and the first cells have arrived."""
 GUESSED_S: Final = 10.0

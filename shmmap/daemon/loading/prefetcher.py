@@ -111,7 +111,7 @@ class Prefetcher:
 
     @property
     def next_s(self) -> float:
-        """When there is something to do: at once if clients moved, loads ended, or a path is being examined."""
+        """When there is something to do: at once if clients moved, loads ended, or a path is examined."""
         many = len(self._sessions.moved) > MOVES_PER_STEP
         if self.cold or many or (self.ended and self.prefetch.paths):
             return -math.inf

@@ -56,7 +56,7 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
-    """Order to compare a source with ``stamp``, and an earlier run's segment, if named, with its checksums."""
+    """Order to compare a source with ``stamp``, and a previous segment, if named, with its checksums."""
 
     number: int
     source: Source
@@ -106,9 +106,9 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
 
     So the daemon can ask the kernel from the first moment on which processes use the segment.  ``version`` is
     the version of its bytes, ``points`` the number of the layer's rows; ``z_min`` and ``z_max`` bound the
-    source's points.  ``neighbours`` are the stamps of the job's neighbours as they were read.  ``cached``: the
-    layer came from the disk cache.  ``outside``: number of points outside the cell's box.  ``objects``: counts
-    of the worker's reads from a published map since its last report
+    source's points.  ``neighbours`` are the stamps of the job's neighbours as they were read.  ``cached``:
+    the layer came from the disk cache.  ``outside``: number of points outside the cell's box.  ``objects``:
+    counts of the worker's reads from a published map since its last report
     (`shmmap.origin.remote.object_tier.ObjectCounts`).
     """
 
