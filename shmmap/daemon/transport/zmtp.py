@@ -74,8 +74,8 @@ class Incoming:
     def messages(self, max_frames: int, send: Callable[[bytes], None]) -> list[tuple[bytes, bool]]:
         """Return complete messages, each as its first frame and whether there were more frames.
 
-        At most ``max_frames`` frames are examined; ``more`` is then True.  ``send`` sends replies that the protocol
-        itself requires.
+        At most ``max_frames`` frames are examined; ``more`` is True if others may follow.  ``send`` sends
+        replies that the protocol itself requires.
 
         Raises
         ------
