@@ -30,7 +30,7 @@ FIRST_RETRY_S: Final = 1.0
 LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
 MAX_FAILURES: Final = 1 << 14
-"""Failures remembered per kind: requests for ever new layers must not fill the memory."""
+"""Failures remembered per kind: requests for always new layers must not fill the memory."""
 LOAD_S: Final = 1e-4
 """Time charged to a load in addition to its bytes: many tiny cells are work, too."""
 BYTE_S: Final = 1e-9
