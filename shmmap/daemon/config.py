@@ -332,13 +332,14 @@ def load_config(
     file
         TOML file; empty for none.
     environ
-        Source of variables named ``SHMMAP_`` and the setting in capitals.  As for clients, ``SHMMAP_ENDPOINT`` is
-        ignored beside a flag that names another instance or directory.
+        Source of variables named ``SHMMAP_`` and the setting in capitals.  As for clients, ``SHMMAP_ENDPOINT``
+        is ignored beside a flag that names another instance or directory.
 
     Raises
     ------
     ConfigError
-        A key is unknown (with a suggestion), or a value has the wrong type or range; the message names its origin.
+        A key is unknown (with a suggestion), or a value has the wrong type or range; the message names
+        its origin.
     """
     found = trace_settings(flags, file=file, environ=environ)
     return DaemonConfig(**{name: one.value for name, one in found.items()})
