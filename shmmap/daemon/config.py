@@ -332,8 +332,8 @@ def load_config(
     file
         TOML file; empty for none.
     environ
-        Source of variables named ``SHMMAP_`` and the setting in capitals.  As for clients, ``SHMMAP_ENDPOINT``
-        is ignored beside a flag that names another instance or directory.
+        Source of variables named ``SHMMAP_`` and the setting in capitals.  As for clients,
+        ``SHMMAP_ENDPOINT`` is ignored beside a flag that names another instance or directory.
 
     Raises
     ------

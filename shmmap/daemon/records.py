@@ -34,7 +34,7 @@ class Resident:
 
     ``checked`` is false for a segment of a previous run until its bytes have been compared with their
     checksums; until then it is not handed out.  ``prefetched`` is true for a prefetched segment until a
-    client asks for it. ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
+    client asks for it.  ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
     the slots of the sessions that hold it.  ``place`` is its position among all segments of its size.
     ``deferred_s`` is how long it was deferred when it was last found in use.
     """
@@ -83,7 +83,7 @@ class Load:
     that failed: in that state it is not loaded again.  ``wanted`` means that a client asked for it.
     ``sources`` are the states of its file and its neighbours' files in the catalogue when a worker was given
     the job, and ``version`` is the version that follows from them.  ``computed`` means that the layer is
-    computed, which may take long. ``payer`` is the asker whose turn was used, ``charged_s`` the loader time
+    computed, which may take long.  ``payer`` is the asker whose turn was used, ``charged_s`` the loader time
     charged in advance, ``spent_s`` the loader time used, and ``took_s`` the total time, fetching included.
     ``losses`` counts loaders that were lost through no fault of this load.  ``prefetch`` means that no client
     has asked for it yet, ``unread`` that its source could not be read.

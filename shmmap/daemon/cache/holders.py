@@ -27,18 +27,18 @@ from shmmap.segment.pins import LOADER_SLOT, has_slot, holders
 __all__ = ["UNKNOWN_SLOT", "Holders", "Share", "Survey", "Usage"]
 
 HOLDERS_S: Final = 0.03
-"""Processor time for finding the holders for one reply, at most."""
+"""Limit of processor time for finding the holders for one reply."""
 MAX_HOLDING_SEGMENTS: Final = 512
 """Segments queried for one reply."""
 UNKNOWN_SLOT: Final = 0
 """Stands for processes that use a segment without having a session."""
 ASKING_S: Final = 0.2
-"""Processor time for finding the holders in one walk, at most; 2048 segments take 0.03 s."""
+"""Limit of processor time for finding the holders in one walk; 2048 segments take 0.03 s."""
 LONG_STEP_S: Final = 0.003
 SHARE: Final = 0.1
 """Share of the loop's time for steps that take long (when a process holds very many locks)."""
 MAX_SEGMENTS: Final = 2048
-"""Segments of a walk that a session waits for: the largest ones; of one session's segments, the oldest."""
+"""Limit of a walk that a session waits for (largest first) and of one session's check (oldest first)."""
 MAX_ASKED: Final = 16
 """Results that one session may wait for at a time."""
 

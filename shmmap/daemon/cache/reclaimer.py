@@ -316,7 +316,7 @@ class Reclaimer:
         return None
 
     def next_sweep_s(self) -> float:
-        """Return when the next look at a retired segment is due; infinity when there is none."""
+        """Return when the next check of a retired segment is due; infinity if there is none."""
         retired = self._next_due()
         return retired.probe_after_s if retired is not None else math.inf
 

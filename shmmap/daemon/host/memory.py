@@ -59,7 +59,7 @@ def loader_bytes(limit_bytes: int | None) -> int:
 
 
 def room_in_group(limit_bytes: int) -> int:
-    """Return the memory of a control group that segments may take: all but a half of at most 256 MiB."""
+    """Return how much of a control group's memory segments may take: all but half, at most 256 MiB."""
     return limit_bytes - min(limit_bytes // 2, RESERVE_BYTES)
 
 
@@ -169,7 +169,7 @@ def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
 
 
 def out_of_memory_kills(vmstat: str = "/proc/vmstat") -> int:
-    """Return how many processes the kernel has killed for lack of memory, of the machine or a group."""
+    """Return how many processes the kernel has killed because memory ran out, anywhere on the machine."""
     return next((int(line.split()[1]) for line in _lines(Path(vmstat)) if line.startswith("oom_kill ")), 0)
 
 

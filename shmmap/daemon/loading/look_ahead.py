@@ -110,8 +110,8 @@ SPREAD_RAD: Final = 0.5
 LATER_S: Final = 1.0
 """Extra delay of cells to the sides compared with cells straight ahead."""
 LONG_STRAIGHT_M: Final = 500.0
-"""Longer than most streets of a town.  For each metre that a client has moved straight ahead beyond this
-length, the look-ahead grows by a metre."""
+"""Length of a straight, longer than most streets of a town, beyond which each metre that a client has moved
+straight ahead extends the look-ahead by a metre."""
 BESIDE_M: Final = 2.0
 """Allowed lateral distance of a client from its route, which is the middle of a lane."""
 
@@ -269,9 +269,9 @@ LOOKS_PER_WISH: Final = 2
 SLOW_LOADS: Final = 1.6
 """Consecutive loads that a cell may have to wait for."""
 SLACK_S: Final = 3.0
-"""Added to the measured times: requests and steps along the path are not continuous."""
+"""Margin added to the measured times, since requests and steps along the path are discrete."""
 SPARE: Final = 1.25
-"""Factor on the outage: cells used up in it are replaced slowly; until then others arrive just in time."""
+"""Factor on the outage's duration: cells used up in one outage are replaced only slowly."""
 AFTER_S: Final = 2.0
 """Time until loads are known to succeed again after an outage, and the first cells have arrived."""
 GUESSED_S: Final = 10.0

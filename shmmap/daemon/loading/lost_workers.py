@@ -62,7 +62,7 @@ class LostWorkers:
             self._vanished(worker, now_s)
 
     def _why_killed(self) -> str:
-        """Return why a loader was killed: if memory ran out, by the kernel, which is not the file's fault."""
+        """Return why a loader was killed, so that a file is not blamed for a lack of memory."""
         before, self.oom_kills = self.oom_kills, out_of_memory_kills()
         limit = memory_limit_bytes()
         allowed = f" (the control group allows {format_bytes(limit)})" if limit else ""

@@ -27,14 +27,13 @@ MAX_PATHS: Final = 256
 """Clients for which cells are prefetched; each adds a comparison to every wish."""
 MISSES_PER_TURN: Final = 64
 MAX_COLD: Final = 1 << 14
-"""Requested cells that were not in memory, between two turns; beyond this, the first ones are forgotten."""
+"""Limit of cells noted between two turns as requested but not in memory; the oldest are dropped."""
 MAX_ENDED: Final = 1024
-"""Loads that ended between two turns; beyond this, the first ones are forgotten."""
+"""Limit of ended loads noted between two turns; the oldest are dropped."""
 FOLLOW_S: Final = 0.005
-"""How long moves of a few clients may wait, and ended loads while no client moves: they are handled
-together."""
+"""How long a few clients' moves may wait, or ended loads while no client moves, to be handled together."""
 KEPT: Final = 4
-"""One loader's places divided by this number are kept free for demands, at least one place."""
+"""Divisor: 1/4 of one loader's places, at least one, is kept free for demands."""
 SWAP_S: Final = 0.25
 """How long a full share is not searched again after a search found no segment to give up."""
 FULL_S: Final = 1.0

@@ -23,7 +23,7 @@ Early: TypeAlias = tuple[ForkedProcess, socket.socket]
 END_TIMEOUT_S: Final = 0.1
 """How long the loop waits for a killed parent to exit; a parent that hangs in the kernel may never do so."""
 CLOSE_TIMEOUT_S: Final = 5.0
-"""The same timeout when the daemon stops: it waits for its child even on a busy machine."""
+"""Timeout of the same wait when the daemon stops; long, since the machine may be busy."""
 
 RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
 

@@ -37,9 +37,9 @@ from shmmap.segment.version import Source, Stamp
 __all__ = ["CONCURRENT_FETCHES", "PublishedReader"]
 
 CONCURRENT_FETCHES: Final = 32
-"""Small objects that a loader fetches concurrently, at most."""
+"""Limit of small objects that a loader fetches concurrently."""
 MAX_BYTES: Final = 8 << 20
-"""Bytes of objects that are fetched or held at a time, at most; a single object may be larger."""
+"""Limit of bytes of objects that are fetched or held at a time; a single object may be larger."""
 _STACK_BYTES: Final = 512 << 10
 """Stack of a thread; small, because it counts in full towards the loader's memory limit."""
 

@@ -71,7 +71,7 @@ class Root(msgspec.Struct, array_like=True, tag="root"):
 
 
 class Decision(msgspec.Struct, array_like=True, tag="decision"):
-    """Whether the requested bytes are reserved, or do not fit."""
+    """Answer to a `Need`: whether the requested bytes are reserved, or do not fit."""
 
     granted: bool
 

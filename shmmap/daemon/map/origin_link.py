@@ -22,7 +22,7 @@ PROBE_S: Final = 1.0
 JITTER: Final = 0.2
 """Random part of the polling interval: the vehicles of a fleet must not poll simultaneously."""
 LONG_TRUST_S: Final = 32.0
-"""Longest time that an answering origin is not polled again although single objects cannot be fetched."""
+"""Longest delay of a poll after a failed fetch, for an origin that keeps answering."""
 END_S: Final = 0.5
 
 

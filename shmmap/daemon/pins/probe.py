@@ -4,7 +4,7 @@
 The first of three sources that works is used: leases (they miss no process), the locks that the client
 library takes (they miss processes that open segments in another way), and the clients' own reports (they also
 miss clients that do not report).  A process that is missed always keeps the bytes it maps; the daemon merely
-believes that it has more memory left than is true.
+believes that it has more memory left than it has.
 """
 
 from __future__ import annotations

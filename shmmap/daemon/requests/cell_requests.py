@@ -88,7 +88,7 @@ class CellRequests:
     waiting
         Requests that wait; this list observes the ends of loads.
     quota_bytes
-        Bytes that one session may keep and no other session holds, at most.
+        Limit of the bytes that one session alone holds.
     due
         Queues the steps that answer a request, to run in the turns of the connection's process.
     clock

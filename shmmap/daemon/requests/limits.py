@@ -137,7 +137,7 @@ class SessionQuota:
     Parameters
     ----------
     nbytes
-        Bytes that one session may keep and no other session holds, at most.
+        Limit of the bytes that one session alone holds.
     clock
         The serving loop's clock, seconds.
     """

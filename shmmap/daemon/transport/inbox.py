@@ -5,7 +5,7 @@ Start-time fair queueing (Goyal, Vin, Cheng, SIGCOMM 1996) with equal weights: e
 runs while its requests are served, and the process furthest behind is next.  A process that was idle starts
 at the current time of the service, so that idling saves nothing up.  Connections of one process take turns.
 Work that takes longer than one turn continues in the next turns of its process, before any other of its
-requests. Requests beyond the limits below are refused, not stored.
+requests.  Requests beyond the limits below are refused, not stored.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ class Motion:
     Attributes
     ----------
     x, y
-        Metres, map frame.
+        Position, metres, map frame.
     at_s
         Time of the position, seconds.
     vx, vy

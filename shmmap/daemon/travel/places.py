@@ -31,9 +31,9 @@ seconds per metre beyond the reach, and the unit vector of its heading, 0 if unk
 
 NOWHERE: Final = np.empty((0, 8))
 MAX_PLACES: Final = 256
-"""Limit of places, which scoring time depends on: of more, the first of those near each other counts."""
+"""Limit of places, since each adds scoring time; beyond it, places near each other become one."""
 MAX_MERGED: Final = 1024
-"""Limit of places merged, a third of a millisecond; of more places, some are left out."""
+"""Limit of places to merge, which takes a third of a millisecond; beyond it, some are left out."""
 MAX_PER_CLIENT: Final = 128
 """Places along a route; on a long route, the later ones are farther apart."""
 NEAREST_M: Final = 10.0
