@@ -120,9 +120,8 @@ class ServingSignals:
 def ignore_signals() -> None:
     """Ignore the signals that stop the daemon: from here on it exits by itself."""
     numbers = (*STOP_SIGNALS, KEEP_SIGNAL)
-    for (
-        number
-    ) in numbers:  # kernel first: Python complains of a signal that arrives while its handler changes
+    # in the kernel first: Python complains of a signal that arrives while its handler changes
+    for number in numbers:
         _libc.signal(number, 1)  # SIG_IGN
     for number in numbers:
         signal.signal(number, signal.SIG_IGN)

@@ -172,7 +172,7 @@ class ObjectFetcher:
             fetch = self._queue[0]
             is_much = self._held_bytes and self._held_bytes + fetch.name.size > MAX_BYTES
             if is_much and (self._under_way or self._done):
-                break  # objects held are dropped when their job is done; if none is under way, go on
+                break  # held objects are freed when their job is done; without such a job, go on
             self._queue.popleft()
             fetch.begun = True
             self._under_way += 1

@@ -193,7 +193,7 @@ class _Worker:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
             limit = limit_behind(error) if error.errno == errno.EFBIG else None
-            if limit is not None:  # a limit of the segment's memory, whatever the source file's state
+            if limit is not None:  # the segment's file is limited, whatever the source is like
                 self._fail(
                     job, "load_failed", f"{job.source.name}: its segment: {limit.message} ({limit.hint})"
                 )

@@ -189,7 +189,7 @@ class PublishedOrigin:
         except Offline as error:
             if fresh:
                 raise
-            # the exit code means to the service manager that a later start may succeed
+            # by the exit code, the service manager knows that a later start may succeed
             raise CannotStart(error.message, hint=error.hint) from None
         finally:
             self._is_loading = False
