@@ -422,7 +422,7 @@ class Service:
 
 
 def _settle_memory() -> None:
-    """Free what reading the map left behind; from now on memory is freed by reference counting alone.
+    """Free memory left over from reading the map; from now on reference counting alone frees memory.
 
     No object that the daemon drops is part of a reference cycle (a test ensures that), and a run of the
     cyclic garbage collector took 30 ms of a turn: even new objects are many where segments come and go fast.

@@ -144,7 +144,7 @@ class CellCache:
         return self.catalogue.pages
 
     def at_height(self, indices: list[int], z: tuple[float, float] | None) -> list[int]:
-        """Return the cells without those whose heights, known from an earlier load, lie outside the range."""
+        """Drop the cells whose heights, known from an earlier load, lie outside a range."""
         if z is None:
             return indices
         return self.heights.overlapping(indices, z)

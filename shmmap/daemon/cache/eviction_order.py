@@ -125,7 +125,7 @@ class Deferred:
         return self._until_s.pop(resident, None) is not None
 
     def first(self) -> tuple[float, Resident] | None:
-        """Return the segment whose deferral ends first, preceded by that time."""
+        """Return the time when the first deferral ends, and its segment."""
         while self._heap:
             until_s, _, resident = self._heap[0]
             if self._until_s.get(resident) == until_s:

@@ -38,7 +38,7 @@ PRESSURE_S: Final = 10.0
 REFRESH_S: Final = 0.004
 """How often a few scores are updated."""
 ROUND_S: Final = 2.0
-"""Minimum time of a round that updates the scores of all segments, a few at a time."""
+"""Minimum interval of rounds that update the scores of all segments, a few at a time."""
 WORK_PER_TURN: Final = 4
 """Segments handled by one `free`: checking one takes 15 us, and retiring one is as much work again."""
 PLACES_S: Final = 0.25

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports of what happens to cells, as events, log lines, counters, and rows of the statistics.
+"""Reports about cells: as events, log lines, counters, and rows of the statistics.
 
 Nothing is reported while a client waits for the loop: `CellEvents.emit` queues it, `CellEvents.flush`
 reports.
@@ -196,7 +196,7 @@ class PrefetchMisses:
 
 
 class CellEvents:
-    """Reports what happens to cells.
+    """Reports the events of cells: to subscribers, the log and the statistics.
 
     Parameters
     ----------

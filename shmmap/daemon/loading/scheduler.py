@@ -425,7 +425,7 @@ class Scheduler:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
             code = failure_code(error)
-            limit = limit_behind(error) if code not in SPACE_CODES else None  # full memory has no such limit
+            limit = limit_behind(error) if code not in SPACE_CODES else None  # else memory is full
             why = f"{limit.message} ({limit.hint})" if limit is not None else str(error.strerror)
             self._fail(load, code, f"its segment cannot be published: {why}", None, now_s)
             return

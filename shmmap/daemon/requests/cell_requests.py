@@ -429,7 +429,7 @@ class CellRequests:
     def _answer_cold(
         self, wanted: PendingRequest, index: int, layer: str, answer: _Answer, now_s: float
     ) -> None:
-        """Add one cell to the answer that may have to be loaded or has failed."""
+        """Add a cell that is not warm to the answer: as resident, pending or failed."""
         cache, found, loads = self._cache, wanted.found, self._scheduler.loads
         key, catalogue = cache.key(index, layer), cache.catalogue
         wire_id = cache.wire_id(key.cell_id)

@@ -93,7 +93,7 @@ def _removed_names(
 def difference(
     wanted: PendingRequest, message: Differential, indices: list[int], layers: tuple[str, ...]
 ) -> Generator[None, None, None]:
-    """Note the area's cells ``indices`` that the client lacks as found, whether in memory or not.
+    """Find which of the area's cells ``indices`` the client lacks, whether they are in memory or not.
 
     If they are not all the cells of the area, a held cell that is not known may lie in it, and stays.
 

@@ -156,7 +156,7 @@ class SessionQuota:
         return session.held_bytes + sum(resident.nbytes for resident in residents) <= self.nbytes
 
     def check(self, wanted: PendingRequest, sizes: Sequence[int]) -> Iterator[None]:
-        """Note the cells that exceed the quota as refused, farthest cells first.
+        """Mark the cells that exceed the quota as refused, farthest cells first.
 
         Parameters
         ----------
