@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon: it loads cells, keeps them in shared memory, and answers clients."""
+"""The daemon: loads cells, keeps them in shared memory, and answers clients."""

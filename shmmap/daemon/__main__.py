@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m shmmap.daemon MAP ...`` is ``shmmap serve MAP ...``."""
+"""Entry point: ``python -m shmmap.daemon MAP ...`` is equivalent to ``shmmap serve MAP ...``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of the daemon put together: on the map in memory stand sockets, requests and the loop."""
+"""Assembly of one run of the daemon: sockets, requests and the loop on top of the map in memory."""
 
 from __future__ import annotations
 
@@ -60,36 +60,36 @@ if TYPE_CHECKING:
 __all__ = ["Elsewhere", "Service"]
 
 LOOK_S: Final = 1.0
-"""How often to check that sockets have their files."""
+"""Interval of checking whether the sockets' files still exist."""
 LAST_WORDS_S: Final = 0.2
-"""How long the end may take to deliver the last messages."""
+"""Time for delivering the last messages when the daemon stops."""
 
 
 class Elsewhere(VersionInService, Protocol):
-    """An origin that is not on this machine."""
+    """A remote origin."""
 
     @property
     def link(self) -> OriginLink:
-        """The origin's link: whether it is in reach, and has another version."""
+        """Link to the origin: whether it is reachable, and has another version."""
 
     @property
     def keeper(self) -> ObjectKeeper | None:
-        """What keeps objects of cells on the disk ahead; None where nothing is kept."""
+        """Keeps objects of cells on the disk ahead of use; None without a disk cache."""
 
     def note_served(self, view: CatalogueView) -> None:
-        """Remember which version of the map is served now."""
+        """Record which version of the map is served now."""
 
     def try_again(self) -> None:
-        """Fetch again what is missing of the list of cells."""
+        """Fetch the missing pages of the list of cells again."""
 
 
 class Service:
-    """The daemon as clients and the service manager see it.
+    """The daemon as clients and the service manager see it: sockets, requests, signals and status.
 
     Raises
     ------
     ConfigError
-        There is no such group of administrators.
+        The group of administrators does not exist.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ class Service:
         )
 
     def _tasks_of(self, elsewhere: Elsewhere) -> Iterator[tuple[str, BackgroundTask]]:
-        """Yield the background tasks that an origin elsewhere needs."""
+        """Yield the background tasks that a remote origin needs."""
         from shmmap.daemon.loading.outages import OriginWatch
 
         cache, scheduler, watched = self._memory.cache, self._memory.scheduler, self._memory.watched
@@ -282,7 +282,7 @@ class Service:
             one.begin()
 
     def _restore_sockets(self, now_s: float) -> None:
-        """Make files of sockets again that another program removed; connections stay as they are."""
+        """Recreate files of sockets that another program removed; open connections continue."""
         if now_s < self._look_s:
             return
         self._look_s = now_s + LOOK_S
@@ -326,11 +326,11 @@ class Service:
         )
 
     def _beat(self) -> None:
-        """Do what is due a few times a second, from the loop itself: a daemon that hangs does not beat."""
+        """Do the periodic work, a few times a second, in the loop itself: a hanging daemon stops beating."""
         memory, now_s = self._memory, time.monotonic()
         self._manager.beat(now_s, self._status)
         self._handshake.look_after_departed()
-        if not any(self._connections):  # none can end and make room
+        if not any(self._connections):  # no connection will end and make room
             self._connections.try_again()
         self._pins.keep(now_s)
         self._operators.answer_overdue(now_s)
@@ -375,11 +375,11 @@ class Service:
         return directories_of(self._config.map_path, self._config.metadata, id_prefix)
 
     def _take_another(self) -> None:
-        """Take another version of the map: there is one."""
+        """Reload because the origin has another version of the map."""
         self._reloader.ask(lambda _result: None)
 
     def _reload(self) -> None:
-        """Read the map again for a signal or a change; the service manager waits for the end."""
+        """Read the map again after a signal or a change, and report start and end to the service manager."""
         self._manager.reloading()
         self._reloader.ask(self._reloaded)
 
@@ -406,12 +406,12 @@ class Service:
                 self._loop.stop(answer=not keep)
 
     def _quick_exit(self, number: int, frame: object) -> None:
-        """Remove the names and exit: a second signal has come.
+        """Remove the names and exit because of a second signal.
 
-        It may come in the middle of the first one's work, so it trusts the disk alone.
+        It may interrupt the handling of the first signal, so it relies only on the directory's content.
         """
         del number, frame
-        ignore_signals()  # one after the other they would pile up in here
+        ignore_signals()  # further signals would pile up in this handler
         directory, instance = self._memory.directory, self._config.instance
         take_away(directory, instance)
         for file, _listener in self._sockets:
@@ -422,10 +422,10 @@ class Service:
 
 
 def _settle_memory() -> None:
-    """Give back what reading the map took; from now on memory is freed by counting references alone.
+    """Free memory left over from reading the map; from now on reference counting alone frees memory.
 
-    Nothing that the daemon drops refers to itself (a test holds that), and a search for what does took 30 ms
-    of a turn: even new objects are many where segments come as fast as others go.
+    No object that the daemon drops is part of a reference cycle (a test ensures that), and a run of the
+    cyclic garbage collector took 30 ms of a turn: even new objects are many where segments come and go fast.
     """
     gc.collect()
     gc.disable()

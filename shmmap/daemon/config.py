@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon's settings: defaults, then one TOML file, then ``SHMMAP_*`` variables, then flags."""
+"""Settings of the daemon: defaults, overridden by one TOML file, ``SHMMAP_*`` variables, and flags."""
 
 from __future__ import annotations
 
@@ -73,28 +73,28 @@ SECTIONS: Final = {
     "instance": "how clients find the daemon",
     "live_budget_bytes": "live maps",
 }
-"""Headings in the help and in the example file, by the first setting below each."""
+"""Headings in the help and in the example file, by the first setting of each section."""
 DROPPED: Final = {"eviction": "what clients will need last is always evicted first"}
-"""Settings that there were, and what holds instead."""
+"""Removed settings, and what applies instead."""
 RENAMED: Final = {"ride_out_s": "outage_tolerance_s"}
-"""Former names of settings, and the present ones."""
+"""Former names of settings, with their present names."""
 
 
 class Setting(NamedTuple):
-    """A setting's value and where it comes from: ``FILE:LINE``, a variable, the flags, the default."""
+    """A setting's value and its origin: ``FILE:LINE``, a variable, the flags, or the default."""
 
     value: Any
     origin: str
 
 
 def _quota(text: str) -> float:
-    """Read a part of the budget, or a size."""
+    """Parse a fraction of the budget, or a size."""
     return float(text) if text.replace(".", "").isdigit() else float(parse_bytes(text))
 
 
 @dataclass(frozen=True, slots=True)
 class DaemonConfig:
-    """Every setting of the daemon; an empty text and 0 stand for what `Row.unset` says."""
+    """All settings of the daemon; an empty text or 0 has the meaning given by `Row.unset`."""
 
     map_path: str = setting(
         "",
@@ -287,21 +287,21 @@ class DaemonConfig:
         """Path of the request socket."""
         if self.endpoint:
             return endpoint_path(self.endpoint, longer=_events_longer(self.endpoint))
-        given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]  # systemd lists all there are
+        given = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]  # systemd lists all runtime directories
         directory = self.runtime_dir or given or _default_runtime_dir()
         return endpoint_path(socket_path(directory, self.instance), longer=EVENTS_LONGER)
 
     def loaders(self) -> int:
-        """Most loader processes at a time."""
+        """Maximum number of loader processes."""
         return self.workers or min(4, max(1, len(os.sched_getaffinity(0)) - 1))
 
 
 ROWS: Final = rows_of(DaemonConfig)
-"""What is known of each setting, by its attribute; `DaemonConfig.live` has tables of its own."""
+"""Metadata of the settings, by attribute; `DaemonConfig.live` has tables of its own."""
 
 
 def _events_longer(endpoint: str) -> int:
-    """How much longer the path of the socket of events is."""
+    """Return by how many bytes the event socket's path is longer."""
     return EVENTS_LONGER + (0 if endpoint.endswith(".sock") else len(".sock"))
 
 
@@ -313,7 +313,7 @@ def _default_runtime_dir() -> str:
 
 
 def option_of(name: str) -> str:
-    """Return what the command line calls a setting, by its attribute."""
+    """Return the command-line option of a setting, given its attribute."""
     if name == "map_path":
         return "MAP"
     called = ROWS[name].called if name in ROWS else name
@@ -323,23 +323,23 @@ def option_of(name: str) -> str:
 def load_config(
     flags: Mapping[str, Any], *, file: str = "", environ: Mapping[str, str] = os.environ
 ) -> DaemonConfig:
-    """Put the settings together; later origins override earlier ones.
+    """Combine the settings; later sources override earlier ones.
 
     Parameters
     ----------
     flags
-        Settings given on the command line, by attribute name or by their name in the file; None means
-        not given.
+        Settings given on the command line, by attribute or by name in the file; None means not given.
     file
-        TOML file, empty for none.
+        TOML file; empty for none.
     environ
-        Variables named ``SHMMAP_`` and the setting in capitals count.  As for clients, ``SHMMAP_ENDPOINT``
-        does not count beside a flag that names another instance or directory.
+        Source of variables named ``SHMMAP_`` and the setting in capitals.  As for clients,
+        ``SHMMAP_ENDPOINT`` is ignored beside a flag that names another instance or directory.
 
     Raises
     ------
     ConfigError
-        An unknown key (with a suggestion), a wrong type or an impossible value, and where it is set.
+        A key is unknown (with a suggestion), or a value has the wrong type or range; the message names
+        its origin.
     """
     found = trace_settings(flags, file=file, environ=environ)
     return DaemonConfig(**{name: one.value for name, one in found.items()})
@@ -376,13 +376,13 @@ def trace_settings(
     settings["live"] = _live(live_tables, live_flags)
     endpoint = settings["endpoint"]
     if endpoint.value and settings["instance"].origin == "default":
-        # clients that know the socket alone look for the segments of the instance it is named after
+        # clients that know only the socket look for the segments of the instance named by it
         settings["instance"] = Setting(_instance_of(endpoint.value), endpoint.origin)
     return settings
 
 
 def _no_setting(word: str, origin: str) -> ConfigError:
-    """Refuse a name that is no setting, or no longer one."""
+    """Return the error for an unknown or removed setting."""
     if word in DROPPED or word in RENAMED:
         called, new, remove = word, RENAMED.get(word, ""), "delete this line"
         if origin == COMMAND_LINE:
@@ -396,7 +396,7 @@ def _no_setting(word: str, origin: str) -> ConfigError:
 
 
 def _live(tables: Setting, flags: Sequence[Setting]) -> Setting:
-    """Put the settings of live maps together: of those that variables or the command line name, too."""
+    """Combine the settings of live maps, including those named by variables or the command line."""
     from shmmap.daemon.config_live import live_settings
 
     origins = [one.origin for one in (tables, *flags) if one.origin]
@@ -410,7 +410,7 @@ def _live(tables: Setting, flags: Sequence[Setting]) -> Setting:
 
 
 def _instance_of(endpoint: str) -> str:
-    """Return the instance that a socket's name stands for; the default one where it cannot be a name."""
+    """Return the instance named by a socket's file name; the default one if that is not a valid name."""
     try:
         return check_instance(os.path.basename(endpoint_path(endpoint)).removesuffix(".sock"))
     except (BadRequest, ConfigError):
@@ -418,7 +418,7 @@ def _instance_of(endpoint: str) -> str:
 
 
 def installed_config_file(environ: Mapping[str, str] = os.environ) -> str:
-    """Return the file that the installed units read: the user's own, else the system's; or empty."""
+    """Return the settings file of the installed units: the user's own, else the system's; or empty."""
     own = environ.get("XDG_CONFIG_HOME", "") or os.path.join(environ.get("HOME", "/"), ".config")
     places = [f"{own}/shmmap/shmmap.toml", SYSTEM_CONFIG_FILE]
     return next((place for place in places if os.path.exists(place)), "")
@@ -430,7 +430,7 @@ def read_settings_file(path: str) -> dict[str, Setting]:
     Raises
     ------
     ConfigError
-        It cannot be read, or is no TOML.
+        The file cannot be read, or is not valid TOML.
     """
     try:
         status = os.stat(path)
@@ -455,9 +455,9 @@ def read_settings_file(path: str) -> dict[str, Setting]:
 
 
 def _lines(text: str) -> dict[str, int]:
-    """First line of each key at the top level.
+    """Return the first line of each key at the top level.
 
-    A line inside a string of several lines may look like one, but what comes before it is no TOML.
+    A line in a multi-line string may look like a key, but the text before it is then not valid TOML.
     """
     found: dict[str, int] = {}
     lines = text.splitlines(keepends=True)

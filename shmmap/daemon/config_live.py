@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which live maps the daemon keeps: ``--live NAME[=DIR]`` and ``[live.NAME]`` of the settings file."""
+"""Settings of the live maps: ``--live NAME[=DIR]`` and ``[live.NAME]`` of the settings file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmmap.errors import ConfigError
 __all__ = ["LIVE_ROWS", "SERVICE_STATE", "LiveSettings", "live_directory", "live_settings", "state_directory"]
 
 SERVICE_STATE: Final = "/var/lib/shmmap/state"
-"""Where each instance of the installed service has its state directory (StateDirectory= of the units)."""
+"""Directory in which each instance of the installed service has its state (StateDirectory= of the units)."""
 
 REAL_S: Final = 0.5
 
@@ -28,10 +28,11 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
-    """Settings of one live map, which clients call ``name``.
+    """Settings of one live map; clients use its ``name``.
 
-    Those of voxels are fixed when the map is made, see `shmmap.chunks.occupancy.Occupancy`.  What stays in
-    memory, and for how long changes are there alone: see `shmmap.daemon.live.paging.residency.Limits`.
+    The settings of voxels are fixed when the map is created, see `shmmap.chunks.occupancy.Occupancy`.  For
+    what stays in memory, and how long changes exist only there, see
+    `shmmap.daemon.live.paging.residency.Limits`.
     """
 
     name: str
@@ -95,34 +96,34 @@ class LiveSettings:
 
     @property
     def occupancy(self) -> Occupancy:
-        """What evidence is worth; raises ConfigError where that cannot be."""
+        """Return the weights of evidence; raise ConfigError if they are invalid."""
         return Occupancy(
             self.hit, self.miss, self.clamp_min, self.clamp_max, self.occupied_above, self.free_below
         )
 
 
 LIVE_ROWS: Final = rows_of(LiveSettings)
-"""What is known of each setting of a live map, by its name in the table."""
+"""Metadata of the settings of a live map, by name in the table."""
 
 
 def live_settings(
     flags: Sequence[str], tables: Mapping[str, Any], origin: str = "command line"
 ) -> tuple[LiveSettings, ...]:
-    """Put the settings of all live maps together.
+    """Combine the settings of all live maps.
 
     Parameters
     ----------
     flags
-        ``NAME`` or ``NAME=DIR`` each; such a map has the settings of the table of its name, if there is one.
+        ``NAME`` or ``NAME=DIR`` each; the table of that name, if present, has the map's other settings.
     tables
-        ``live`` of the settings file.
+        Table ``live`` of the settings file.
     origin
-        Where the tables are, for messages.
+        Origin of the tables, for messages.
 
     Raises
     ------
     ConfigError
-        A name, a key or a value cannot be.
+        A name, key or value is invalid.
     """
     if not isinstance(tables, Mapping) or not all(isinstance(table, Mapping) for table in tables.values()):
         raise ConfigError(
@@ -149,7 +150,7 @@ def live_settings(
 
 
 def _real(path: str) -> str:
-    """Return a path without links, as far as that is known at once: a directory may hang."""
+    """Return a path without links, if it can be resolved quickly: a directory may hang."""
     found = [os.path.normpath(path)]
     looking = threading.Thread(target=lambda: found.append(os.path.realpath(path)), daemon=True)
     looking.start()
@@ -200,7 +201,7 @@ def live_directory(instance: str, name: str, environ: Mapping[str, str] = os.env
     Raises
     ------
     ConfigError
-        There is none.
+        There is no state directory.
     """
     state = state_directory(instance, environ)
     if not state:
@@ -213,10 +214,10 @@ def live_directory(instance: str, name: str, environ: Mapping[str, str] = os.env
 
 
 def state_directory(instance: str, environ: Mapping[str, str] = os.environ) -> str:
-    """Return where an instance keeps what must not be lost.
+    """Return the directory in which an instance keeps data that must not be lost.
 
     ``$STATE_DIRECTORY`` (a service), else ``$XDG_STATE_HOME/shmmap/INSTANCE``, by default in the home
-    directory; empty where there is none.
+    directory; empty if there is none.
     """
     service = environ.get("STATE_DIRECTORY", "").split(":")[0]
     if service:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of a setting: its name, type, default, range and help, in the class that holds its value.
+"""Metadata of settings: name, type, default, range and help, in the class that holds the values.
 
-A field ``workers: int = setting(0, "most loader processes at a time", ...)`` is a row of a table.  Options of
-``shmmap serve``, checks of the configuration file, what their errors say, and the example file are made from
-these rows.  Nothing here imports a package, so that ``shmmap --help`` needs none.
+A field ``workers: int = setting(0, "most loader processes at a time", ...)`` is a row of a table.  The
+options of ``shmmap serve``, the checks of the configuration file, their error messages, and the example file
+are generated from these rows.  This module imports no other package, so that ``shmmap --help`` needs none.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 LARGEST_BYTES: Final = 1 << 62
 _BEYOND: Final = 1 << 63
-"""Beyond any limit; a whole number may be too large for a float."""
+"""Larger than any limit; an integer may be too large for a float."""
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(i?)b?\s*", re.IGNORECASE)
 _TRUTHS: Final = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}
 _KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
@@ -36,7 +36,7 @@ _PARSERS: Final[dict[type, Callable[[str], Any]]] = {
 
 
 class Allowed(NamedTuple):
-    """Which values a setting may have; the words for them in hints; all of them, if they are few."""
+    """Values that a setting may have: a check, a text for hints, and all values if they are few."""
 
     accepts: Callable[[Any], bool]
     words: str = ""
@@ -47,28 +47,28 @@ _ANYTHING: Final = Allowed(lambda _: True)
 
 
 def within(lowest: float, highest: float, unit: str = "") -> Allowed:
-    """Allow numbers of a range."""
+    """Allow numbers in a range."""
     return Allowed(lambda value: lowest <= value <= highest, f"{lowest} to {highest} {unit}".rstrip())
 
 
 def at_least(lowest: str) -> Allowed:
-    """Allow sizes from ``lowest`` on, such as ``64K``."""
+    """Allow sizes of at least ``lowest``, such as ``64K``."""
     nbytes = parse_bytes(lowest)
     return Allowed(lambda value: nbytes <= value <= LARGEST_BYTES, f"at least {lowest}")
 
 
 def one_of(*choices: str) -> Allowed:
-    """Allow these texts."""
+    """Allow only these texts."""
     return Allowed(choices.__contains__, f"{', '.join(choices[:-1])} or {choices[-1]}", choices)
 
 
 def parse_bytes(text: str) -> int:
-    """Read a size such as ``512M``, ``2GiB`` or ``1000000`` (powers of 1024), at most 2^62 bytes.
+    """Parse a size such as ``512M``, ``2GiB`` or ``1000000`` (powers of 1024), at most 2^62 bytes.
 
     Raises
     ------
     ConfigError
-        It is no size, or a larger one.
+        The text is not a size, or the size is too large.
     """
     match = _SIZE.fullmatch(text)
     nbytes = float(match[1]) * 1024.0 ** " kmgt".index(match[2].lower() or " ") if match else math.inf
@@ -79,24 +79,24 @@ def parse_bytes(text: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One setting.
+    """Metadata of one setting.
 
     Attributes
     ----------
     name
-        Its attribute.
+        Attribute that holds the value.
     default
-        Its default; the type of this is the setting's.
+        Default value; its type is the setting's type.
     help
-        What it is, as a clause: in the example file it begins with a capital and ends with a full stop.
+        Description as a clause; in the example file it begins with a capital and ends with a full stop.
     metavar
-        What the command line calls its value; empty: it lists the choices.
+        Name of the value on the command line; empty: the choices are listed.
     unset
-        What an empty value, or 0, stands for, which is allowed then.
+        Meaning of an empty value, or 0, which is then allowed.
     size
-        Name in files, variables and options of a size in bytes, whose attribute is called otherwise.
+        Name in files, variables and options of a size in bytes, whose attribute has another name.
     parse
-        Reads it from text, where its type alone does not say how; raises ValueError or `ConfigError`.
+        Parses the value from text if the type is not enough; raises ValueError or `ConfigError`.
     """
 
     name: str
@@ -110,29 +110,29 @@ class Row:
 
     @property
     def called(self) -> str:
-        """Name in files, and of variables in small letters."""
+        """Name in files, and in lower case that of variables."""
         return self.size or self.name
 
     @property
     def hint(self) -> str:
-        """Which values it may have."""
+        """Text that lists the allowed values."""
         words, unset = self.allowed.words, self.unset
         return f"{words}; 0: {unset}" if words and unset and not isinstance(self.default, str) else words
 
     def checked(self, value: Any, where: str, *, key: str, origin: str, as_text: bool = True) -> Any:
-        """Return a value in the setting's type.
+        """Return a value converted to the setting's type.
 
         Parameters
         ----------
         where
-            What the message begins with: the origin, and what the setting is called there.
+            Beginning of the message: the origin, and the setting's name there.
         as_text
-            Read numbers and truths from text, too, as variables and options have them.
+            Whether numbers and booleans may be given as text, as in variables and options.
 
         Raises
         ------
         ConfigError
-            It is of another type, or not allowed.
+            The value has another type, or is not allowed.
         """
         kind = type(self.default)
         try:
@@ -155,22 +155,22 @@ class Row:
         return value
 
     def toml(self, value: Any) -> str:
-        """Write a value as in a configuration file."""
+        """Return a value as written in a configuration file."""
         if self.size and value:
             for power, unit in ((3, "G"), (2, "M"), (1, "K")):
                 if value % 1024**power == 0:
                     return f'"{value // 1024**power}{unit}"'
-        # settings are texts, numbers and truths, which TOML writes as JSON does
+        # settings are texts, numbers and booleans, which TOML writes as JSON does
         return json.dumps(value, ensure_ascii=False)
 
     def option_help(self) -> str:
-        """Return the help of the option: what it is, and its default."""
+        """Return the help of the option: its description and default."""
         unset = f"; 0: {self.unset}" if self.unset and self.default else ""
         default = self.toml(self.default).strip('"').removesuffix(".0") if self.default else self.unset
         return f"{self.help}{unset}" + (f" (default: {default})" if default else "")
 
     def example(self, value: Any = None) -> tuple[str, str]:
-        """Return the words for the example file, and the line that sets the value, by default the default."""
+        """Return the description for the example file, and the line that sets ``value`` or the default."""
         words = f"{self.help[:1].upper()}{self.help[1:]}."
         if self.unset:
             words += f"  {'Empty' if isinstance(self.default, str) else '0'}: {self.unset}."
@@ -187,13 +187,13 @@ def setting(
     size: str = "",
     parse: Callable[[str], Any] | None = None,
 ) -> T:
-    """Describe a field of a dataclass as a setting, see `Row`."""
+    """Declare a field of a dataclass as a setting, see `Row`."""
     described = (help, metavar, allowed, unset, size, parse)
     return field(default=default, metadata={"setting": described})
 
 
 def rows_of(kind: type) -> dict[str, Row]:
-    """Return the settings of a dataclass by their attributes, in its order."""
+    """Return the settings of a dataclass by attribute, in order of declaration."""
     return {
         one.name: Row(one.name, one.default, *one.metadata["setting"])
         for one in fields(kind)
@@ -202,8 +202,8 @@ def rows_of(kind: type) -> dict[str, Row]:
 
 
 def near_hint(name: str, names: Iterable[str]) -> str:
-    """Return the hint for a setting that there is not: the one that was meant, or all."""
-    import difflib  # 6 ms, for mistakes alone
+    """Return the hint for an unknown setting: the most similar one, or all."""
+    import difflib  # takes 6 ms, and only mistakes need it
 
     known = list(names)
     near = difflib.get_close_matches(name, known, n=1)

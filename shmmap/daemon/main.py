@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of the daemon: lock, open the map, serve, stop.
+"""One run of the daemon: take the lock, open the map, serve, stop.
 
-The order matters.  The lock comes first, because binding would steal a live socket; leftovers are
-taken over before anything is published; READY is reported when requests are answered.  On the way out
-every name is removed before the lock is.
+The order matters.  The lock comes first, because binding would steal a live socket.  The previous run's
+segments are taken over before anything is published.  READY is reported once requests are answered.  At the
+end, every name is removed before the lock is released.
 
 **Stopping empties, restarting keeps warm.** SIGTERM and SIGINT stop the daemon and free all memory.
 SIGUSR1 stops it and leaves the segments to the next run, which adopts them
-(`shmmap.daemon.loading.adoption`), as it does after a crash, or when a defect ends the daemon; clients that
-wait for an answer get it from the next run, too. A SIGTERM that follows a SIGUSR1 changes nothing
-about that, so a service manager that sends SIGTERM anyway can announce a restart beforehand. systemd
-ends a unit in the same way for ``restart`` and ``stop``, but while it does so its job list says which it
-is; ``+`` gives the line the right to ask and to send, in a unit for one user ``systemctl --user`` has it
+(`shmmap.daemon.loading.adoption`).  The same happens after a crash, or when a defect ends the daemon.
+Clients that wait for an answer get it from the next run, too.  A SIGTERM after a SIGUSR1 changes nothing, so
+a restart can be announced before a service manager sends its SIGTERM.  systemd stops a unit in the same way
+for ``restart`` and ``stop``, but meanwhile its job list shows which of them it is.  ``+`` gives the line the
+right to query that list and to send the signal; in a user's own unit ``systemctl --user`` has that right
 anyway::
 
     ExecStop=-+/bin/sh -c 'systemctl list-jobs --plain --no-legend | \
@@ -81,26 +81,26 @@ if TYPE_CHECKING:
 __all__ = ["run"]
 
 LIVE_S: Final = 1.5
-"""How long points wait for live maps at the start: points are served whatever is wrong with those."""
+"""How long points wait for live maps at the start: faulty live maps must not prevent serving points."""
 LIVE_ALONE_S: Final = 120.0
-"""How long the daemon waits for live maps where it serves nothing else: kernels are compiled meanwhile."""
+"""How long the daemon waits for live maps if it serves nothing else: kernels are compiled meanwhile."""
 SWITCH_S: Final = 0.0005
-"""How long a thread that reads the map again may keep the serving loop waiting for the interpreter."""
+"""How long a thread that reloads the map may keep the serving loop waiting for the interpreter lock."""
 
 
 def run(config: DaemonConfig) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code.
+    """Serve until SIGTERM or SIGINT; return the exit code.
 
     Raises
     ------
     MapMissing, MapDataError
-        There is no map, or none that can be served.
+        The map does not exist, or cannot be served.
     ConfigError
-        No map is named, or a setting cannot work on this machine.
+        No map is named, or a setting cannot be used on this machine.
     InstanceBusy
-        Another daemon has this instance.
+        Another daemon runs this instance.
     CannotStart
-        A required resource is unavailable: full, not there yet, or taken.
+        A required resource is unavailable: full, not there yet, or in use.
     """
     set_up_logging(getattr(logging, config.log_level.upper()))
     if not config.map_path and not config.live:
@@ -110,7 +110,7 @@ def run(config: DaemonConfig) -> int:
             hint="give `shmmap serve MAP`, or set map_path; --live NAME for a live map alone",
         )
     if is_url(config.map_path):
-        read_url(config.map_path)  # may refuse: one that may hold a secret is not logged
+        read_url(config.map_path)  # check before logging: an invalid URL may contain a secret
     log.info("starting", version=__version__, instance=config.instance, map=config.map_path, pid=os.getpid())
     early = fork_early()
     prepare_process()
@@ -132,7 +132,7 @@ def run(config: DaemonConfig) -> int:
             stack.callback(_end_threads, elsewhere)
         origin: ViewOrigin = elsewhere if elsewhere is not None else _origin_here(config)
         cache_dir = absolute_path(config.cache_dir or default_cache_directory())
-        config = dataclasses.replace(  # loaders and clients run elsewhere
+        config = dataclasses.replace(  # loaders and clients run in other directories
             config, map_path=origin.path, shm_dir=directory.path, cache_dir=cache_dir
         )
         with signals.held():
@@ -140,7 +140,7 @@ def run(config: DaemonConfig) -> int:
             stack.callback(lock.release)
             # two runtime directories may share a directory of segments
             refuse_second(directory, config.instance)
-            stack.callback(ignore_signals)  # without the lock no name is ours to take away
+            stack.callback(ignore_signals)  # without the lock, the names are not ours to remove
             step("daemon.lock")
             stack.push(partial(stopped_early, signals, directory, config.instance))
         started_s = time.monotonic()
@@ -177,7 +177,7 @@ def run(config: DaemonConfig) -> int:
 
 
 def _origin_here(config: DaemonConfig) -> ViewOrigin:
-    """Find where cells come from on this machine."""
+    """Return the local or remote origin of the cells."""
     if not config.map_path:
         return NoMap()
     return find_origin(
@@ -192,7 +192,7 @@ def _origin_here(config: DaemonConfig) -> ViewOrigin:
 
 
 def _published(config: DaemonConfig) -> PublishedOrigin | None:
-    """Open a published map: a URL, or a directory with a file CURRENT; None where the map is files."""
+    """Open a published map, given as a URL or a directory with a file CURRENT; None if the map is files."""
     path = config.map_path
     if config.trust and not is_url(path) and not os.path.isdir(path):
         raise ConfigError(
@@ -235,7 +235,7 @@ def _fetched_from(origin: PublishedOrigin) -> FetchedFrom:
 
 
 def _end_threads(origin: PublishedOrigin) -> None:
-    """End threads that ask the origin; one that still waits must not see the interpreter's end."""
+    """End the threads that query the origin; if one still waits, skip the interpreter's shutdown."""
     if not origin.close():
         atexit.register(_leave)
 
@@ -246,7 +246,7 @@ def _leave() -> None:
 
 
 def _refuse_taken(path: str, activated: ActivatedSocket | None) -> None:
-    """Refuse sockets that other programs have, before the map is read."""
+    """Refuse sockets that other programs use, before the map is read."""
     if activated is None:
         refuse_taken(path)
     refuse_taken(events_path(path))
@@ -258,12 +258,12 @@ def _close(
     kind: type[BaseException] | None,
     *_: object,
 ) -> None:
-    """Leave memory to the next run, too, if a defect ended this one: it is like a crash."""
+    """Close; if a defect ended this run, leave memory to the next run, as after a crash."""
     closed.close(keep=signals.keep or (kind is not None and not issubclass(kind, ShmmapError)))
 
 
 def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay | NoLiveMaps:
-    """Start the process that keeps the live maps, and wait for it a while."""
+    """Start the process that keeps the live maps, and wait for it up to a time limit."""
     if not config.live:
         return NoLiveMaps()
     mappers, ledger = Authorization(config.live_group, "live_group"), memory.cache.ledger
@@ -289,7 +289,7 @@ def _live_maps(config: DaemonConfig, memory: MapInMemory, gid: int) -> LiveRelay
 
 
 def _socket_path(config: DaemonConfig, activated: ActivatedSocket | None) -> str:
-    """Return where this daemon listens: a socket that was passed to it decides."""
+    """Return the path of the request socket; a socket that was passed to the daemon takes precedence."""
     if activated is None:
         return config.socket()
     if config.endpoint and config.socket() != activated.path:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of one run that have names in shared memory, put together: cache, loaders, statistics.
+"""Assembly of the parts that have names in shared memory: cache, loaders, statistics.
 
-Also where the chunks of live maps go, and how much memory they may take beside the cells.
+Also decides where chunks of live maps are stored, and how much memory they may take besides the cells.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ __all__ = ["FetchedFrom", "MapInMemory", "bytes_beside_cells", "place_live_maps"
 
 CEILING_BYTES: Final = 1 << 30
 PART: Final = 8
-"""By default live maps get this part of the free memory."""
+"""Divisor: by default, live maps get 1/8 of the free memory."""
 LEAST_BYTES: Final = 4 << 20
-"""Least budget of a map: some of the largest chunks, half a mebibyte each."""
+"""Minimum budget of a map: some of the largest chunks, half a mebibyte each."""
 
 
 def bytes_beside_cells(maps: int, *, cells: ShmDirectory, shm_dir: str, budget_bytes: int) -> int:
-    """Return how many bytes this many live maps need in the file system of the cells, at least or as set."""
+    """Return the bytes that live maps need in the cells' file system: their budget, or the minimum."""
     if not maps:
         return 0
     path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
@@ -73,23 +73,23 @@ def place_live_maps(
     gid: int,
     marks_gid: int,
 ) -> Begin:
-    """Decide where live maps are kept and how much memory they may take.
+    """Decide where live maps are stored and how much memory they may take.
 
     Parameters
     ----------
     cells, cells_budget_bytes
-        Where the cells are, and what they may take.
+        Directory and budget of the cells.
     shm_dir, budget_bytes
-        As set; empty and 0 for the defaults.
+        Settings for live maps; empty and 0 for the defaults.
     gid, marks_gid
-        Groups that may read chunks, and that may map.
+        Groups that may read chunks, and that may write to live maps.
 
     Raises
     ------
     ConfigError
-        The directory has huge pages, or both budgets do not fit in it; there is no state directory.
+        The directory has huge pages, both budgets do not fit in it, or there is no state directory.
     CannotStart
-        The directory cannot be used, or too little is free.
+        The directory cannot be used, or too little memory is free.
     """
     path = shm_dir or (cells.path if _huge_pages(cells.path) is None else DEFAULT_SHM_DIR)
     directory = ShmDirectory(path)
@@ -135,7 +135,7 @@ def place_live_maps(
 
 
 def _huge_pages(path: str) -> str | None:
-    """Return the mount option that gives a directory huge pages; None where it has none."""
+    """Return the mount option that gives a directory huge pages; None if it has none."""
     below = os.path.realpath(path) + "/"
     around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
     if not around:
@@ -146,25 +146,25 @@ def _huge_pages(path: str) -> str | None:
 
 
 class FetchedFrom(NamedTuple):
-    """Where loaders fetch cells: their arguments for it, and how many cells each fetches at once."""
+    """Arguments with which loaders fetch cells, and the number of cells each loader fetches concurrently."""
 
     words: tuple[str, ...]
     places: int
 
 
 class MapInMemory:
-    """What has names in shared memory: the cache with its loaders, and the statistics.
+    """Parts with names in shared memory: the cache with its loaders, and the statistics.
 
-    Leftovers of a previous run are taken over.  `close` takes the names away again.
+    A previous run's segments are taken over.  `close` removes the names.
 
     Raises
     ------
     ConfigError
-        The budget cannot work on this machine, or a limit lets nothing be written to the directory.
+        The budget is impossible on this machine, or a limit prevents writing to the directory.
     CannotStart
-        The directory is full, or something is in the way of a name.
+        The directory is full, or another file has a needed name.
     InstanceBusy
-        Another daemon has these names.
+        Another daemon uses these names.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class MapInMemory:
         epoch = secrets.randbits(63) | 1
         self.identity = _identity(config, catalogue, directory.path, socket_path, epoch)
         group_limit = memory_limit_bytes()
-        budget = choose_budget(  # may refuse: before anything has a name
+        budget = choose_budget(  # may raise: before anything has a name
             config.budget_bytes,
             directory,
             ours_bytes=directory.used_bytes(segment_prefix(config.instance)),
@@ -209,7 +209,7 @@ class MapInMemory:
                 reserve=ledger.add_overhead,
             )
         with contextlib.ExitStack() as undo:
-            undo.callback(self.statistics.close)  # its name must not stay when something else fails
+            undo.callback(self.statistics.close)  # its name must not stay if a later step fails
             self.statistics.set("pin_source", list(PinSource).index(pins.source))
             self.statistics.set("last_reload_unix_ns", time.time_ns())
             self.statistics.set("map_problems", len(catalogue.problems))
@@ -237,7 +237,7 @@ class MapInMemory:
                 *(origin.words if origin is not None else ()),
             )
             parent = PreparedParent(settings, self.watched, early)
-            parent.start()  # it imports what loaders need while this process gets ready
+            parent.start()  # its imports run while this process continues to start
             pool = partial(
                 WorkerPool,
                 config.loaders(),
@@ -266,7 +266,7 @@ class MapInMemory:
             undo.pop_all()
 
     def close(self, *, keep: bool) -> None:
-        """End the loaders, and remove every name, or leave those of the segments to the next run."""
+        """End the loaders, and remove every name; with ``keep`` leave the segments' names to the next run."""
         self.scheduler.pool.close()
         self.adoption.close(keep=keep)
         self.cache.close(keep=keep)
@@ -296,7 +296,7 @@ def _identity(
 
 @contextlib.contextmanager
 def _first_write(directory: ShmDirectory) -> Iterator[None]:
-    """Say in errors of the first write to a directory what is wrong with it."""
+    """Explain in the error of the first write to a directory what is wrong with the directory."""
     try:
         yield
     except OSError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has to be in place before the daemon can serve: limits, groups, and a way to see what is in use."""
+"""Prerequisites of serving: limits, groups, and a way to detect segments in use."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ _LARGE_BYTES: Final = 1 << 20
 
 
 def raise_descriptor_limit() -> None:
-    """Take as many descriptors as allowed: a session takes two, and the customary limit is 1024."""
+    """Raise the limit of descriptors to its maximum: a session takes two, and the usual limit is 1024."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def give_back_large_tables() -> None:
-    """Return large memory to the kernel when it is freed.
+    """Return large memory blocks to the kernel when they are freed.
 
-    After the first table of a large map, glibc would keep what others leave: 30 MB of a million cells.
+    After the first table of a large map, glibc would keep freed memory: 30 MB for a million cells.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -51,17 +51,17 @@ def give_back_large_tables() -> None:
 
 
 def import_ahead() -> None:
-    """Import what numpy would import when `np.unique` is first called: 12 ms, in the serving loop."""
+    """Import modules that numpy imports at the first `np.unique`, which takes 12 ms, before the loop runs."""
     importlib.import_module("numpy.ma")
 
 
 def access_of_segments(config: DaemonConfig) -> tuple[int, int]:
-    """Return group id and mode of what readers open; -1 and owner-only without a group.
+    """Return group id and mode of the files that readers open; -1 and owner-only without a group.
 
     Raises
     ------
     ConfigError
-        There is no such group, or this user may give it nothing.
+        The group does not exist, or this user may not assign files to it.
     """
     if not config.group:
         return -1, 0o400
@@ -77,7 +77,7 @@ def access_of_segments(config: DaemonConfig) -> tuple[int, int]:
 
 
 def check_file_size_limit(budget_bytes: int) -> None:
-    """Warn of segments that a limit on the size of files will refuse."""
+    """Warn if the file size limit is lower than some segments."""
     limit = file_size_limit()
     if limit is not None and limit < budget_bytes:
         log.warning(
@@ -89,7 +89,7 @@ def check_file_size_limit(budget_bytes: int) -> None:
 
 
 def choose_pins(directory: ShmDirectory) -> PinWatch:
-    """Find out how this machine shows that a segment is in use, and log it."""
+    """Determine how this machine shows which segments are in use, and log it."""
     support = probe_pins(directory)
     if support.source is not PinSource.LEASES:
         log.warning("shm directory grants no leases", shm_dir=directory.path, hint="shmmap doctor")
@@ -100,7 +100,7 @@ def choose_pins(directory: ShmDirectory) -> PinWatch:
 
 
 def account_name(uid: int) -> str:
-    """Return a user's name, or the number of one without."""
+    """Return a user's name, or the number of a user without a name."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -108,12 +108,12 @@ def account_name(uid: int) -> str:
 
 
 def group_id(name: str, key: str) -> int:
-    """Return the id of a group given by name or number; ``key`` is the setting it comes from.
+    """Return the id of a group given by name or number; ``key`` is the setting that contains it.
 
     Raises
     ------
     ConfigError
-        There is no such group.
+        The group does not exist.
     """
     try:
         return grp.getgrnam(name).gr_gid

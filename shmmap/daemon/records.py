@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records that all packages of the daemon share: keys, segments in memory and retired, loads, failures."""
+"""Records shared by all packages of the daemon: keys, resident and retired segments, loads, failures."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from shmmap.segment.version import Stamp
 __all__ = ["SPACE_CODES", "Failure", "Key", "Load", "Resident", "Retired", "failure_code"]
 
 SPACE_CODES: Final = frozenset({"over_budget", "no_space"})
-"""Failures for lack of memory: they pass when memory is released."""
+"""Failures for lack of memory: they may be retried when memory is released."""
 
 
 def failure_code(error: OSError) -> str:
-    """Return the code of a load that failed because its segment's file could not be made."""
+    """Return the failure code of a load whose segment's file could not be created."""
     return "no_space" if is_full(error) else "load_failed"
 
 
@@ -30,13 +30,13 @@ class Key(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Resident:
-    """A published segment and what the daemon knows of its use.
+    """A published segment, and the daemon's knowledge of its use.
 
-    ``checked`` is false for one of a previous run of the daemon until its bytes were compared with
-    their checksums: until then it is not handed out.  ``prefetched`` is true for one that was fetched ahead,
-    until a client asks for it.  ``handle`` and ``stale_handle`` are encoded once, for all
-    replies; ``sessions`` are the slots of sessions that hold it; ``place`` is where it stands
-    among all segments of its size; ``deferred_s`` how long it was deferred when it was last found in use.
+    ``checked`` is false for a segment of a previous run until its bytes have been compared with their
+    checksums; until then it is not handed out.  ``prefetched`` is true for a prefetched segment until a
+    client asks for it.  ``handle`` and ``stale_handle`` are encoded once for all replies.  ``sessions`` are
+    the slots of the sessions that hold it.  ``place`` is its position among all segments of its size.
+    ``deferred_s`` is how long it was deferred when it was last found in use.
     """
 
     name: str
@@ -61,11 +61,11 @@ class Resident:
 
 @dataclass(slots=True, eq=False)
 class Retired:
-    """A segment out of service; ``resident`` says what it was.
+    """A segment out of service; ``resident`` describes it.
 
-    ``probe_after_s`` is when its use is next worth a look, ``unopened`` that no process had it open
-    at the last look, ``interval_s`` how long the last wait between two looks was; before ``tick_over_s``
-    a process may be just opening it.
+    ``probe_after_s`` is the time of its next check, ``unopened`` whether no process had it open at the last
+    check, and ``interval_s`` the last interval between two checks.  Before ``tick_over_s`` a process may be
+    opening it.
     """
 
     resident: Resident
@@ -77,16 +77,16 @@ class Retired:
 
 @dataclass(slots=True, eq=False)
 class Load:
-    """A load that is queued or under way; ``reserved`` bytes are promised to it meanwhile.
+    """A load that is queued or running; ``reserved`` bytes are promised to it while it runs.
 
-    ``adopted`` is a segment of a previous run that only has to be checked, ``unless`` the state of a file
-    that could not be loaded: in that state it is not tried again.  ``wanted`` says that a client asked for
-    it, ``sources`` and ``version`` what the catalogue knew of its file and its neighbours', and which version
-    that makes, when a worker was given the job.  ``computed`` says that it is a layer that is computed, which
-    may take long.  ``payer`` is the asker whose turn was used for it, ``charged_s`` the loader's time that it
-    was expected to need, ``spent_s`` the time that it did, ``took_s`` how long it took, fetching included;
-    ``losses`` counts loaders that were lost through no fault of its own.
-    ``prefetch`` says that no client has asked for it yet, ``unread`` that what it reads could not be read.
+    ``adopted`` is a segment of a previous run that only has to be checked.  ``unless`` is the state of a file
+    that failed: in that state it is not loaded again.  ``wanted`` means that a client asked for it.
+    ``sources`` are the states of its file and its neighbours' files in the catalogue when a worker was given
+    the job, and ``version`` is the version that follows from them.  ``computed`` means that the layer is
+    computed, which may take long.  ``payer`` is the asker whose turn was used, ``charged_s`` the loader time
+    charged in advance, ``spent_s`` the loader time used, and ``took_s`` the total time, fetching included.
+    ``losses`` counts loaders that were lost through no fault of this load.  ``prefetch`` means that no client
+    has asked for it yet, ``unread`` that its source could not be read.
     """
 
     key: Key
@@ -114,10 +114,10 @@ class Load:
 
 @dataclass(slots=True)
 class Failure:
-    """Why the last load of a key failed, and when asking again is worth another try.
+    """Why the last load of a key failed, and when the load may be retried.
 
-    ``stamp`` is the state of the file that it failed for: another state is tried at once.  None, if it is
-    not known or must not be looked up (its file system may be what hangs).
+    ``stamp`` is the state of the file that failed: another state is loaded at once.  It is None if it is not
+    known or must not be looked up (the file system may be what hangs).
     """
 
     code: str

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The service manager (systemd): what the daemon reports to it, and the socket that it hands over.
+"""Interface to the service manager (systemd): reports to it, and the socket that it passes.
 
-The watchdog is fed from the serving loop and from nowhere else, so that a loop that hangs is noticed.  While
-a reload runs the service is "reloading": systemd wants RELOADING=1 together with MONOTONIC_USEC (newer
-versions fail the reload without it) and READY=1 when it is over.
+Only the serving loop feeds the watchdog, so that a loop that hangs is noticed.  During a reload the service
+is "reloading": systemd expects RELOADING=1 with MONOTONIC_USEC (newer versions fail the reload without it),
+and READY=1 at the end.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ __all__ = [
 ]
 
 STATUS_EVERY_S: Final = 2.0
-"""Each status line wakes programs that listen to the service manager: not at every beat."""
+"""Minimum time between status lines: each one wakes programs that listen to the service manager."""
 
 
 def notify(*lines: str) -> None:
-    """Send ``KEY=value`` lines to ``NOTIFY_SOCKET`` (sd_notify(3)), if there is one.
+    """Send ``KEY=value`` lines to ``NOTIFY_SOCKET`` (sd_notify(3)), if it is set.
 
-    A line break inside a value (a path may have one) becomes a blank: it would start another line.
+    A line break in a value (a path may contain one) becomes a blank, since it would start another line.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
@@ -54,10 +54,10 @@ def notify(*lines: str) -> None:
 
 
 def watchdog_interval_s(environ: Mapping[str, str]) -> float:
-    """Return the seconds between two watchdog messages; infinite where the service manager wants none.
+    """Return the seconds between two watchdog messages; infinity if the service manager expects none.
 
-    A third of ``WATCHDOG_USEC``: sd_watchdog_enabled(3) recommends half of it at most, and one may
-    be late.
+    A third of ``WATCHDOG_USEC``: sd_watchdog_enabled(3) recommends at most half of it, and one message may be
+    late.
     """
     text, pid = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
     if not text.isdigit() or int(text) <= 0 or (pid and pid != str(os.getpid())):
@@ -68,7 +68,7 @@ def watchdog_interval_s(environ: Mapping[str, str]) -> float:
 def status_line(
     *, resident: int, cells: int, used_bytes: int, budget_bytes: int, clients: int, failed: int
 ) -> str:
-    """Return what ``systemctl status`` shows: ``"212 of 4096 cells, 3.1 of 6.0 GiB, 5 clients"``."""
+    """Return the text for ``systemctl status``: ``"212 of 4096 cells, 3.1 of 6.0 GiB, 5 clients"``."""
     unit, name = (1 << 30, "GiB") if budget_bytes >= 1 << 30 else (1 << 20, "MiB")
     line = (
         f"{resident} of {cells} cells, {used_bytes / unit:.1f} of {budget_bytes / unit:.1f} {name},"
@@ -83,9 +83,9 @@ class ServiceManager:
     Parameters
     ----------
     environ
-        Of this process: ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` count.
+        Environment of this process: ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are used.
     send
-        Sends lines ``KEY=value``.
+        Sends ``KEY=value`` lines.
     """
 
     def __init__(self, environ: Mapping[str, str] = os.environ, send: Callable[..., None] = notify) -> None:
@@ -113,48 +113,48 @@ class ServiceManager:
                 self._send(f"STATUS={line}")
 
     def reloading(self) -> None:
-        """Report that the map is being read again; each call is followed by one of `reloaded`."""
+        """Report that a reload has begun; each call is followed by one of `reloaded`."""
         self._reloads += 1
         now_us = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
         self._send("RELOADING=1", f"MONOTONIC_USEC={now_us}", "STATUS=reading the map again")
 
     def reloaded(self, outcome: str) -> None:
-        """Report that the map was read again, or could not be; ready once no other reload runs."""
+        """Report that a reload has ended, successful or not; ready once no other reload runs."""
         self._reloads -= 1
         self._status = ""
         if not self._reloads:
             self._send("READY=1", f"STATUS={outcome}")
 
     def stopping(self, why: str) -> None:
-        """Report that serving ends."""
+        """Report that the daemon stops serving."""
         self._send("STOPPING=1", f"STATUS={why}")
 
     def failed(self, message: str) -> None:
-        """Report that serving cannot start; the message stays visible in ``systemctl status``."""
+        """Report that the daemon cannot start; the message stays visible in ``systemctl status``."""
         self._send(f"STATUS={message}")
 
 
 EXTEND_EVERY_S: Final = 20.0
 EXTEND_S: Final = 60.0
 MAX_START_S: Final = 3600.0
-"""A start that takes longer hangs; starting again may help."""
+"""Limit of a start: a longer one counts as hanging, and another start may help."""
 
 
 class MoreTime:
-    """While its ``with`` block runs, a thread asks the service manager for more time.
+    """Context manager: during its ``with`` block, a thread asks the service manager for more time.
 
-    systemd ends a service that is not ready after ``TimeoutStartSec``, and starts it again: one that looks at
-    the files of ten million cells, for minutes, would never be ready.  ``EXTEND_TIMEOUT_USEC`` (sd_notify(3))
-    asks for more.
+    systemd ends a service that is not ready after ``TimeoutStartSec``, and starts it again.  A daemon that
+    checks the files of ten million cells, which takes minutes, would never be ready.  ``EXTEND_TIMEOUT_USEC``
+    (sd_notify(3)) requests more time.
 
     Parameters
     ----------
     send
-        Sends lines ``KEY=value``.
+        Sends ``KEY=value`` lines.
     what
-        What takes so long, for the status line.
+        The slow activity, for the status line.
     every_s
-        How often.
+        Interval of the requests, seconds.
     """
 
     def __init__(self, send: Callable[..., None], what: str, every_s: float = EXTEND_EVERY_S) -> None:
@@ -188,7 +188,7 @@ FIRST_FD: Final = 3  # SD_LISTEN_FDS_START
 
 
 class ActivatedSocket(NamedTuple):
-    """A listening socket and where it listens."""
+    """A listening socket and its path."""
 
     fd: int
     path: str
@@ -199,21 +199,21 @@ def take_activated_socket(
 ) -> ActivatedSocket | None:
     """Take over the socket that the service manager passed (sd_listen_fds(3)); None when it passed none.
 
-    The socket outlives the daemon, so that clients that connect while it starts or restarts only wait; its
-    file, owner and mode are the service manager's, and so the daemon never removes it.
-    The variables are removed: loaders must not believe that the socket is theirs.
+    The socket outlives the daemon, so clients that connect while it starts or restarts only wait.  Its file,
+    owner and mode belong to the service manager, so the daemon never removes it.  The variables are removed,
+    so that loaders do not take the socket for theirs.
 
     Parameters
     ----------
     environ
-        ``LISTEN_PID`` and ``LISTEN_FDS`` count.
+        Environment; ``LISTEN_PID`` and ``LISTEN_FDS`` are used.
     first_fd
-        Where passed descriptors start.
+        Number of the first passed descriptor.
 
     Raises
     ------
     ConfigError
-        More than one socket was passed, or one that is no listening unix stream socket.
+        More than one socket was passed, or the socket is not a listening unix stream socket.
     """
     pid, count = environ.pop("LISTEN_PID", ""), environ.pop("LISTEN_FDS", "")
     environ.pop("LISTEN_FDNAMES", None)

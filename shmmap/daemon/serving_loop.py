@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serving loop: one thread, and nothing in it that waits for a disk.
+"""The serving loop: a single thread, which never waits for a disk.
 
-Requests are served first.  Then come descriptors of loaders and the kernel, deadlines, one background task,
-memory to free and loads to hand out, a step at a time.  Files are read and layers built elsewhere
-(`shmmap.daemon.loading.worker_main`).  A turn goes from one poll of the descriptors to the next, and what
-clients send meanwhile waits for it.  Each turn is measured; other work than requests ends it after
-`TURN_NS`, and goes on in a later one.
+Requests are served first.  Then follow the descriptors of loaders and the kernel, deadlines, one background
+task, memory to free and loads to hand out, step by step.  Files are read and layers computed elsewhere
+(`shmmap.daemon.loading.worker_main`).  A turn lasts from one poll of the descriptors to the next; messages
+that clients send in between wait for the next turn.  Each turn is measured; work other than requests ends the
+turn after `TURN_NS`, and continues in a later turn.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ __all__ = ["BackgroundTask", "ServingLoop"]
 
 CLIENTS: Final = "clients"
 TURN_NS: Final = 50_000
-"""Processor time after which a turn begins no other step than a request."""
+"""Processor time after which a turn begins only requests, and no other step."""
 REQUESTS_S: Final = 0.002
-"""How long requests are served, at most, before a round of all other work, and loads handed out in one."""
+"""Longest time of serving requests before a round of all other work, and of handing out loads per round."""
 LONG_TURN_NS: Final = 10_000_000
-"""Processor time of a turn that is worth an event."""
+"""Processor time above which a turn is reported as an event."""
 LONG_TURN_EVENT_S: Final = 1.0
 
 
 class BackgroundTask(Protocol):
-    """Work that has its own time and is done in bounded steps."""
+    """Work with its own schedule, done in bounded steps."""
 
     @property
     def next_s(self) -> float:
-        """When a step is due; infinity for never, any time in the past for at once."""
+        """Time when a step is due; infinity for never, any time in the past for at once."""
 
     def run_step(self, now_s: float) -> None:
-        """Do the step that is due."""
+        """Run the step that is due."""
 
 
 @dataclass(eq=False, slots=True)
@@ -59,8 +59,8 @@ class ServingLoop:
     Parameters
     ----------
     tasks
-        Background tasks, each with the kind of turn that it makes: a round does a step of one of them, of
-        those that are due the one that waited longest.
+        Background tasks, each with its kind of turn: each round runs a step of one task, the one that has
+        been due for longest.
     """
 
     watched: WatchedDescriptors
@@ -81,12 +81,12 @@ class ServingLoop:
     _longest_s: float = 0.0
     _longest_kind: str = "statistics"
     _event_s: float = float("-inf")
-    _ready: dict[int, None] = field(default_factory=dict)  # descriptors to call that are no clients'
+    _ready: dict[int, None] = field(default_factory=dict)  # ready descriptors that are not clients'
     _round: Iterator[None] | None = None
-    _requests_s: float = REQUESTS_S  # what is left for requests before the round goes on
+    _requests_s: float = REQUESTS_S  # time left for requests before the round continues
 
     def stop(self, *, answer: bool = True) -> None:
-        """Leave the loop after this turn; without ``answer`` waiting requests are left to the next run."""
+        """Leave the loop after this turn; without ``answer``, waiting requests are left to the next run."""
         self.stopping = True
         self._answer_at_end = answer
 
@@ -104,7 +104,7 @@ class ServingLoop:
                 self.survey.step()
 
     def turn(self) -> None:
-        """Poll, then serve a request, or go on with all other work; clients first."""
+        """Poll, then serve a request or continue all other work; clients come first."""
         for fd in self._poll(self._poll_timeout_s()):
             if self.watched.kinds.get(fd) == CLIENTS:
                 self._call(fd)
@@ -122,7 +122,7 @@ class ServingLoop:
         self._round, self._requests_s = None, REQUESTS_S
 
     def _poll_timeout_s(self) -> float:
-        """Return how long nothing has to be done if nothing comes."""
+        """Return how long the loop may sleep if nothing arrives."""
         if len(self.inbox) or self._ready or self._round is not None:
             return 0
         until_s = min(
@@ -133,7 +133,7 @@ class ServingLoop:
         return min(max(0.0, until_s - time.monotonic()), BEAT_S)
 
     def _poll(self, timeout_s: float) -> list[int]:
-        """End a turn, wait, and begin the next one."""
+        """End a turn, wait for descriptors, and begin the next turn."""
         now_ns = time.thread_time_ns()
         took_ns = now_ns - self._turn_began_ns
         self._turn_began_ns = now_ns
@@ -145,7 +145,7 @@ class ServingLoop:
         return self.watched.poll(timeout_s)
 
     def _serve_next(self) -> None:
-        """Serve a step of what is next in the inbox, if there is anything."""
+        """Serve a step of the next item in the inbox, if there is one."""
         if (item := self.inbox.take()) is None:
             return
         begin_s = time.monotonic()
@@ -162,7 +162,7 @@ class ServingLoop:
             self.statistics.add_duration("request", int(took_s * 1e9))
 
     def _other_work(self) -> Iterator[None]:
-        """Do a round of all work but requests, a step at a time."""
+        """Run a round of all work except requests, step by step."""
         for fd in list(self._ready):
             yield
             self._ready.pop(fd, None)
@@ -183,7 +183,7 @@ class ServingLoop:
                 break
 
     def _do_what_is_due(self, now_s: float) -> None:
-        """Act on deadlines, and do the next step of a background task."""
+        """Handle deadlines, and run the next step of a background task."""
         self._guarded("loaders", self.scheduler.lost.end_overdue, now_s)
         self._guarded("answers", self.cells.answer_overdue, now_s)
         for _ in range(len(self.tasks)):
@@ -197,15 +197,15 @@ class ServingLoop:
 
     def _call(self, fd: int) -> None:
         callback = self.watched.callbacks.get(fd)
-        if callback is not None:  # another one's may have ended it
+        if callback is not None:  # another callback may have removed it
             self._guarded(self.watched.kinds[fd], callback)
 
     def _guarded(self, kind: str, call: Callable[..., object], *arguments: object) -> None:
-        """Call what must not end the daemon if it fails, unless that happens repeatedly."""
+        """Call a function whose failure must not end the daemon, unless it fails repeatedly."""
         begin_s = time.monotonic()
         try:
             call(*arguments)
-        except Exception:  # a defect: one client's trouble must not be that of all
+        except Exception:  # a defect: one client's trouble must not affect all clients
             if self.defects.record():
                 raise
         took_s = time.monotonic() - begin_s

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turns of the serving loop: which descriptors begin one, and how long work on many things goes on in it."""
+"""Turns of the serving loop: descriptors that begin a turn, and time limits of long work in it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Final, Generic, TypeVar
 __all__ = ["BATCH", "TURN_S", "Pace", "Walk", "WatchedDescriptors", "batched"]
 
 DESCRIPTORS_PER_TURN: Final = 16
-"""The kernel begins with those that were not looked at last time."""
+"""Descriptors returned per poll; the kernel begins with those not returned last time."""
 
 
 class WatchedDescriptors:
-    """Callbacks for descriptors that are readable.
+    """Callbacks of descriptors that are readable.
 
-    ``kinds`` are the kinds of turn that they make, of `shmmap.statistics.counters.TURN_KINDS`.
+    ``kinds`` are their kinds of turn, see `shmmap.statistics.counters.TURN_KINDS`.
     """
 
     def __init__(self) -> None:
@@ -27,52 +27,52 @@ class WatchedDescriptors:
         self._again: list[int] = []
 
     def watch(self, fd: int, callback: Callable[[], None], kind: str = "clients") -> None:
-        """Call ``callback`` from the loop whenever ``fd`` is readable, or its other end is closed."""
+        """Call ``callback`` from the loop whenever ``fd`` is readable, or its peer has closed."""
         self.callbacks[fd], self.kinds[fd] = callback, kind
         self._epoll.register(fd, select.EPOLLIN)
 
     def watch_for(self, fd: int, *, reading: bool, writing: bool) -> None:
-        """Call a watched descriptor's callback when it can be read or written; always when it is closed."""
+        """Call a watched descriptor's callback when it is readable or writable; always when it is closed."""
         self._epoll.modify(fd, reading * select.EPOLLIN | writing * select.EPOLLOUT)
 
     def call_again(self, fd: int) -> None:
-        """Call its callback in the next turn, whatever the kernel says."""
+        """Call a descriptor's callback in the next turn, whether it is ready or not."""
         self._again.append(fd)
 
     def unwatch(self, fd: int) -> None:
-        """Stop watching; before the descriptor is closed."""
+        """Stop watching a descriptor; call this before closing it."""
         callback = self.callbacks.pop(fd, None)  # it may hold the last reference to the descriptor's owner
         if callback is not None:
             del self.kinds[fd]
             self._epoll.unregister(fd)
 
     def poll(self, timeout_s: float) -> list[int]:
-        """Wait until descriptors are ready, at most this long, and return them."""
+        """Wait until descriptors are ready, at most ``timeout_s``, and return them."""
         again, self._again = self._again, []
         ready = self._epoll.poll(0 if again else timeout_s, DESCRIPTORS_PER_TURN)
         return [*again, *(fd for fd, _events in ready)]
 
     def close(self) -> None:
-        """Stop polling, after everything watched is gone."""
+        """Stop polling, after all watched descriptors have been removed."""
         self._epoll.close()
 
 
 TURN_S: Final = 0.0005
-"""Time after which the rest is left to the next turn.  A request for some hundred cells needs less."""
+"""Time after which work is left to the next turn.  A request for some hundred cells needs less."""
 
 BATCH: Final = 16
-"""Things between two looks at the time, where each takes some microseconds."""
+"""Items between two checks of the time, if each takes some microseconds."""
 
 Item = TypeVar("Item")
 
 
 def batched(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
-    """Return batches of many things, to look at the time before each of them."""
+    """Return batches of items; the time is checked before each batch."""
     return (items[begin : begin + BATCH] for begin in range(0, len(items), BATCH))
 
 
 class Pace:
-    """The time that a generator has in its present turn."""
+    """Time limit of a generator in its current turn."""
 
     __slots__ = ("_end_s",)
 
@@ -85,23 +85,23 @@ class Pace:
 
     @property
     def is_over(self) -> bool:
-        """Whether the turn has used its time."""
+        """Whether the turn's time is used up."""
         return time.monotonic() >= self._end_s
 
     def pause(self) -> Iterator[None]:
-        """End the turn, if it has used its time, and begin the next one."""
+        """End the turn if its time is used up, and begin the next one."""
         if self.is_over:
             yield
             self.begin()
 
 
 class Walk(Generic[Item]):
-    """A walk over many things that takes several turns; without any it is done.
+    """A walk over many items that takes several turns; without items it is done.
 
     Attributes
     ----------
     is_done : bool
-        Whether it has come to its end.
+        Whether the walk has reached its end.
     """
 
     __slots__ = ("_items", "is_done")
@@ -111,7 +111,7 @@ class Walk(Generic[Item]):
         self.is_done = items is None
 
     def for_a_turn(self) -> Iterator[Item]:
-        """Go on until the turn's time is used: one item further at least."""
+        """Yield items until the turn's time is used up, at least one."""
         end_s = time.monotonic() + TURN_S
         for item in self._items:
             yield item

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Present cells: what is in memory, what it costs, and what is evicted."""
+"""Cells in memory: their accounting, use and eviction."""

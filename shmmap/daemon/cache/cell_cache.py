@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map in memory: finds cells, publishes, supersedes, adopts, evicts.
+"""The map in memory: finds, publishes, supersedes, adopts and evicts cells.
 
-The cache joins the pure ledger with what does the work: the catalogue, the index of warm cells and the
-shared-memory directory.  It never blocks, and knows neither loaders nor sockets: absent cells are requested
+The cache joins the ledger, which does no I/O, with the catalogue, the index of warm cells and the
+shared-memory directory.  It never blocks, and uses neither loaders nor sockets: absent cells are requested
 from `shmmap.daemon.loading.scheduler`, which publishes here.
 """
 
@@ -43,7 +43,7 @@ __all__ = ["CellCache"]
 _PAGE_BYTES: Final = 4096
 _HEADER_ALLOWANCE_BYTES: Final = 2 * _PAGE_BYTES
 SHOWN_PER_TURN: Final = 16
-"""Segments that were handed out, and whose rows are brought up to date in one turn: 0.1 ms."""
+"""Handed-out segments whose rows are updated in one turn: 0.1 ms."""
 
 
 class CellCache:
@@ -59,23 +59,23 @@ class CellCache:
     Attributes
     ----------
     catalogue
-        The state of the map that is served; another one after a reload.
+        The state of the map that is served; replaced by a reload.
     layers
-        Versions of its cells' layers.
+        Versions of the layers of its cells.
     evictor, reclaimer
         Make room; give memory back.
     holders, survey
-        Which processes map a segment, and how much each maps in all.
+        Find the processes that map a segment, and how much each process maps in total.
     events
         Reports what happens to cells.
     warm
-        The cells that are in memory at their current version.
+        Cells in memory at their current version.
     heights
-        Of cells that were loaded since they changed.
+        Heights of the cells that were loaded since they last changed.
     lost
-        Finds segments that other programs removed or cut short.
+        Finds segments that other programs removed or truncated.
     unentered : int
-        Number of segments still to be looked for in the state of the map that is served now.
+        Number of segments not yet checked against the state of the map that is served now.
     """
 
     def __init__(
@@ -124,14 +124,14 @@ class CellCache:
     # --- the map --------------------------------------------------------------------------------
 
     def index_of(self, cell: str) -> int | None:
-        """Return the catalogue index of an id: whole, without the prefix, or a unique base name."""
+        """Return the catalogue index of an id: complete, without the prefix, or a unique base name."""
         index = self.catalogue.find(cell)
         if index is None and not cell.startswith("/"):
             index = self.catalogue.find(self.id_prefix + cell)
         return index
 
     def wire_id(self, cell_id: str) -> str:
-        """Return an id as replies carry it: without the prefix, whole where it does not start with it."""
+        """Return an id as replies carry it: without the prefix, or unchanged if it has none."""
         return cell_id.removeprefix(self.id_prefix)
 
     def key(self, index: int, layer: str) -> Key:
@@ -140,27 +140,27 @@ class CellCache:
 
     @property
     def pages(self) -> Pages | None:
-        """Pages of the list of cells; None where the list is whole."""
+        """Pages of the list of cells; None if the list is complete."""
         return self.catalogue.pages
 
     def at_height(self, indices: list[int], z: tuple[float, float] | None) -> list[int]:
-        """Leave out cells whose heights, known once they were loaded, lie outside the range."""
+        """Drop the cells whose heights, known from an earlier load, lie outside a range."""
         if z is None:
             return indices
         return self.heights.overlapping(indices, z)
 
     def pages_around(self, area: Area, layers: Iterable[str]) -> Sequence[int]:
-        """Return the pages that list an area's cells, and the cells around it that these layers look into."""
+        """Return the pages that list an area's cells and the neighbouring cells that these layers read."""
         pages = self.pages
         if pages is None:
             return ()
         return pages.of_area(area.around(*area.center, self.layers.halo_m(layers)))
 
     def estimate(self, index: int, layer: str) -> int:
-        """Return the bytes to reserve before a load: what the origin says, or else a guess.
+        """Return the bytes to reserve before a load: the origin's number, or else an estimate.
 
-        `points` has its file's bytes, plus its header, at most.  Only for compressed and ASCII files can it
-        be more; their worker asks for it, as does that of a computed layer.
+        `points` takes at most its file's size plus the header.  Only compressed and ASCII files can need
+        more; then the worker asks for it, and so does the worker of a computed layer.
         """
         ready = self.catalogue.ready(index, layer)
         if ready is not None:
@@ -173,7 +173,7 @@ class CellCache:
     # --- finding --------------------------------------------------------------------------------
 
     def find_warm(self, index: int, layer: str, now_s: float) -> Resident | None:
-        """Return the current version of a cell, if it is in memory (a retired one is put back in service)."""
+        """Return the current version of a cell if it is in memory; a retired one returns to service."""
         resident = self.warm.get(index, layer)
         if resident is None and self.unentered:
             resident = self.ledger.by_key.get(self.key(index, layer))
@@ -194,11 +194,11 @@ class CellCache:
         return index is not None and self.layers.version(index, resident.key.layer) == resident.version
 
     def is_in_service(self, resident: Resident) -> bool:
-        """Whether a segment is what requests for its cell are answered with."""
+        """Whether requests for a segment's cell are answered with this segment."""
         return self.ledger.resident_named(resident.name) is resident and self.is_current(resident)
 
     def resident(self, key: Key) -> Resident | None:
-        """Return the segment of a key that can be handed out, current or not."""
+        """Return the segment of a key that can be handed out, whether current or not."""
         resident = self.ledger.by_key.get(key)
         return resident if resident is not None and resident.checked else None
 
@@ -208,7 +208,7 @@ class CellCache:
         return resident is not None and bool(resident.sessions)
 
     def replaced_bytes(self, session: Session, key: Key) -> int:
-        """Return the bytes of an old version that a session holds: it is about to drop it for the new one."""
+        """Return the bytes of an old version that a session holds and will drop for the new one."""
         for known in (self.ledger.by_key.get(key), self.reclaimer.retired_of(key)):
             if known is not None and session.slot in known.sessions and not self.is_current(known):
                 return known.nbytes
@@ -217,14 +217,14 @@ class CellCache:
     # --- coming ---------------------------------------------------------------------------------
 
     def publish(self, fd: int, header_bytes: int, resident: Resident, index: int, now_s: float) -> int:
-        """Name a finished segment and hand it out from now on; return the version it supersedes, 0 for none.
+        """Name a finished segment and hand it out from now on; return the version it supersedes, or 0.
 
-        ``resident`` describes it; its name and bytes are known once it is published.
+        ``resident`` describes it; its name and bytes are set here.
 
         Raises
         ------
         OSError
-            It cannot be published, for lack of memory, say.
+            The segment cannot be published, for example for lack of memory.
         """
         resident.name = new_segment_name(self.instance)
         block = PublishBlock(self.epoch, resident.version)
@@ -245,7 +245,7 @@ class CellCache:
         self.statistics.add("adopted")
 
     def accept(self, resident: Resident) -> bool:
-        """Hand out an adopted segment from now on; False if it has left service meanwhile."""
+        """Hand out an adopted segment from now on; return False if it has left service in the meantime."""
         index = self.index_of(resident.key.cell_id)
         if index is None or self.ledger.resident_named(resident.name) is not resident:
             return False
@@ -255,16 +255,16 @@ class CellCache:
         return True
 
     def reject(self, resident: Resident, why: str, now_s: float) -> None:
-        """Take an adopted segment that is not what it should be out of service, if it still is in it."""
+        """Take an adopted segment that failed its check out of service, if it is still in service."""
         if self.ledger.resident_named(resident.name) is resident:
             self.statistics.add("adoptions_failed")
             log.warning("leftover segment rejected", segment=resident.name, reason=why)
             self.reclaimer.retire(resident, now_s, "damaged")
 
     def _enter(self, resident: Resident, index: int) -> None:
-        """Encode a segment's handle, and find it by index if it is current.
+        """Encode a segment's handle, and index the segment if it is current.
 
-        One that is not checked yet only shows: a client that holds its version need not be sent it again.
+        An unchecked segment is only listed: a client that holds its version does not have to get it again.
         """
         self.warm.note_version(resident)
         current = True
@@ -275,7 +275,7 @@ class CellCache:
         self.events.emit(self.events.show, resident, "resident" if current else "stale")
 
     def enter_if_current(self, resident: Resident, index: int) -> bool:
-        """Whether a segment is of its cell's current version; then it is found by index from now on."""
+        """Index a segment if it has its cell's current version; return whether it has."""
         if not resident.checked or resident.version != self.layers.version(index, resident.key.layer):
             return False
         self.warm.enter(resident, index, len(self.catalogue))
@@ -285,17 +285,17 @@ class CellCache:
     def serve(self, new: CatalogueView, changed: NDArray[np.intp] | None) -> list[ShardedDict[int, Any]]:
         """Serve another state of the map.
 
-        Nothing is warm in it before `find_warm` or `MapSwitch.run_step` has found it in the ledger.
+        No cell is warm in the new state until `find_warm` or `MapSwitch.run_step` has found it in the ledger.
 
         Parameters
         ----------
         changed
-            Indices of cells that have changed; None where indices mean other cells.
+            Indices of changed cells; None if the new catalogue numbers cells differently.
 
         Returns
         -------
         list
-            Tables that are not used any more; to free many entries at once takes long.
+            Unused tables, to be freed in steps: freeing many entries at once takes long.
         """
         left: list[ShardedDict[int, Any]] = [*self.warm.layers.values(), *self.layers.forget()]
         self.catalogue = new
@@ -309,7 +309,7 @@ class CellCache:
     # --- being used -----------------------------------------------------------------------------
 
     def hand_out(self, residents: Sequence[Resident], now_s: float) -> None:
-        """Note that segments are handed out: each is spared for as long as opening it takes."""
+        """Note that segments are handed out: each is spared from eviction for as long as opening it takes."""
         first_used = 0
         for resident in residents:
             resident.last_use_s = now_s
@@ -323,9 +323,10 @@ class CellCache:
         self._used.update(residents)
 
     def show_used(self, now_s: float) -> bool:
-        """Bring the rows of some segments that were handed out up to date; whether there are more.
+        """Update the rows of some segments that were handed out; return whether more are left.
 
-        One that others cut short is retired: its cell has failed at the client's, and is loaded again.
+        A segment that another program truncated is retired: clients cannot read it, and its cell is loaded
+        again.
         """
         for _ in range(min(SHOWN_PER_TURN, len(self._used))):
             resident = self._used.pop()
@@ -336,12 +337,12 @@ class CellCache:
         return bool(self._used)
 
     def report(self, now_s: float) -> None:
-        """Publish and log what is reported now and then; a few times a second."""
+        """Publish and log periodic reports, a few times a second."""
         self.events.step(now_s)
         self.lost.report(now_s)
 
     def measure(self) -> None:
-        """Bring the gauges of memory and of the map up to date."""
+        """Update the gauges of memory and of the map."""
         ledger, statistics, pages = self.ledger, self.statistics, self.pages
         ledger.overhead_bytes = statistics.size_bytes
         found = ledger.unchecked_count + len(self.warm) + self.unentered
@@ -366,16 +367,16 @@ class CellCache:
             statistics.set(name, value)
 
     def _memory(self) -> tuple[int, int, int, int]:
-        """Budget, used, pinned and retired bytes."""
+        """Return budget, used, pinned and retired bytes."""
         ledger, pinned = self.ledger, self.statistics.values["bytes_pinned"]
         return ledger.budget_bytes, ledger.used_bytes, pinned, ledger.retired_bytes
 
     # --- leaving --------------------------------------------------------------------------------
 
     def invalidate(self, index: int) -> None:
-        """Note that a cell has changed: what is resident of it is not current, and its heights are unknown.
+        """Note that a cell has changed: its segments are not current, and its heights are unknown.
 
-        The same goes for its neighbours in layers that look into it.
+        The same applies to its neighbours in layers that read this cell.
         """
         self.heights.forget(np.array([index]))
         self.layers.cell_changed(index)
@@ -384,7 +385,7 @@ class CellCache:
                 self.warm.leave(cell, layer)
 
     def segment_retired(self, resident: Resident, why: str) -> None:
-        """Find a segment no more; its bytes still show."""
+        """Remove a segment from the indices; the statistics still show its bytes."""
         self.events.emit(self.events.retired, resident, why)
         self._used.discard(resident)
         self.statistics.add("prefetch_in_vain", resident.prefetched)
@@ -395,20 +396,20 @@ class CellCache:
         self.events.emit(self.events.show, resident, "zombie")
 
     def segment_gone(self, name: str) -> None:
-        """Show a segment no more."""
+        """Remove a segment from the statistics."""
         self.events.emit(self.events.hide, name)
 
     def reclaim(self, now_s: float) -> bool:
-        """Free some retired segments that are due, and look for lost ones; whether more may fit now."""
+        """Free some retired segments that are due, check for lost ones; return whether more may fit now."""
         freed = bool(self.ledger.retired) and self.reclaimer.sweep(now_s) > 0
         return (not self.lost.to_check.is_done and self.lost.check_some(now_s)) or freed
 
     def next_reclaim_s(self) -> float:
-        """Return when `reclaim`, or making room, is worth another try although nothing has changed."""
+        """Return when `reclaim` or an eviction is worth another try although nothing has changed."""
         return min(self.reclaimer.next_sweep_s(), self.evictor.wake_s)
 
     def close(self, *, keep: bool = False) -> None:
-        """Take every segment's name away, or leave the names to the next run."""
+        """Remove every segment's name, or with ``keep`` leave the names to the next run."""
         if not keep:
             self.reclaimer.remove_all()
         self.reclaimer.close()

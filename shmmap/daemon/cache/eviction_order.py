@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which segments are evicted, kept while they come, go and are used; without any I/O.
+"""The order in which segments are evicted, maintained as they are added, removed and used; without any I/O.
 
-Asking for the next ones costs O(log n), however many segments there are.  Scores are remembered: those at
-the front are checked at each question, so that nothing is evicted by an outdated one; all others are
-brought up to date a few at a time (`EvictionOrder.refresh`) while clients move.  What has become worth
-less since is found at the next round.  As long as no client moves, the order is exactly that of a sort.
+Asking for the next segments costs O(log n).  Scores are cached.  Those at the front are checked at each
+query, so that no outdated score causes an eviction; all others are updated a few at a time
+(`EvictionOrder.refresh`) while clients move.  A segment that has become less valuable since is found in the
+next round.  As long as no client moves, the order is exactly that of a sort.
 
-A segment that cannot be evicted now is deferred: until a time, or until `EvictionOrder.reconsider`.
+A segment that cannot be evicted now is deferred: until a given time, or until `EvictionOrder.reconsider`.
 """
 
 from __future__ import annotations
@@ -23,27 +23,27 @@ from shmmap.large_tables import ShardedDict
 __all__ = ["BATCH", "FRONT", "Deferred", "EvictionOrder", "Score"]
 
 FRONT: Final = 8
-"""Segments offered at a time; when fewer are in order, as many are scored."""
+"""Segments offered at a time; when fewer are in order, this many are scored."""
 TRIES: Final = 4
-"""How often the front is scored again before it is taken as it is, if its scores were outdated."""
+"""How often outdated scores at the front are recomputed before the front is taken as it is."""
 BATCH: Final = 16
-"""Segments scored, or taken back, at a time: 0.1 ms, if all their places in the order change."""
+"""Segments scored, or put back in order, at a time: 0.1 ms if all of them change their places."""
 TOLERANCE: Final = 0.1
-"""A score that has changed by a smaller part stays as it is while it is not at the front."""
+"""A score that has changed by a smaller fraction is not updated unless it is at the front."""
 _BLOCK: Final = 512
 
 
 class Score(NamedTuple):
-    """How segments are scored now; ``version`` changes when scores may."""
+    """How segments are scored now; ``version`` changes whenever scores may."""
 
     of: Callable[[Sequence[Resident]], Iterable[float]]
     version: int = 0
 
 
 class _Entry(NamedTuple):
-    """A segment by its score; the greatest is evicted first. No two have the same number."""
+    """A segment with its score; the greatest entry is evicted first. Numbers are unique."""
 
-    unclaimed: bool  # no session says that it holds it: most likely no process has it mapped
+    unclaimed: bool  # no session reports that it holds it: most likely no process has it mapped
     score: float
     unused: float
     number: int
@@ -60,7 +60,7 @@ class _Entry(NamedTuple):
 
 
 class _Sorted:
-    """Entries in ascending order, in blocks: adding and removing one moves a block at most."""
+    """Entries in ascending order, in blocks: an insertion or removal moves at most one block."""
 
     def __init__(self) -> None:
         self._blocks: list[list[_Entry]] = []
@@ -100,7 +100,7 @@ class _Sorted:
 
 
 class Deferred:
-    """Segments that cannot be evicted now, and until when; infinity: until they are reconsidered."""
+    """Segments that cannot be evicted until a given time; infinity: until they are reconsidered."""
 
     def __init__(self) -> None:
         self._until_s: ShardedDict[Resident, float | None] = ShardedDict()
@@ -121,11 +121,11 @@ class Deferred:
             heapq.heappush(self._heap, (until_s, self._number, resident))
 
     def take(self, resident: Resident) -> bool:
-        """Remove a segment, and return whether it was there."""
+        """Remove a segment; return whether it was present."""
         return self._until_s.pop(resident, None) is not None
 
     def first(self) -> tuple[float, Resident] | None:
-        """Return the segment whose time comes next, and when that is."""
+        """Return the time when the first deferral ends, and its segment."""
         while self._heap:
             until_s, _, resident = self._heap[0]
             if self._until_s.get(resident) == until_s:
@@ -134,7 +134,7 @@ class Deferred:
         return None
 
     def due(self, now_s: float) -> list[Resident]:
-        """Remove and return segments whose time has come, a bounded number."""
+        """Remove and return segments whose deferral has ended, a bounded number."""
         found = []
         for _ in range(BATCH):
             if not self._heap or self._heap[0][0] > now_s:
@@ -152,20 +152,20 @@ class Deferred:
 
 
 class EvictionOrder:
-    """All residents, each in one place: new (not scored yet), in order, or deferred.
+    """All residents, each in one state: new (not scored yet), in order, or deferred.
 
     Attributes
     ----------
     in_grace
-        Deferred because they were just handed out: their readers may be opening them.
+        Segments deferred because they were just handed out: readers may be opening them.
     deferred
-        Deferred because a request or pin needs them, or a process has them mapped.
+        Segments deferred because a request or pin needs them, or a process has them mapped.
     new : ShardedDict
-        Not scored yet; what comes into service is put here.
+        Segments not scored yet; segments that enter service are added here.
     changes : int
-        How often a segment came or was reconsidered: there may be more that can be evicted now.
+        How often a segment was added or reconsidered, so that more may be evictable now.
     scored : int
-        How many scores were computed so far.
+        Number of scores computed so far.
     """
 
     def __init__(self) -> None:
@@ -193,7 +193,7 @@ class EvictionOrder:
             self.deferred.take(resident)
 
     def reconsider(self, resident: Resident) -> bool:
-        """Take note that a user of a segment has released it; whether it had been deferred for that."""
+        """Note that a user has released a segment; return whether the segment was deferred."""
         entry, resident.deferred_s = self._entries.get(resident), 0.0
         if self.deferred.take(resident) or (entry is not None and entry.unclaimed is bool(resident.sessions)):
             self.leave(resident)
@@ -203,11 +203,11 @@ class EvictionOrder:
         return False
 
     def reconsider_all(self) -> None:
-        """Take note that any segment deferred as mapped or needed may have been released."""
+        """Note that any segment deferred as mapped or needed may have been released."""
         few, many = self.new, self.deferred.take_all()
         if len(few) > len(many):
             few, many = many, few
-        many.update(few)  # however many there are, few of them are touched
+        many.update(few)  # the smaller table is merged into the larger one
         self.changes += 1
         self.new = many
 
@@ -217,10 +217,10 @@ class EvictionOrder:
         where.put(resident, until_s)
 
     def front(self, score: Score) -> list[Resident] | None:
-        """Return what should be evicted first, in that order, at most `FRONT`; empty if all are deferred.
+        """Return the segments to evict first, in order, at most `FRONT`; empty if all are deferred.
 
-        As far as they have been scored, see `fill`.  None if scores at the front were outdated: they were
-        brought up to date, and it is worth asking again.
+        Only scored segments are considered, see `fill`.  Returns None if scores at the front were outdated:
+        they have been updated, and the caller should ask again.
         """
         front = self._sorted.greatest(FRONT)
         outdated = [entry.resident for entry in front if entry.is_outdated(score.version)]
@@ -230,7 +230,7 @@ class EvictionOrder:
             self._tried.update(dict.fromkeys(outdated))
             if self._tries < TRIES:
                 return None
-            # whatever else there is, these go before most others
+            # whatever else there is, these are evicted before most others
             tried = [entry for one in self._tried if (entry := self._entries.get(one)) is not None]
             front = sorted(tried, reverse=True)
         self._tries = 0
@@ -239,15 +239,15 @@ class EvictionOrder:
 
     @property
     def all_scored(self) -> bool:
-        """Whether all have been scored."""
+        """Whether all segments have been scored."""
         return not self.new
 
     def fill(self, score: Score, now_s: float) -> bool:
-        """Score some new segments, or some whose time has come, if few are in order; whether any were."""
+        """Score some new or no longer deferred segments if few are in order; return whether any were."""
         for resident in (*self.in_grace.due(now_s), *self.deferred.due(now_s)):
             self.new[resident] = None
         if len(self._entries) >= FRONT or not self.new:
-            return False  # they wait: many at once cost little more than one
+            return False  # they wait: scoring many at once costs little more than one
         self.score_new(score, FRONT)
         return True
 
@@ -257,7 +257,7 @@ class EvictionOrder:
             self._place([self.new.popitem()[0] for _ in range(min(most, len(self.new)))], score)
 
     def refresh(self, some: Iterable[Resident], score: Score) -> None:
-        """Bring the scores of some segments up to date."""
+        """Update the scores of some segments."""
         entries = [entry for one in some if (entry := self._entries.get(one)) is not None]
         outdated = [entry for entry in entries if entry.is_outdated(score.version)]
         if not outdated:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making room: the segments that clients will need last are retired, unless a process has them mapped.
+"""Eviction: retires the segments that clients will need last, except those that a process has mapped.
 
-One turn of the serving loop looks at a bounded number of segments; what remains is for the next.
+One turn of the serving loop handles a bounded number of segments; the others follow in later turns.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ from shmmap.daemon.travel.places import NOWHERE, Places, until_needed
 __all__ = ["Evictor", "eviction_scores"]
 
 PIN_MEMO_S: Final = 0.2
-"""How long, at least, a segment found pinned is not considered again; longer and longer if the kernel
-reports when a process closes it."""
+"""How long, at least, a segment found pinned is not considered again.  The time grows with each try if the
+kernel reports when a process closes the segment."""
 PREFETCHED_PER_TURN: Final = 64
-"""Segments fetched ahead that are compared with a wish at a time: a tenth of a millisecond."""
+"""Prefetched segments compared with a wish at a time: a tenth of a millisecond."""
 PRESSURE_S: Final = 10.0
-"""How long scores are kept up to date after room was needed."""
+"""How long scores are kept up to date after memory was short."""
 REFRESH_S: Final = 0.004
-"""How often a few scores are brought up to date."""
+"""How often a few scores are updated."""
 ROUND_S: Final = 2.0
-"""How often, at most, those of all segments, a few at a time."""
+"""Minimum interval of rounds that update the scores of all segments, a few at a time."""
 WORK_PER_TURN: Final = 4
-"""Segments looked at by one `free`, 15 us each; to retire one is as much work."""
+"""Segments handled by one `free`: checking one takes 15 us, and retiring one is as much work again."""
 PLACES_S: Final = 0.25
-"""How often the places of clients that move are taken over."""
+"""How often the positions of moving clients are updated."""
 SOON_S: Final = 30.0
-"""Added to the time until a segment is needed: without it, no size would matter among those needed soon."""
+"""Added to the time until a segment is needed; without it, size would not matter for those needed soon."""
 
 
 def eviction_scores(candidates: Sequence[Resident], places: Places, now_s: float) -> NDArray[np.float64]:
-    """Score segments, (N,): the highest is evicted first, of equals the one not used for longest.
+    """Score segments, (N,): the highest is evicted first; among equals, the one unused for longest.
 
     The score is the time until a segment is needed (s), weighted by the square root of its size: of the
-    powers tried, this saved most bytes of loading where sizes differ.  Without any place the least recently
-    used segment is evicted first.  Whether it was asked for, fetched ahead or computed makes no difference.
+    exponents tried, this one saved most bytes of loading where sizes differ.  Without any place the least
+    recently used segment is evicted first.  Requested, prefetched and computed segments are scored alike.
 
     Parameters
     ----------
     places
-        Where the clients are and will be.
+        Present and future positions of the clients.
     """
     if not len(places):
         return np.array([-resident.last_use_s for resident in candidates], dtype=np.float64)
@@ -77,15 +77,15 @@ class Evictor:
     Attributes
     ----------
     evicted_count
-        Segments retired to make room.
+        Number of segments retired to make room.
     wake_s
-        When `free` is worth calling again although nothing changed: at once, or when a grace ends.
+        When `free` is worth calling again although nothing changed: at once, or when a grace period ends.
     """
 
     reclaimer: Reclaimer
     evicted_count: int = 0
     wake_s: float = math.inf
-    # the count of changes after which nothing could be freed, until when that holds, and when to try again
+    # count of changes after which nothing could be freed, until when that holds, and when to try again
     _waits: tuple[int, float, float] = (-1, -math.inf, -math.inf)
     _score: Score = _UNTIL_CLIENTS_MOVE
     _round: Iterator[Resident] = field(default_factory=lambda: iter(()))
@@ -97,14 +97,14 @@ class Evictor:
     _new_ones: bool = False
 
     def free(self, shortage: int, now_s: float, *, rather_than: Resident | None = None) -> bool:
-        """Retire segments until ``shortage`` bytes are about to be freed; False if the rest is in use.
+        """Retire segments until ``shortage`` bytes are about to be freed; return False if the rest is in use.
 
-        True also means that calling again at ``wake_s`` helps.
+        True may also mean that calling again at ``wake_s`` helps.
 
         Parameters
         ----------
         rather_than
-            What the room is for, if no client has asked for it: what would be evicted after that stays.
+            Prefetched cell that the room is for: segments that would be evicted after it stay.
         """
         ledger = self.reclaimer.ledger
         self.wake_s = math.inf
@@ -116,7 +116,7 @@ class Evictor:
         if rather_than is None and order.changes == self._waits[0] and now_s < self._waits[1]:
             self.wake_s = self._waits[2]
             return True
-        score = self._scored(now_s, 4.0 * PLACES_S)  # as a rule `turn` has them up to date
+        score = self._scored(now_s, 4.0 * PLACES_S)  # normally `run_step` keeps them up to date
         if order.fill(score, now_s):
             self.wake_s = now_s
             return True
@@ -152,15 +152,15 @@ class Evictor:
         return self._is_any_soon_free(now_s) or ledger.coming_bytes >= shortage
 
     def give_up_prefetched(self, shortage: int, now_s: float, wished: Resident) -> bool:
-        """Retire what was fetched ahead, is not asked for yet and is needed later than ``wished``.
+        """Retire prefetched segments that no client has asked for and that are needed later than ``wished``.
 
-        Returns whether there was any; it looks at some of it, and at others the next time.
+        Returns whether there were any.  Each call examines some of them, the next call others.
         """
         ledger = self.reclaimer.ledger
         some = [
             one for one in islice(ledger.prefetched, PREFETCHED_PER_TURN) if not ledger.is_needed(one.key)
         ]
-        for resident in some:  # to the end of the line
+        for resident in some:  # move them to the end
             del ledger.prefetched[resident]
             ledger.prefetched[resident] = None
         least, *scores = self._scored(now_s, 4.0 * PLACES_S).of([wished, *some])
@@ -175,7 +175,7 @@ class Evictor:
         return work < WORK_PER_TURN
 
     def _is_any_soon_free(self, now_s: float) -> bool:
-        """Whether a grace that will end is worth waiting for: no process has opened that segment yet."""
+        """Whether a grace period is worth waiting for: no process has opened that segment yet."""
         ledger = self.reclaimer.ledger
         order = ledger.order
         for _ in range(LOOKS_PER_TURN):
@@ -195,7 +195,7 @@ class Evictor:
         return True
 
     def _found_in_use(self, resident: Resident, now_s: float) -> bool:
-        """Whether a process has this mapped; then it is deferred."""
+        """Whether a process has a segment mapped; if so, defer it."""
         if not self.reclaimer.is_pinned(resident):
             return False
         order = self.reclaimer.ledger.order
@@ -208,11 +208,11 @@ class Evictor:
 
     @property
     def next_s(self) -> float:
-        """When `turn` has something to do; for a while after room was needed."""
+        """When `run_step` has something to do; for a while after memory was short."""
         return self._refreshed_s + REFRESH_S if self._refreshed_s < self._refresh_until_s else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Score some new segments, or bring some scores up to date, in turn."""
+        """Score some new segments, or update some scores, alternately."""
         self._refreshed_s = now_s
         ledger, before = self.reclaimer.ledger, self._score
         score = self._scored(now_s, PLACES_S)
@@ -228,7 +228,7 @@ class Evictor:
             self._round, self._round_version = ledger.segments.walk(), score.version
 
     def _scored(self, now_s: float, age_s: float) -> Score:
-        """Return how segments are scored, by where clients are now, or were ``age_s`` ago at most."""
+        """Return how segments are scored, by client positions that are at most ``age_s`` old."""
         sessions = self.reclaimer.sessions
         if sessions.places_version != self._score.version and now_s - self._placed_s >= age_s:
             self._placed_s = now_s

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which processes map which segments, and how much memory that is: asked of the kernel, some in each turn.
+"""Which processes map which segments, and how much memory: the kernel is queried in bounded steps.
 
-One look at a segment takes about 30 us, and there may be thousands.  One walk over all of them keeps the
-gauges of the statistics up to date, a turn a beat.  For a session that asks, a new walk begins and takes one
-turn of the loop after the other; all sessions that asked before it began get its result.  What a single
-session maps is looked up in the turns of its request, before it is refused what would exceed its quota.
+A query for one segment takes about 30 us, and there may be thousands of segments.  A continuous walk over all
+of them, one step per beat, keeps the gauges of the statistics up to date.  When a session asks, a new walk
+begins and runs one step in every turn of the loop; all sessions that asked before it began get its result.
+Before a request is refused for its session's quota, its own steps look up what that session maps.
 """
 
 from __future__ import annotations
@@ -27,35 +27,35 @@ from shmmap.segment.pins import LOADER_SLOT, has_slot, holders
 __all__ = ["UNKNOWN_SLOT", "Holders", "Share", "Survey", "Usage"]
 
 HOLDERS_S: Final = 0.03
-"""Processor time that finding the holders for one reply may take."""
+"""Limit of processor time for finding the holders for one reply."""
 MAX_HOLDING_SEGMENTS: Final = 512
-"""Segments looked at for one reply."""
+"""Segments queried for one reply."""
 UNKNOWN_SLOT: Final = 0
-"""Stands for processes that use a segment and have no session."""
+"""Stands for processes that use a segment without having a session."""
 ASKING_S: Final = 0.2
-"""Processor time that finding the holders may take in one walk; 2048 segments take 0.03 s."""
+"""Limit of processor time for finding the holders in one walk; 2048 segments take 0.03 s."""
 LONG_STEP_S: Final = 0.003
 SHARE: Final = 0.1
-"""Part of the loop's time that steps get when they take long (a process holds very many locks)."""
+"""Share of the loop's time for steps that take long (when a process holds very many locks)."""
 MAX_SEGMENTS: Final = 2048
-"""Segments of a walk for which a session waits: the largest; of one session's the oldest."""
+"""Limit of a walk that a session waits for (largest first) and of one session's check (oldest first)."""
 MAX_ASKED: Final = 16
-"""Results that one session may wait for."""
+"""Results that one session may wait for at a time."""
 
 
 @dataclass(eq=False, slots=True)
 class Holders:
-    """Finds which processes have segments locked, and which sessions these are."""
+    """Finds the processes that have segments locked, and their sessions."""
 
     reclaimer: Reclaimer
 
     @property
     def by_slot(self) -> bool:
-        """Whether the kernel knows which sessions use a segment."""
+        """Whether the kernel reports which sessions use a segment."""
         return self.reclaimer.pins.source is not PinSource.SESSIONS
 
     def slots_of(self, resident: Resident) -> list[int] | None:
-        """Return the slots that have a segment locked; None if its name is gone."""
+        """Return the slots that have a segment locked; None if the segment's name is gone."""
         try:
             with self.reclaimer.pins.opened(self.reclaimer.name_on_disk(resident)) as fd:
                 return holders(fd)
@@ -63,7 +63,7 @@ class Holders:
             return None
 
     def has(self, resident: Resident, slot: int) -> bool:
-        """Whether a session may have a segment locked: not, if its name is there and its lock is not."""
+        """Whether a session may have a segment locked: not if the segment exists without its lock."""
         try:
             with self.reclaimer.pins.opened(self.reclaimer.name_on_disk(resident)) as fd:
                 return has_slot(fd, slot)
@@ -71,10 +71,11 @@ class Holders:
             return True
 
     def users_among(self, resident: Resident, slots: Sequence[int]) -> list[int]:
-        """Return the slots of sessions among those that have a segment locked, and 0 for unknown users.
+        """Return the given slots that have a segment locked, and 0 for unknown users.
 
-        Unknown are a lock that belongs to no session (of a client of a previous run that has not said hello
-        again), and a pin without any lock.  Loaders look at segments, too, and do not count.
+        A user is unknown if its lock belongs to no session (a client of a previous run that has not said
+        hello again), or if the segment is pinned without any lock.  Loaders open segments, too, and do not
+        count.
         """
         known = [slot for slot in slots if self.reclaimer.sessions.by_slot(slot) is not None]
         ours = slots.count(LOADER_SLOT)
@@ -83,13 +84,13 @@ class Holders:
         return known
 
     def of(self, resident: Resident) -> tuple[Holder, ...]:
-        """Return the holders of a segment; session 0 is "unknown": a pin without our lock."""
+        """Return the holders of a segment; session 0 is "unknown": a pin without a lock of shmmap."""
         return tuple(self._as_holders({slot: [resident.nbytes, 1] for slot in self._users_of(resident)}))
 
     def look(self, found: list[Holder]) -> Iterator[None]:
-        """Find the holders of most memory, a segment a step; at the end ``found`` has them, largest first.
+        """Find the holders of most memory, one segment a step; the last step fills ``found``, largest first.
 
-        The number of segments is bounded, and so is the time that they take.
+        The number of segments and the time for them are bounded.
         """
         spent_s, sums_of = 0.0, dict[int, list[int]]()
         for resident in islice(self.reclaimer.ledger.segments.walk(), MAX_HOLDING_SEGMENTS):
@@ -108,7 +109,7 @@ class Holders:
         return self.users_among(resident, self.slots_of(resident) or ())
 
     def _as_holders(self, found: Mapping[int, Sequence[int]]) -> list[Holder]:
-        """Make lines of a reply of bytes and segments by slot."""
+        """Convert bytes and segments by slot into rows of a reply."""
         lines = []
         for slot, (nbytes, cells) in sorted(found.items(), key=lambda item: -item[1][0]):
             session = self.reclaimer.sessions.by_slot(slot)
@@ -121,7 +122,7 @@ class Holders:
 
 @dataclass(slots=True)
 class Share:
-    """What one session maps; ``superseded`` segments have left service or have a successor."""
+    """Segments that one session maps; ``superseded`` ones are out of service or have a successor."""
 
     mapped_bytes: int = 0
     superseded: int = 0
@@ -130,10 +131,10 @@ class Share:
 
 @dataclass(slots=True)
 class Usage:
-    """How many segments are mapped, and their bytes; ``unknown`` are those mapped without a session's lock.
+    """Number and bytes of mapped segments; ``unknown`` ones are mapped without a session's lock.
 
-    ``shares`` has the slots of sessions that map anything; it is empty unless the kernel knows them
-    (``by_slot``).
+    ``shares`` contains the slots of sessions that map segments; it is empty unless the kernel reports
+    sessions (``by_slot``).
     """
 
     count: int = 0
@@ -148,17 +149,17 @@ Answer = Callable[[Usage], None]
 
 
 class Survey:
-    """Looks at all segments, some per `step`.
+    """Walks over all segments to find their users, some segments per `step`.
 
     Parameters
     ----------
     in_service
-        Whether a segment is handed out.
+        Whether a segment can be handed out.
 
     Attributes
     ----------
     usage : Usage
-        The result of the last whole walk.
+        The result of the last complete walk.
     """
 
     def __init__(self, holders: Holders, *, in_service: Callable[[Resident], bool]) -> None:
@@ -179,23 +180,23 @@ class Survey:
 
     @property
     def next_s(self) -> float:
-        """When `turn` has something to do: infinity for never."""
+        """When `run_step` has something to do; infinity for never."""
         return float("inf") if self.idle else self._rests_until_s
 
     def ask(self, session: Session, answer: Answer) -> None:
-        """Call ``answer`` later with the result of a walk that begins after now.
+        """Call ``answer`` later with the result of a walk that begins after this call.
 
         Raises
         ------
         Busy
-            The session waits for too many already.
+            The session waits for too many results already.
         """
         if sum(asker is session for asker, _ in self._asked) >= MAX_ASKED:
             raise Busy("this session waits for too many answers of this kind", hint="wait for them first")
         self._asked.append((session, answer))
 
     def run_step(self, now_s: float) -> None:
-        """Do a step if a session waits, unless the step before took so long that others come first."""
+        """Run a step if a session waits, unless the previous step took so long that other work goes first."""
         if self.idle or now_s < self._rests_until_s:
             return
         self.step()
@@ -205,15 +206,15 @@ class Survey:
     def look_at(
         self, session: Session, before_s: float, enough: Callable[[], bool], wanted: Container[Key] = ()
     ) -> Generator[None, None, None]:
-        """Drop what a session does not map any more, a look a step, until that is ``enough``.
+        """Drop segments that a session no longer maps, checking one per step, until ``enough()`` is True.
 
-        What was handed out at ``before_s`` or later it may be about to open; what is ``wanted`` again
-        counts either way.
+        Segments handed out at ``before_s`` or later stay, since the session may be about to open them;
+        ``wanted`` keys stay in any case.
         """
         if not self._holders.by_slot:
             return
         looked = 0
-        for version in list(session.held):  # what was handed out longest ago first
+        for version in list(session.held):  # in the order in which they were handed out
             for resident in list(session.held.get(version, ())):
                 if looked == MAX_SEGMENTS or enough():
                     return
@@ -225,7 +226,7 @@ class Survey:
                 yield
 
     def step(self) -> None:
-        """Look at some segments, or hand the result to one session that asked."""
+        """Query some segments, or pass the result to one session that asked."""
         if self._asked and not self._running:
             self._running, self._asked = self._asked[::-1], []
             self._begin(MAX_SEGMENTS)
@@ -246,7 +247,7 @@ class Survey:
         return self._walk
 
     def _slots_of(self, resident: Resident) -> list[int]:
-        """Return the slots that have a segment locked; none, so that its pin is unknown, if time is up."""
+        """Return the slots that have a segment locked; none if time is up: its pin is then unknown."""
         if self._asking_s > ASKING_S:
             return []
         begin_s = time.thread_time()

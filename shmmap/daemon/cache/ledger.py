@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in memory, what it takes, and whether more fits; without any I/O.
+"""Accounting of memory: which segments exist, what they take, and whether more fits; without any I/O.
 
-Every byte is in exactly one place: *resident* (a named segment that can be handed out), *retired* (out
-of service, perhaps still mapped), or *reserved* (promised to a load).  Their sum never exceeds the
-budget: a load starts only when its reservation fits.
+Every byte is in exactly one state: *resident* (a named segment that can be handed out), *retired* (out of
+service, perhaps still mapped), or *reserved* (promised to a load).  The sum never exceeds the budget: a load
+starts only when its reservation fits.
 
 Times are seconds on any one clock, injected by the caller.
 """
@@ -21,7 +21,7 @@ __all__ = ["Ledger", "Segments"]
 
 
 class Segments:
-    """All segments in memory, for walks that take several turns while segments come and go."""
+    """All segments in memory, for walks that take several turns while segments are added and removed."""
 
     def __init__(self) -> None:
         self._by_size: list[list[Resident]] = [[] for _ in range(64)]
@@ -41,51 +41,51 @@ class Segments:
         """Remove a segment."""
         alike = self._by_size[resident.nbytes.bit_length()]
         last = alike.pop()
-        if last is not resident:  # it takes the empty place
+        if last is not resident:  # the last segment moves to the freed place
             alike[resident.place], last.place = last, resident.place
         self._count -= 1
 
     def walk(self) -> Iterator[Resident]:
-        """Yield all that are there now and stay, larger ones first (to a factor of two).
+        """Yield all segments that exist now and stay, larger ones first (to a factor of two).
 
-        What comes meanwhile may be left out; what stays may come twice.
+        Segments added during the walk may be left out; segments that stay may be yielded twice.
         """
         for alike in reversed(self._by_size):
             at = len(alike)
-            while (at := min(at, len(alike)) - 1) >= 0:  # from the end: what fills a gap has been seen
+            while (at := min(at, len(alike)) - 1) >= 0:  # from the end: what fills a gap was yielded
                 yield alike[at]
 
 
 class Ledger:
-    """The bytes of one daemon.
+    """Memory accounting of one daemon.
 
     Parameters
     ----------
     budget_bytes
-        Never exceeded by resident, retired and reserved bytes together.
+        Limit of resident, retired and reserved bytes together.
 
     Attributes
     ----------
     by_key
-        What can be handed out.
+        Segments that can be handed out.
     retired : dict
-        By the name they had, segments out of service.
+        Segments out of service, by their original name.
     segments
-        All in memory, retired ones included.
+        All segments in memory, retired ones included.
     order
-        In which order residents are evicted.
+        Order in which residents are evicted.
     retired_bytes, freeing_bytes
-        Memory of what is out of service, and how much of it the kernel is taking back just now.
+        Memory of retired segments, and the part of it that the kernel is taking back now.
     unopened_bytes
-        Bytes of retired segments that no process had open at the last look.
+        Bytes of retired segments that no process had open when last checked.
     overhead_bytes
-        What the daemon itself keeps in shared memory (its statistics); counts as used.
+        Shared memory of the daemon itself (its statistics); counts as used.
     set_aside_bytes
-        Segments of a previous run that cannot be judged before more of the map is known; counts as used.
+        Segments of a previous run that can only be judged when more of the map is known; count as used.
     prefetched, prefetched_bytes
-        What was prefetched and no client has asked for yet, and its memory.
+        Prefetched segments that no client has asked for yet, and their memory.
     unchecked_count
-        How many residents are of a previous run and not yet checked.
+        Number of residents of a previous run that have not been checked yet.
     """
 
     def __init__(self, budget_bytes: int) -> None:
@@ -112,26 +112,26 @@ class Ledger:
 
     @property
     def used_bytes(self) -> int:
-        """Resident, retired and reserved bytes, what is set aside, and the daemon's own overhead."""
+        """Resident, retired, reserved and set-aside bytes, plus the daemon's own overhead."""
         in_memory = self.resident_bytes + self.retired_bytes + self.set_aside_bytes
         return in_memory + self.reserved_bytes + self.overhead_bytes
 
     def shortage(self, nbytes: int) -> int:
-        """How many bytes must be freed before ``nbytes`` more fit; 0 or less when they fit."""
+        """Return how many bytes must be freed before ``nbytes`` more fit; 0 or less if they fit."""
         return self.used_bytes + nbytes - self.budget_bytes
 
     def reserve(self, nbytes: int) -> bool:
-        """Promise bytes to a load; False if they do not fit."""
+        """Promise bytes to a load; return False if they do not fit."""
         fits = nbytes <= 0 or self.shortage(nbytes) <= 0
         self.reserved_bytes += nbytes if fits else 0
         return fits
 
     def fits_at_all(self, nbytes: int) -> bool:
-        """Whether ``nbytes`` fit beside the daemon's own overhead, once all else is evicted."""
+        """Whether ``nbytes`` fit beside the daemon's own overhead once everything else is evicted."""
         return nbytes + self.overhead_bytes <= self.budget_bytes
 
     def add_overhead(self, nbytes: int) -> bool:
-        """Count more memory of the daemon itself; False if that does not fit."""
+        """Count more memory of the daemon itself; return False if it does not fit."""
         fits = self.shortage(nbytes) <= 0
         self.overhead_bytes += nbytes if fits else 0
         return fits
@@ -150,17 +150,17 @@ class Ledger:
         return self._by_name.get(name)
 
     def of_cell(self, cell_id: str) -> list[Resident]:
-        """Return all layers of one cell that can be handed out."""
+        """Return the segments of one cell, in all layers, that can be handed out."""
         found = (self.by_key.get(Key(cell_id, layer)) for layer in self._layers)
         return [resident for resident in found if resident is not None]
 
     def layers(self) -> Iterable[str]:
-        """Return layers of which there are segments that can be handed out."""
+        """Return the layers that have segments to hand out."""
         return self._layers.keys()
 
     @property
     def cell_count(self) -> int:
-        """Number of cells with a segment that can be handed out, in the layer that most have."""
+        """Number of cells with a segment to hand out, in the layer that has most."""
         return max(self._layers.values(), default=0)
 
     @property
@@ -171,11 +171,11 @@ class Ledger:
     # --- being needed ---------------------------------------------------------------------------
 
     def need(self, key: Key) -> None:
-        """Keep this from being evicted: a waiting request or an operator's pin needs it."""
+        """Protect a key from eviction: a waiting request or an operator's pin needs it."""
         self._needed[key] = self._needed.get(key, 0) + 1
 
     def need_no_more(self, key: Key) -> None:
-        """Take back one `need`."""
+        """Undo one `need`."""
         count = self._needed.pop(key) - 1
         if count:
             self._needed[key] = count
@@ -187,13 +187,13 @@ class Ledger:
         return self._needed.keys()
 
     def is_needed(self, key: Key) -> bool:
-        """Whether a request or pin needs this."""
+        """Whether a request or pin needs a key."""
         return key in self._needed
 
     # --- coming ---------------------------------------------------------------------------------
 
     def enter(self, resident: Resident) -> Resident | None:
-        """Put a segment into service; return the version it supersedes, to be retired by name."""
+        """Put a segment into service; return the version that it supersedes, to be retired by name."""
         old = self.by_key.get(resident.key)
         self.by_key[resident.key] = self._by_name[resident.name] = resident
         self._layers[resident.key.layer] += 1
@@ -210,12 +210,12 @@ class Ledger:
         return old
 
     def checked(self, resident: Resident) -> None:
-        """Note that a segment of a previous run is what it should be: it can be handed out."""
+        """Note that a segment of a previous run passed its check: it can be handed out."""
         resident.checked = True
         self.unchecked_count -= 1
 
     def asked_for(self, resident: Resident) -> None:
-        """Note that a client asked for what was prefetched."""
+        """Note that a client asked for a prefetched segment."""
         self._not_ahead(resident)
         resident.prefetched = False
 
@@ -239,14 +239,14 @@ class Ledger:
         self.retired[resident.name] = Retired(resident)
 
     def add_retired(self, resident: Resident) -> Retired:
-        """Count a segment that has been out of service since a previous run of the daemon."""
+        """Count a segment that a previous run of the daemon took out of service."""
         self.segments.add(resident)
         self.retired_bytes += resident.nbytes
         retired = self.retired[resident.name] = Retired(resident)
         return retired
 
     def rename(self, resident: Resident, name: str) -> None:
-        """Give a segment another name."""
+        """Change the name of a segment."""
         if resident.name in self._by_name:
             self._by_name[name] = self._by_name.pop(resident.name)
         else:
@@ -270,24 +270,24 @@ class Ledger:
         return self.enter(retired.resident)
 
     def mark_unopened(self, retired: Retired, unopened: bool) -> None:
-        """Note whether no process had a retired segment open at the last look."""
+        """Note whether no process had a retired segment open when last checked."""
         self.unopened_bytes += retired.resident.nbytes * (unopened - retired.unopened)
         retired.unopened = unopened
 
     def freed(self, name: str) -> int:
-        """Count out a retired segment whose memory is back with the kernel; return its bytes."""
+        """Stop counting a retired segment whose memory the kernel has taken back; return its bytes."""
         nbytes = self._gone(name)
         self.retired_bytes -= nbytes
         return nbytes
 
     def freeing(self, name: str) -> int:
-        """Note that the kernel is taking a retired segment's memory back: it counts until `closed`."""
+        """Note that the kernel is taking back a retired segment's memory; it counts until `closed`."""
         nbytes = self._gone(name)
         self.freeing_bytes += nbytes
         return nbytes
 
     def closed(self, nbytes: int) -> None:
-        """Count out bytes that were being freed and are back with the kernel."""
+        """Stop counting bytes that the kernel has finished taking back."""
         self.freeing_bytes -= nbytes
         self.retired_bytes -= nbytes
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segments that other programs remove (``rm /dev/shm/*``, logind's RemoveIPC, a cleaner) or cut short.
+"""Segments that other programs remove (``rm /dev/shm/*``, logind's RemoveIPC, a cleaner) or truncate.
 
-They are retired, so that their cells are loaded again when they are next asked for.  Their readers keep what
-they map.
+They are retired, so that their cells are loaded again at the next request.  Readers keep the segments that
+they have mapped.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from shmmap.quantities import format_bytes
 __all__ = ["LostSegments"]
 
 SETTLE_S: Final = 0.5
-"""A cleaner removes one file after the other: its log line waits until none has followed for this long."""
+"""A cleaner removes files one after the other: the log line waits until none has vanished for this long."""
 LIKELY: Final = (
     "logind (RemoveIPC) after the user's last logout, or a cleaner of temporary files; see `shmmap doctor`"
 )
 
 
 class LostSegments:
-    """Watches the names of segments, retires those that are lost, and logs them in one line a burst.
+    """Watches the names of segments, retires lost segments, and logs each burst of losses in one line.
 
     Parameters
     ----------
     prefix
-        What names of segments begin with.
+        Prefix of the names of segments.
 
     Attributes
     ----------
     to_check : Walk
-        Segments to look for, after more names vanished than the kernel reported.
+        Segments to check after the kernel lost reports of vanished names.
     fd : int
-        Readable when `retire_vanished` has something to do; -1 where the kernel reports nothing.
+        Readable when `retire_vanished` has something to do; -1 where the kernel reports no removals.
     """
 
     def __init__(self, reclaimer: Reclaimer, prefix: str) -> None:
@@ -64,7 +64,7 @@ class LostSegments:
             self._inotify = None
 
     def vanished(self) -> set[str] | None:
-        """Return the names (slash included) that vanished since the last call; None: the kernel lost some."""
+        """Return names (slash included) that vanished since the last call; None if the kernel lost some."""
         names: set[str] = set()
         for event in self._inotify.read() if self._inotify is not None else ():
             if event.mask & OVERFLOW:
@@ -74,7 +74,7 @@ class LostSegments:
         return names
 
     def retire_vanished(self, now_s: float) -> bool:
-        """Retire segments whose names the kernel reports as removed; True if that released memory."""
+        """Retire segments whose removal the kernel reports; return True if that released memory."""
         ledger, names = self._reclaimer.ledger, self.vanished()
         if names is None:
             self.to_check = Walk(ledger.segments.walk())
@@ -82,14 +82,14 @@ class LostSegments:
         return self._retire_lost(filter(None, map(ledger.resident_named, names)), now_s)
 
     def check_some(self, now_s: float) -> bool:
-        """Look for some of the segments that are to be checked; True if that released memory."""
+        """Check whether some segments still exist; return True if that released memory."""
         return self._retire_lost(self.to_check.for_a_turn(), now_s)
 
     def _retire_lost(self, residents: Iterable[Resident], now_s: float) -> bool:
         return sum(self.retire_if_lost(resident, now_s) for resident in residents) > 0
 
     def retire_if_lost(self, resident: Resident, now_s: float) -> bool:
-        """Retire a segment in service that was removed or cut short, so that its cell is loaded again."""
+        """Retire a segment in service that was removed or truncated, so that its cell is loaded again."""
         reclaimer = self._reclaimer
         if reclaimer.ledger.resident_named(resident.name) is not resident:
             return False
@@ -106,7 +106,7 @@ class LostSegments:
         return True
 
     def report(self, now_s: float) -> None:
-        """Log what was lost, once nothing has followed for a moment."""
+        """Log the lost segments, once none has followed for a moment."""
         if not (self._removed or self._cut) or now_s < self._last_s + SETTLE_S:
             return
         log.warning(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From one state of the map to the next: what of the memory is still right, and what changed since when."""
+"""Switch from one state of the map to the next: which segments are still current, and which cells changed."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["MapSwitch"]
 
 STATES_REMEMBERED: Final = 64
 CELLS_REMEMBERED: Final = 2048
-"""Changes of cells, in all states that are remembered; for changes before them the whole list is read."""
+"""Changed cells remembered, over all states; for changes before these, clients read the whole list."""
 
 
 class MapSwitch:
-    """Changes the catalogue that the cache serves, and remembers the changes.
+    """Changes the catalogue that the cache serves, and remembers the changed cells.
 
-    To change over takes one short step.  What is in memory is then looked at some segments a `turn`; a
-    cell that is asked for meanwhile is looked for at once (`CellCache.find_warm`).
+    The switch itself is one short step.  The segments in memory are then checked, some per `run_step`; a cell
+    that is requested in the meantime is checked at once (`CellCache.find_warm`).
     """
 
     def __init__(self, cache: CellCache) -> None:
@@ -41,7 +41,7 @@ class MapSwitch:
         self._to_free: Walk[None] | None = None
 
     def changes_since(self, map_version: int) -> tuple[set[str], list[str]] | None:
-        """Return ids that changed or appeared, and that vanished, since a map version; None: not known."""
+        """Return ids that changed or appeared, and that vanished, since a map version; None if not known."""
         if map_version == self._cache.catalogue.map_version:
             return set(), []
         history = list(self._history)
@@ -59,27 +59,27 @@ class MapSwitch:
         return changed, list(removed)
 
     def catch_up(self, cells: Sequence[int], reads: Sequence[Stamp], known: Sequence[Stamp]) -> bool:
-        """Take over the states of files that a loader has read; False if the map may have newer ones.
+        """Record the states of files that a loader has read; return False if the map may have newer ones.
 
         Parameters
         ----------
         cells
-            Catalogue indices of the cell that was loaded and of the neighbours that it looks into now.
+            Catalogue indices of the loaded cell and of the neighbours that it reads now.
         reads, known
-            The files' states as the loader read them, and as the catalogue had them when it was sent.
+            States of the files as the loader read them, and as the catalogue had them when the job was sent.
         """
         if not len(cells) == len(reads) == len(known):
-            return False  # the map has got or lost a neighbour meanwhile
+            return False  # the map has gained or lost a neighbour in the meantime
         for index, read, before in zip(cells, reads, known, strict=True):
             now = self._cache.catalogue.stamp(index)
             if now != read:
                 if now != before:
-                    return False  # another state was found since: what was read may have been replaced
+                    return False  # another state was found since: what was read may be outdated
                 self.learn(index, read)
         return True
 
     def learn(self, index: int, stamp: Stamp) -> None:
-        """Take over that a loader found a cell's file in this state."""
+        """Record the state in which a loader found a cell's file."""
         cache = self._cache
         if cache.catalogue.stamp(index) == stamp:
             return
@@ -91,7 +91,7 @@ class MapSwitch:
         cache.events.emit(cache.events.changed, cell_id, cache.catalogue.version(index))
 
     def switch(self, new: CatalogueView, change: CatalogueChange) -> None:
-        """Serve another state of the map; ``change`` is what it differs in from the one served now."""
+        """Serve another state of the map; ``change`` is the difference from the state served now."""
         cache = self._cache
         if change.known and change.count <= CELLS_REMEMBERED:
             touched = {cell for how in ("changed", "added", "moved") for cell in change.ids(how)}
@@ -107,22 +107,22 @@ class MapSwitch:
         self.recheck()
 
     def recheck(self) -> None:
-        """Look at all segments again: more of the map is known, and those that were not current may be."""
+        """Check all segments again: more of the map is known, so more segments may be current."""
         self._unseen = Walk(self._cache.ledger.segments.walk())
         self._cache.unentered = self._cache.ledger.resident_count
 
     @property
     def busy(self) -> bool:
-        """Whether `turn` has something to do."""
+        """Whether `run_step` has something to do."""
         return self._unseen is not None or self._to_free is not None
 
     @property
     def next_s(self) -> float:
-        """When `turn` has something to do: at once, or never."""
+        """When `run_step` has something to do: at once, or never."""
         return 0.0 if self.busy else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Look at some segments: each is current, out of date, or of a cell that left the map."""
+        """Check some segments: each is current, outdated, or of a cell that left the map."""
         cache = self._cache
         if self._unseen is not None:
             for resident in self._unseen.for_a_turn():
@@ -138,7 +138,7 @@ class MapSwitch:
                 self._to_free = None
 
     def _free_leftovers(self) -> Iterator[None]:
-        """Free tables that are not used any more, an entry a step: many at once take long."""
+        """Free unused tables, one entry per step: freeing many at once takes long."""
         while self._leftovers:
             if self._leftovers[-1]:
                 self._leftovers[-1].popitem()

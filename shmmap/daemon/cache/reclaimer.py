@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Getting memory back: retire a segment by renaming it, free it once the kernel says that no process has it.
+"""Freeing memory: a segment is retired by renaming it, and freed once the kernel reports no user.
 
-The number of segments looked at in one turn of the serving loop is bounded; the rest follows in the next.
+Each turn of the serving loop checks a bounded number of segments.
 
-Renaming first means that no other process can open the segment; looking again on a later tick catches
-a process that was just opening it.  A retired segment that is still mapped stays in the ledger, and is
-looked at again when its reader says that it has released it, when the kernel reports a close,
-or when a client's session ends; on a timer only as a precaution.
+After the renaming, no other process can open the segment; a second check on a later tick finds a process that
+was just opening it.  A retired segment that is still mapped stays in the ledger.  It is checked again when
+its reader reports a release, when the kernel reports a close, or when a client's session ends; a timer is
+only a precaution.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ __all__ = ["Closer", "Reclaimer"]
 
 SMALL_BYTES: Final = 1 << 16
 MAX_WAITING: Final = 64
-"""Descriptors that may wait to be closed: clients need them more."""
+"""Descriptors that may wait to be closed: clients need descriptors more."""
 THREAD_NAME: Final = "shmmap-freeing"
 
 
 class Closer:
-    """Closes the last descriptors of removed segments, in a thread that is begun when it is first needed.
+    """Closes the last descriptors of removed segments in a thread, which is started when first needed.
 
-    Taking memory back takes the kernel 0.2 ms a megabyte, in the thread that closes the last descriptor.
-    This one does nothing else, and holds the interpreter only for the moment between two closes.
+    Freeing memory takes the kernel 0.2 ms per megabyte, in the thread that closes the last descriptor.  This
+    thread does nothing else, and holds the interpreter lock only between two closes.
 
     Attributes
     ----------
     fd
         Readable when `closed` has something to count.
     small_bytes
-        Memory that is taken back sooner than another thread is woken.
+        Segments up to this size are freed faster than another thread is woken.
     """
 
     def __init__(self) -> None:
@@ -65,23 +65,23 @@ class Closer:
 
     @property
     def full(self) -> bool:
-        """Whether no more may be given to it for now."""
+        """Whether no more descriptors may be passed to the thread now."""
         return self._waiting >= MAX_WAITING
 
     def close(self, fd: int, nbytes: int) -> None:
-        """Close a descriptor, whose segment takes ``nbytes``, in the thread."""
+        """Close the descriptor of a segment of ``nbytes`` in the thread."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=THREAD_NAME, daemon=True)
             before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
             try:
-                self._thread.start()  # signals are the serving loop's
+                self._thread.start()  # signals are for the serving loop
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self._waiting += 1
         self._to_close.put((fd, nbytes))
 
     def closed(self) -> int:
-        """Return the bytes of what was closed since the last call."""
+        """Return the bytes of the segments closed since the last call."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         nbytes = 0
@@ -91,7 +91,7 @@ class Closer:
         return nbytes
 
     def end(self) -> None:
-        """Close what waits, and end the thread."""
+        """Close the descriptors that wait, and end the thread."""
         if self._thread is not None:
             self._to_close.put(None)
             self._thread.join()
@@ -107,38 +107,38 @@ class Closer:
 
 
 TICK_S: Final = 0.002
-"""A retired segment is looked at again this much later: an ``open`` in flight is over by then."""
+"""Delay until a retired segment is checked again: an ``open`` in flight has finished by then."""
 RETIRED_INTERVAL_S: Final = 0.1
-"""How often a segment that is still mapped is looked at where the kernel does not report closes."""
+"""How often a segment that is still mapped is checked where the kernel does not report closes."""
 WATCHED_INTERVAL_S: Final = 5.0
-"""How often, at most, where it does: a precaution.  A report comes a moment before the close counts,
-so the first looks after it follow each other quickly."""
+"""How often, at most, it is checked where the kernel does: a precaution.  A report arrives a moment before
+the close takes effect, so the first checks after a report follow each other quickly."""
 SHARE_S: Final = 0.0005
-"""With very many of them each is looked at less often: at most one per this time (a look takes 15 us)."""
+"""Minimum time between two checks when very many segments are mapped (a check takes 15 us)."""
 HAND_OUT_GRACE_S: Final = 1.0
-"""A segment just handed out is not evicted for this long, so that its reader can open it."""
+"""A segment that was just handed out is not evicted for this long, so that its reader can open it."""
 LOOKS_PER_TURN: Final = 8
-"""Segments looked at, retired or freed per turn: a look takes 15 us, retiring 50."""
+"""Segments checked, retired or freed per turn: a check takes 15 us, retiring one 50 us."""
 
 
 class RetirementObserver(Protocol):
-    """Follows segments that leave."""
+    """Is notified of segments that leave service."""
 
     def segment_retired(self, resident: Resident, why: str) -> None:
-        """Follow a segment that left service; ``why`` as in `Reclaimer.retire`."""
+        """Handle a segment that left service; ``why`` as in `Reclaimer.retire`."""
 
     def segment_gone(self, name: str) -> None:
-        """Follow a name under which there is no segment any more: it was freed, or has another name."""
+        """Handle a name that has no segment any more: the segment was freed or renamed."""
 
 
 @dataclass(eq=False, slots=True)
 class Reclaimer:
-    """Retires segments, and gives their memory back.
+    """Retires segments, and frees their memory.
 
     Attributes
     ----------
     closer
-        Closes what takes long to close.
+        Closes descriptors whose closing takes long.
     """
 
     ledger: Ledger
@@ -155,17 +155,17 @@ class Reclaimer:
     # --- retiring -----------------------------------------------------------------------------
 
     def name_on_disk(self, resident: Resident) -> str:
-        """Return the name of a segment's file: a retired one has another."""
+        """Return the name of a segment's file, which differs for a retired segment."""
         return retired_name(resident.name) if resident.name in self.ledger.retired else resident.name
 
     def is_pinned(self, resident: Resident) -> bool | None:
-        """Whether a process uses a segment, as the kernel says; None if its name is gone."""
+        """Whether a process uses a segment, according to the kernel; None if the segment's name is gone."""
         if self.pins.source is PinSource.SESSIONS:
             return bool(resident.sessions)
         return self.pins.is_used(self.name_on_disk(resident))
 
     def retire(self, resident: Resident, now_s: float, why: str = "request") -> bool:
-        """Take a segment out of service; True if no process has it mapped, so that it is freed soon.
+        """Take a segment out of service; return True if no process has it mapped, so that it is freed soon.
 
         Parameters
         ----------
@@ -177,13 +177,13 @@ class Reclaimer:
         return self._watch(resident, now_s, why, found=found)
 
     def superseded(self, old: Resident, now_s: float) -> None:
-        """Retire the name of an old version that the ledger took out of service."""
+        """Retire by name an old version that the ledger took out of service."""
         self._watch(old, now_s, "superseded", found=self._hide(old))
 
     def _hide(self, resident: Resident) -> bool:
-        """Give a segment the name of a retired one; False if it is gone.
+        """Rename a segment to its retired name; return False if the segment is gone.
 
-        Where any user may make files that name may be taken: then it is a name that cannot be guessed.
+        Where any user may create files, that name may be taken: then a name is used that cannot be guessed.
         """
         try:
             return self.directory.rename(resident.name, retired_name(resident.name))
@@ -196,7 +196,7 @@ class Reclaimer:
             return found
 
     def _watch(self, resident: Resident, now_s: float, why: str, *, found: bool) -> bool:
-        """Follow a segment out of service until it can be freed; True if no process has it mapped."""
+        """Watch a retired segment until it can be freed; return True if no process has it mapped."""
         retired = self.ledger.retired[resident.name]
         self.observer.segment_retired(resident, why)
         if not found:
@@ -212,7 +212,7 @@ class Reclaimer:
         return unopened
 
     def adopt(self, resident: Resident, now_s: float, *, hidden: bool) -> None:
-        """Follow a segment of a previous run that cannot serve; its file may be ``hidden`` already."""
+        """Watch a segment of a previous run that cannot serve; its file may be ``hidden`` already."""
         retired = self.ledger.add_retired(resident)
         if not hidden:
             self._hide(resident)
@@ -220,34 +220,34 @@ class Reclaimer:
         self.pins.keep(retired_name(resident.name))
 
     def _begin_tick(self, retired: Retired, now_s: float) -> None:
-        """Let it be freed only when no process can be just opening it."""
+        """Schedule the check after which a segment may be freed: no process can be opening it by then."""
         retired.tick_over_s = now_s + TICK_S
         self._look_at(retired, retired.tick_over_s)
 
     def _look_at(self, retired: Retired, when_s: float) -> None:
-        """Schedule a look at a retired segment."""
+        """Schedule a check of a retired segment."""
         retired.probe_after_s = when_s = max(when_s, retired.tick_over_s)
         self._number += 1
         heapq.heappush(self._due, (when_s, self._number, retired))
 
     def retired_of(self, key: Key) -> Resident | None:
-        """Return the last segment of a key that left service, while there is one."""
+        """Return the segment of a key that was retired last, while it exists."""
         retired = self._by_key.get(key)
         return retired.resident if retired is not None else None
 
     def may_revive(self, key: Key) -> bool:
-        """Whether a segment is retired that could be handed out again, if its version is the current one."""
+        """Whether a retired segment could be handed out again if its version is the current one."""
         return key in self._by_key
 
     def revive(self, key: Key, version: int, now_s: float) -> Resident | None:
-        """Put a retired but still existing segment of exactly this version back into service."""
+        """Put a retired segment of exactly this version back into service if it still exists."""
         retired = self._by_key.get(key)
         if retired is None or retired.resident.version != version:
             return None
         name = retired.resident.name
         try:
             found = self.directory.rename(retired_name(name), name)
-        except OSError as error:  # another program has taken its name: the cell is loaded again
+        except OSError as error:  # another program has taken the name: the cell is loaded again
             log.warning("segment not renamed", old=retired_name(name), new=name, error=error.strerror)
             self.never_revive(key)
             return None
@@ -262,19 +262,19 @@ class Reclaimer:
         return retired.resident
 
     def never_revive(self, key: Key) -> None:
-        """Do not hand out again what is retired of this key."""
+        """Never hand out retired segments of this key again."""
         self._by_key.pop(key, None)
 
     def _vanished(self, retired: Retired) -> None:
-        """Release the bytes of a segment whose name others removed.
+        """Release the bytes of a segment whose name another program removed.
 
-        Its readers keep its memory, and until when cannot be found out.
+        Its readers keep the memory, and nothing shows until when.
         """
         self._forget(retired)
         self.ledger.freed(retired.resident.name)
 
     def _forget(self, retired: Retired) -> None:
-        """Forget a segment that is no more, or of which only memory is left."""
+        """Forget a segment that is gone, or whose name is gone."""
         resident = retired.resident
         self.pins.release(retired_name(resident.name))
         if self._by_key.get(resident.key) is retired:
@@ -288,16 +288,16 @@ class Reclaimer:
     # --- freeing ------------------------------------------------------------------------------
 
     def sweep(self, now_s: float) -> int:
-        """Look at some retired segments that are due, free those that no process has, return the bytes freed.
+        """Check some retired segments that are due, free those without a user, and return the bytes freed.
 
-        Those whose memory is being freed in another thread do not count, see `collect`.
+        Memory that another thread is freeing does not count, see `collect`.
         """
         freed = 0
         for _ in range(LOOKS_PER_TURN):
             retired = self._next_due(now_s)
             if retired is None:
                 break
-            freed += self._probe(retired, now_s)  # if that fails, its time has still come
+            freed += self._probe(retired, now_s)  # if that fails, it is still due
         if not self._to_check.is_done:
             for resident in self._to_check.for_a_turn():
                 retired = self.ledger.retired.get(resident.name)
@@ -306,22 +306,22 @@ class Reclaimer:
         return freed
 
     def _next_due(self, now_s: float = math.inf) -> Retired | None:
-        """Return the retired segment that is to be looked at next, if its time has come."""
+        """Return the retired segment that is checked next, if its time has come."""
         while self._due and self._due[0][0] <= now_s:
             when_s, _, retired = self._due[0]
             known = self.ledger.retired.get(retired.resident.name)
             if known is retired and when_s == retired.probe_after_s:
                 return retired
-            heapq.heappop(self._due)  # it is gone, or another time was set
+            heapq.heappop(self._due)  # the segment is gone, or was rescheduled
         return None
 
     def next_sweep_s(self) -> float:
-        """Return when the next look at a retired segment is due; infinity when there is none."""
+        """Return when the next check of a retired segment is due; infinity if there is none."""
         retired = self._next_due()
         return retired.probe_after_s if retired is not None else math.inf
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Schedule a look at segments that a client has dropped: what no other has is freed soon."""
+        """Schedule a check of segments that a client has dropped: those without other users are freed."""
         for resident in residents:
             retired = self.ledger.retired.get(resident.name)
             if retired is None:
@@ -330,7 +330,7 @@ class Reclaimer:
                 self._look_at(retired, now_s)
 
     def _probe(self, retired: Retired, now_s: float) -> int:
-        """Look at a retired segment whose tick is over; return the bytes that were freed."""
+        """Check a retired segment whose tick is over; return the bytes freed."""
         if self.is_pinned(retired.resident):
             self.ledger.mark_unopened(retired, False)
             name = retired_name(retired.resident.name)
@@ -345,7 +345,7 @@ class Reclaimer:
         return self._free(retired)
 
     def _free(self, retired: Retired) -> int:
-        """Remove a segment that no process has; a large one's memory goes back in another thread."""
+        """Remove a segment that no process uses; the memory of a large one is freed in another thread."""
         resident = retired.resident
         name = retired_name(resident.name)
         fd = -1
@@ -360,20 +360,20 @@ class Reclaimer:
         return 0
 
     def collect(self) -> int:
-        """Count memory that the other thread has freed since the last time; return its bytes."""
+        """Count memory that the other thread has freed since the last call; return its bytes."""
         nbytes = self.closer.closed()
         self.ledger.closed(nbytes)
         return nbytes
 
     def _interval_s(self, retired: Retired) -> float:
-        """Return how long to wait with the next look at a segment that was found in use."""
+        """Return the delay until the next check of a segment that was found in use."""
         if self.pins.keeps(retired_name(retired.resident.name)):
             retired.interval_s = min(max(TICK_S, 2 * retired.interval_s), WATCHED_INTERVAL_S)
             return retired.interval_s
         return max(RETIRED_INTERVAL_S, SHARE_S * len(self.ledger.retired))
 
     def on_closes(self, now_s: float) -> bool:
-        """Schedule a look at segments that processes have closed; whether anything may fit that did not."""
+        """Schedule a check of segments that processes have closed; return whether more may fit now."""
         names = self.pins.closed()
         if names is None:
             self.ledger.order.reconsider_all()
@@ -399,7 +399,7 @@ class Reclaimer:
         self.pins.close()
 
     def remove_all(self) -> None:
-        """Take every name away; memory goes back as soon as its last reader ends."""
+        """Remove every name; the memory is freed as soon as the last reader ends."""
         for resident in self.ledger.segments.walk():
             with contextlib.suppress(OSError):
                 self.directory.unlink(self.name_on_disk(resident))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells that are in memory at their current version: what is answered without a load."""
+"""Index of the cells in memory at their current version: requests for these need no load."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ __all__ = ["Heights", "WarmIndex"]
 
 
 TABLES_BYTES: Final = 64 << 20
-"""Of all tables; one takes 8 bytes for every cell of the map, as far as they are in memory."""
+"""Memory of all tables; each takes 8 bytes per cell of the map, but untouched pages of it take none."""
 LEAST_TABLES: Final = 4
 RETIRED_REMEMBERED: Final = 1 << 14
-"""Versions out of service; a client that holds an older one has to drop it, as after a restart."""
+"""Retired versions remembered; a client that holds an older one has to drop it, as after a restart."""
 
 
 class Heights:
-    """Lowest and highest z of cells by catalogue index, metres; as far as they are known.
+    """Lowest and highest z of cells by catalogue index, metres, where known.
 
     Parameters
     ----------
     cells
-        How many cells there are.
+        Number of cells.
     """
 
     def __init__(self, cells: int) -> None:
@@ -49,14 +49,14 @@ class Heights:
         self._known[indices] = False
 
     def get(self, index: int) -> tuple[float, float] | None:
-        """Return the lowest and highest z of a cell; None where they are not known."""
+        """Return the lowest and highest z of a cell, metres; None if they are not known."""
         if not self._known[index]:
             return None
         z_min, z_max = self._z[index].tolist()
         return z_min, z_max
 
     def overlapping(self, indices: list[int], z: tuple[float, float]) -> list[int]:
-        """Return the cells of which it is not known that they lie outside a range."""
+        """Return the cells that may overlap a height range: all but those known to lie outside it."""
         cells = np.array(indices, dtype=np.intp)
         z_min, z_max = self._z[cells].T
         outside = self._known[cells] & ((z_max < z[0]) | (z_min > z[1]))
@@ -66,20 +66,20 @@ class Heights:
 
 @dataclass(eq=False, slots=True)
 class WarmIndex:
-    """Two indices of the same segments: for single cells, and for a whole area at once.
+    """Two indices of the same segments: one for single cells, one for a whole area at once.
 
-    The latter takes a table as long as the map, which only the layers with the most segments have.
+    The index for areas takes a table as long as the map, so only the layers with the most segments have one.
 
     Attributes
     ----------
     layers : dict
-        Per layer, catalogue index to resident segment.
+        Resident segment by catalogue index, per layer.
     tables : dict
-        Per layer that has one, (cells,) uint64: the version, 0 where the cell is not in memory.
+        Version by catalogue index, (cells,) uint64, 0 for a cell not in memory; for layers with a table.
     of_version : ShardedDict
-        Versions handed out, current and earlier ones, to cell and layer.
+        Cell and layer by version, for current and earlier versions that were handed out.
     retired : OrderedDict
-        Those of them that are out of service.
+        Retired versions among these.
     """
 
     layers: dict[str, ShardedDict[int, Resident]] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class WarmIndex:
         return found.get(index) if found is not None else None
 
     def versions(self, layer: str, cells: NDArray[np.intp]) -> list[int] | None:
-        """Return the versions of cells by catalogue index: 0 where one is not in memory; None if none is."""
+        """Return the versions of cells, 0 for a cell not in memory; None if the layer has no segment."""
         table = self.tables.get(layer)
         if table is not None:
             return cast("list[int]", table[cells].tolist())
@@ -108,7 +108,7 @@ class WarmIndex:
         return [resident.version if resident is not None else 0 for resident in residents]
 
     def encode(self, resident: Resident, wire_id: str, segment: str) -> None:
-        """Encode a segment's handle once, fresh and stale, to be used in every reply.
+        """Encode a segment's handle, fresh and stale, for reuse in every reply.
 
         Parameters
         ----------
@@ -123,7 +123,7 @@ class WarmIndex:
         resident.stale_handle = encode_handle(msgspec.structs.replace(handle, stale=True))
 
     def enter(self, resident: Resident, index: int, cells: int) -> None:
-        """Enter a segment with the current version of its cell; ``cells`` is how many the map has."""
+        """Enter a segment with its cell's current version; ``cells`` is the number of cells in the map."""
         layer = resident.key.layer
         found = self.layers.get(layer)
         if found is None:
@@ -137,10 +137,10 @@ class WarmIndex:
             self._make_table(layer, cells)
 
     def _make_table(self, layer: str, cells: int) -> None:
-        """Make a layer's table if there is room, or if a layer with a quarter of its segments has one."""
+        """Make a layer's table if there is room, or if a layer with a quarter as many segments has one."""
         found = self.layers[layer]
         if len(found).bit_count() != 1:
-            return  # it is tried again when they have doubled
+            return  # tried again when their number has doubled
         if len(self.tables) >= max(LEAST_TABLES, TABLES_BYTES // (8 * cells)):
             smallest = min(self.tables, key=lambda other: len(self.layers[other]))
             if 4 * len(self.layers[smallest]) > len(found):
@@ -151,19 +151,19 @@ class WarmIndex:
             table[index] = resident.version
 
     def note_version(self, resident: Resident) -> None:
-        """Remember which cell and layer a segment's version is of."""
+        """Remember the cell and layer of a segment's version."""
         self.of_version[resident.version] = resident.key
         self.retired.pop(resident.version, None)
 
     def note_retired(self, resident: Resident) -> None:
-        """Note that a segment is out of service: what its version is of is forgotten in time."""
+        """Note that a segment is retired; its version is forgotten after `RETIRED_REMEMBERED` others."""
         self.retired[resident.version] = None
         if len(self.retired) > RETIRED_REMEMBERED:
             oldest, _ = self.retired.popitem(last=False)
             self.of_version.pop(oldest, None)
 
     def leave(self, index: int, layer: str) -> None:
-        """Remove a cell whose version is another now, or whose segment is retired."""
+        """Remove a cell whose version has changed, or whose segment is retired."""
         found = self.layers.get(layer)
         if found is None or found.pop(index, None) is None:
             return

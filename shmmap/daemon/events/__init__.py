@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happened, numbered, and sent to subscribers."""
+"""Numbered events, and their delivery to subscribers."""

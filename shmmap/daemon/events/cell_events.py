@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happens to cells, reported: as events, log lines, counters, and rows of the statistics.
+"""Reports about cells: as events, log lines, counters, and rows of the statistics.
 
-Nothing is reported while a client waits for the loop: `CellEvents.emit` keeps it, `CellEvents.flush` reports.
+Nothing is reported while a client waits for the loop: `CellEvents.emit` queues it, `CellEvents.flush`
+reports.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["CellEvents", "EvictionHistory", "PrefetchMisses", "PressureEvents"]
 
 MAX_EVICTED: Final = 1 << 14
-"""Segments evicted to make room that are remembered."""
+"""Number of segments evicted for lack of memory that are remembered."""
 PRESSURE_S: Final = 1.0
 LOG_S: Final = 60.0
 _SETTINGS: Final = {
@@ -32,18 +33,18 @@ _SETTINGS: Final = {
     "quota": "session_quota (--session-quota): raise it, or have this client hold less",
     "no_space": "shm_dir (--shm-dir): its file system is full, or smaller than the budget",
 }
-"""What an operator can change, by the code of a refusal."""
+"""Setting that an operator can change, by the code of a refusal."""
 
 
 class PressureEvents:
-    """Cells refused for lack of memory: an event a second and a log line a minute, however many there are.
+    """Refusals of cells for lack of memory: at most one event a second and one log line a minute.
 
     Parameters
     ----------
     memory
-        Gives budget, used, pinned and zombie bytes.
+        Returns budget, used, pinned and retired bytes.
     holder
-        Describes the session that holds most of the memory.
+        Returns a description of the session that holds most of the memory.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class PressureEvents:
         self.step(now_s)
 
     def step(self, now_s: float) -> None:
-        """Publish and log what has not been, if the last time is long enough ago."""
+        """Publish and log the refusals not yet reported, if the interval has passed."""
         if self._refused and now_s - self._published_s >= PRESSURE_S:
             self._event_log.publish(events.Pressure, *self._last, self._refused, *self._memory())
             self._refused, self._published_s = 0, now_s
@@ -91,41 +92,41 @@ class PressureEvents:
 
 
 class EvictionHistory:
-    """The last keys that were evicted to make room: if one is loaded again, the cache was too small.
+    """Keys recently evicted for lack of memory: if one is loaded again, the cache was too small.
 
-    The same idea as the ghost lists of ARC (Megiddo and Modha, FAST 2003), used for reports only.
+    As the ghost lists of ARC (Megiddo and Modha, FAST 2003), but used for reports only.
     """
 
     def __init__(self) -> None:
-        self._versions: OrderedDict[Key, int] = OrderedDict()  # a dict finds its oldest one slowly
+        self._versions: OrderedDict[Key, int] = OrderedDict()  # a dict is slow at finding its oldest key
 
     def __len__(self) -> int:
         return len(self._versions)
 
     def evicted(self, key: Key, version: int) -> None:
-        """Note that this version made room for others."""
+        """Note that this version was evicted for lack of memory."""
         self._versions.pop(key, None)
         self._versions[key] = version
         if len(self._versions) > MAX_EVICTED:
             self._versions.popitem(last=False)
 
     def loaded(self, key: Key, version: int) -> bool:
-        """Whether a load brought back just what had been evicted to make room."""
+        """Whether a load brought back a version that had been evicted for lack of memory."""
         return self._versions.pop(key, None) == version
 
 
 QUIET_S: Final = 1.0
-"""A client's prefetch misses are one event at most in this time."""
+"""Minimum time between two prefetch-miss events of one client."""
 MAX_EVENTS_PER_TURN: Final = 16
-"""Clients looked at in one turn: many of them must not drive all else out of the log."""
+"""Clients handled in one turn: their events must not displace all others from the log."""
 MAX_MISSED_CELLS: Final = 1 << 12
 MAX_WAITING_CLIENTS: Final = 1 << 8
-"""Most cells whose misses are remembered, and most clients remembered for each of them."""
+"""Limit of cells whose misses are remembered, and of clients remembered for each of them."""
 
 
 @dataclass(eq=False, slots=True)
 class _Waited:
-    """Prefetch misses of one client that are no event yet, and until when they stay none."""
+    """Prefetch misses of one client not published yet, and until when they are held back."""
 
     session: int
     pid: int
@@ -137,31 +138,31 @@ class _Waited:
 
 
 class PrefetchMisses:
-    """Cells that moving clients had to wait for: of each client one event a second, also after its end.
+    """Cells that moving clients had to wait for: one event a second per client, also after its session ended.
 
-    A client that asks again for a cell that has not come meanwhile waits on, and that is no other wait.
+    A client that asks again for a cell that has not arrived continues the same wait.
     """
 
     def __init__(self, log: EventLog) -> None:
         self._log = log
-        self._absent: OrderedDict[tuple[str, str], set[int]] = OrderedDict()  # sessions that wait for it
-        self._waited: OrderedDict[int, _Waited] = OrderedDict()  # by session; the next one first
+        self._absent: OrderedDict[tuple[str, str], set[int]] = OrderedDict()  # sessions that wait for each
+        self._waited: OrderedDict[int, _Waited] = OrderedDict()  # by session; the next one to publish first
 
     def __len__(self) -> int:
-        """How many clients are remembered."""
+        """Return the number of clients remembered."""
         return len(self._waited)
 
     def arrived(self, cell_id: str, layer: str) -> None:
-        """Note that no client waits for a cell any more."""
+        """Note that a cell has arrived, so that no client waits for it any more."""
         self._absent.pop((cell_id, layer), None)
 
     def note(self, session: Session, cell_id: str, layer: str) -> bool:
-        """Note that a client has to wait for a cell; False if it does so already.
+        """Note that a client has to wait for a cell; return False if it already waits for it.
 
         Parameters
         ----------
         cell_id
-            As replies carry it.
+            Id as in replies.
         """
         waiting = self._absent.setdefault((cell_id, layer), set())
         if session.slot in waiting:
@@ -195,19 +196,19 @@ class PrefetchMisses:
 
 
 class CellEvents:
-    """Reports what happens to cells.
+    """Reports the events of cells: to subscribers, the log and the statistics.
 
     Parameters
     ----------
     pressure
         Reports cells that were refused for lack of memory.
     id_prefix, segment_prefix
-        What cell ids and segment names are shown without.
+        Prefixes that are removed from the cell ids and segment names in reports.
 
     Attributes
     ----------
     minutes : MinuteLog
-        Log lines about what happens often.
+        Log lines about frequent events.
     """
 
     def __init__(
@@ -231,27 +232,27 @@ class CellEvents:
     # --- after clients have been answered -----------------------------------------------------------
 
     def emit(self, report: Callable[..., None], *what: Any) -> None:
-        """Report something, in order, once no client waits for the loop; see `flush`."""
+        """Queue a report until no client waits for the loop; see `flush`."""
         self._pending.append((report, what))
 
     @property
     def pending(self) -> bool:
-        """Whether something is still to be reported."""
+        """Whether reports are queued."""
         return bool(self._pending)
 
     def flush_one(self) -> None:
-        """Report the first thing that is pending, if there is one."""
+        """Report the first queued item, if there is one."""
         if self._pending:
             report, what = self._pending.popleft()
             report(*what)
 
     def flush(self) -> None:
-        """Report all that is pending."""
+        """Report all queued items."""
         while self._pending:
             self.flush_one()
 
     def step(self, now_s: float) -> None:
-        """Publish and log what is reported now and then; a few times a second."""
+        """Publish and log periodic reports, a few times a second."""
         self._pressure.step(now_s)
         self.minutes.step(now_s)
         self._misses.turn(now_s)
@@ -265,7 +266,7 @@ class CellEvents:
     def loaded(self, resident: Resident, took_ns: int, replaces: int, cached: bool, ahead: bool) -> None:
         """Report that a segment was loaded and published; ``took_ns`` from handing the load to a worker.
 
-        ``cached`` says that it came out of the disk cache, ``ahead`` that no client had asked for it yet.
+        ``cached``: the layer came from the disk cache; ``ahead``: no client had asked for it yet.
         """
         again = self._publish_loaded(resident, resident.load_ns, replaces, ahead)
         self._misses.arrived(self._id(resident.key.cell_id), resident.key.layer)
@@ -285,7 +286,7 @@ class CellEvents:
         self._publish_loaded(resident, 0, 0, ahead=False)
 
     def _publish_loaded(self, resident: Resident, load_ns: int, replaces: int, ahead: bool) -> bool:
-        """Publish that a segment is in service; return whether it had been evicted to make room."""
+        """Publish that a segment is in service; return whether it had been evicted for lack of memory."""
         again = self._history.loaded(resident.key, resident.version)
         self._log.publish(
             events.Loaded,
@@ -306,7 +307,7 @@ class CellEvents:
         self._log.publish(events.Changed, self._id(cell_id), version, "changed")
 
     def retired(self, resident: Resident, why: str) -> None:
-        """Report that a segment left service; of a superseded one its successor's event is enough."""
+        """Report that a segment left service, unless it was superseded: its successor's event is enough."""
         if why == "room":
             self._history.evicted(resident.key, resident.version)
         if why != "superseded":
@@ -347,11 +348,11 @@ class CellEvents:
     # --- rows of the statistics ---------------------------------------------------------------------
 
     def show(self, resident: Resident, state: CellState) -> None:
-        """Show a segment as it is now."""
+        """Write the row of a segment in its present state."""
         self._statistics.cell_changed(resident.name, self.row(resident, state))
 
     def row(self, resident: Resident, state: CellState) -> CellRow:
-        """Return the row of a segment."""
+        """Return the row of a segment for the statistics."""
         return CellRow(
             self._id(resident.key.cell_id),
             resident.key.layer,
@@ -368,5 +369,5 @@ class CellEvents:
         )
 
     def hide(self, name: str) -> None:
-        """Remove the row of a segment that is no more."""
+        """Remove the row of a segment that no longer exists."""
         self._statistics.cell_removed(name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What happened in this run of the daemon, numbered; the last of it is remembered, and sent to subscribers.
+"""Numbered events of this run of the daemon: the latest ones are stored, and all are sent to subscribers.
 
-Events leave by an XPUB socket beside that of requests.  A subscriber that does not keep up loses events and
-notices by their numbers; the log waits for none of them.
+Events are sent over an XPUB socket next to the request socket.  A subscriber that is too slow loses events,
+and notices by their numbers; the log waits for no subscriber.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["EventLog", "EventPublisher", "MinuteLog", "events_path"]
 
 REMEMBERED: Final = 4096
-"""Events kept for later questions: under a megabyte."""
+"""Events stored for later requests: less than a megabyte."""
 PAGE_EVENTS: Final = 500
 LOG_S: Final = 60.0
 MAX_UNREAD_BYTES: Final = 1 << 20
-"""Of events kept for a subscriber that does not read; it loses further ones."""
+"""Limit of unread events of a subscriber; at the limit it loses further ones."""
 MAX_SUBSCRIPTION_BYTES: Final = 64
 _NAMED: Final = 3
-_SUBSCRIBE: Final = b"\x01"  # and a prefix
+_SUBSCRIBE: Final = b"\x01"  # followed by a prefix
 
 
 class Subscriber(Protocol):
     """A receiver of all events."""
 
     def offer(self, body: bytes, max_unread_bytes: int, /) -> None:
-        """Send a message, unless that much is unread already."""
+        """Send a message, unless ``max_unread_bytes`` are unread already."""
 
 
 class EventLog:
-    """Numbers, remembers and sends events.
+    """Numbers, stores and sends events.
 
     Parameters
     ----------
     epoch
-        This run of the daemon.
+        Number of this run of the daemon.
     clock_ns
         Wall clock, nanoseconds.
 
@@ -67,20 +67,20 @@ class EventLog:
         self._subscribers: dict[Subscriber, None] = {}
 
     def subscribe(self, subscriber: Subscriber) -> None:
-        """Send all events to a subscriber from now on; first it is sent the number of the last event."""
+        """Send all events to a subscriber from now on, beginning with the number of the last event."""
         self._subscribers[subscriber] = None
         subscriber.offer(self._event(events.Beat), MAX_UNREAD_BYTES)
 
     def unsubscribe(self, subscriber: Subscriber) -> None:
-        """Send no more events to a subscriber."""
+        """Stop sending events to a subscriber."""
         self._subscribers.pop(subscriber, None)
 
     def close(self) -> None:
-        """Send no more events."""
+        """Stop sending events."""
         self._subscribers.clear()
 
     def publish(self, kind: Callable[..., events.Event], *fields: object) -> None:
-        """Send an event made of ``kind`` and its own fields, numbered, and remember it."""
+        """Send an event made of ``kind`` and its own fields, with the next number, and store it."""
         self.last += 1
         now_ns = self._clock_ns()
         data = encode_event(kind(self.last, self.epoch, now_ns, *fields))
@@ -88,7 +88,7 @@ class EventLog:
         self._send(data)
 
     def mention(self, kind: Callable[..., events.Event], *fields: object) -> None:
-        """Send an event that takes no number and is not remembered."""
+        """Send an event without a number, which is not stored."""
         self._send(self._event(kind, *fields))
 
     def beat(self) -> None:
@@ -103,7 +103,7 @@ class EventLog:
             one.offer(data, MAX_UNREAD_BYTES)
 
     def page(self, message: Recent) -> EventPage:
-        """Answer a request for past events."""
+        """Return past events in answer to a request."""
         first = self.last - len(self._kept) + 1
         skip = min(max(0, message.after + 1 - first), len(self._kept))
         limit = max(0, min(message.limit, PAGE_EVENTS))
@@ -115,17 +115,17 @@ class EventLog:
 
 
 def events_path(request_path: str) -> str:
-    """Return where the events of the daemon at this request socket are."""
+    """Return the path of the event socket that belongs to this request socket."""
     return request_path.removesuffix(".sock") + ".events.sock"
 
 
 class EventPublisher:
-    """The socket of the event log: a client subscribes to all events, or to none.
+    """The socket of the event log: clients subscribe to all events or to none.
 
     Parameters
     ----------
     listening
-        A socket that listens.
+        A listening socket.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class EventPublisher:
 
 
 class MinuteLog:
-    """Log lines about frequent things: the first at once, then one a minute with the sum."""
+    """Log lines about frequent events: the first at once, then one per minute with the total."""
 
     def __init__(self) -> None:
         self._counts: dict[str, Counter[str]] = {}
@@ -160,12 +160,12 @@ class MinuteLog:
         self._due_s: dict[str, float] = {}
 
     def count(self, event: str, of: str, nbytes: int) -> None:
-        """Count an event and its bytes; ``of`` is the client or the reason that the log line names."""
+        """Count an event and its bytes; ``of`` is the client or reason named in the log line."""
         self._counts.setdefault(event, Counter())[of] += 1
         self._bytes[event] += nbytes
 
     def step(self, now_s: float) -> None:
-        """Log what has been counted and is due."""
+        """Log the counts that are due."""
         for event in [event for event in self._counts if now_s >= self._due_s.get(event, float("-inf"))]:
             of = self._counts.pop(event)
             most = ", ".join(f"{count} {name}" for name, count in of.most_common(_NAMED))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machine the daemon runs on: names, locks, memory, signals, logs, scheduling."""
+"""The daemon's machine: names, locks, memory, signals, logs, scheduling."""

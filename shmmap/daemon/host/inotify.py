@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""inotify(7), as little of it as the daemon needs: there is nothing for it in the standard library."""
+"""The part of inotify(7) that the daemon needs, which the standard library lacks."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ __all__ = [
 ]
 
 CLOSED: Final = 0x08 | 0x10
-"""A descriptor that could write, or could not, is closed for the last time: IN_CLOSE."""
+"""A file was closed, whether it was open for writing or not: IN_CLOSE."""
 NAME_GONE: Final = 0x40 | 0x200
-"""A name in the directory was removed or is another now: IN_MOVED_FROM, IN_DELETE."""
+"""A name was removed from the directory or moved away: IN_MOVED_FROM, IN_DELETE."""
 CREATED: Final = 0x100
-"""A name in the directory is new: IN_CREATE."""
+"""A name was created in the directory: IN_CREATE."""
 SELF_MOVED: Final = 0x800
-"""What is watched has another name now: IN_MOVE_SELF."""
+"""The watched file or directory was renamed: IN_MOVE_SELF."""
 SELF_GONE: Final = 0x400 | SELF_MOVED
-"""What is watched was removed, or has another name now: IN_DELETE_SELF."""
+"""The watched file or directory was removed or renamed: IN_DELETE_SELF, IN_MOVE_SELF."""
 NAMES_CHANGED: Final = NAME_GONE | 0x80 | CREATED
-"""A name in the directory came, went, or means something else now."""
+"""A name in the directory was added, removed, or replaced."""
 ALSO: Final = 0x20000000
-"""To be watched for beside what is watched for already: IN_MASK_ADD."""
+"""Add to the events of an existing watch: IN_MASK_ADD."""
 CHANGED: Final = 0x08 | NAME_GONE | 0x80 | CREATED | 0x400 | SELF_MOVED | 0x1000000 | 0x4000000
-"""A file in the directory was written, came or went, or the directory itself did; directories only, and
-nothing of files that have no name any more."""
+"""A file in the directory, or the directory itself, was written, added, removed or moved.  Directories only;
+no events of unlinked files."""
 DIRECTORY: Final = 0x40000000
-"""The event is about a directory: IN_ISDIR."""
+"""The event concerns a directory: IN_ISDIR."""
 OVERFLOW: Final = 0x4000
 """Events were lost: IN_Q_OVERFLOW."""
 ENDED: Final = 0x8000
-"""The watch has ended; what was watched is gone, or the watch was removed: IN_IGNORED."""
+"""The watch has ended because its target is gone or the watch was removed: IN_IGNORED."""
 _ONCE: Final = 0x80000000
 _EVENT: Final = struct.Struct("@iIII")
 _READ_BYTES: Final = 16 << 10
@@ -56,7 +56,7 @@ _libc: Final = ctypes.CDLL(None, use_errno=True)
 
 
 class Event(NamedTuple):
-    """What happened to which watch; ``name`` is the directory entry, empty for a file's own watch."""
+    """An event and its watch; ``name`` is the directory entry, empty for a file's own watch."""
 
     watch: int
     mask: int
@@ -64,12 +64,12 @@ class Event(NamedTuple):
 
 
 class Inotify:
-    """One queue of events.
+    """An inotify instance: a queue of events.
 
     Raises
     ------
     OSError
-        The kernel has none left for this user (``fs.inotify.max_user_instances``).
+        The kernel's limit for this user is reached (``fs.inotify.max_user_instances``).
     """
 
     def __init__(self) -> None:
@@ -80,16 +80,16 @@ class Inotify:
         os.close(self.fd)
 
     def add(self, path: str, mask: int, *, once: bool = False) -> int:
-        """Watch a file or directory, until its first event or until `remove`; OSError if that cannot be."""
+        """Watch a path, with ``once`` only until its first event; raise OSError if that fails."""
         wanted = ctypes.c_uint32(mask | (_ONCE if once else 0))
         return _checked(_libc.inotify_add_watch(self.fd, os.fsencode(path), wanted))
 
     def remove(self, watch: int) -> None:
-        """End a watch; nothing if it has ended."""
+        """End a watch, if it has not ended."""
         _libc.inotify_rm_watch(self.fd, watch)
 
     def read(self) -> list[Event]:
-        """Return events that are there, a bounded number of them."""
+        """Return pending events, a bounded number of them."""
         data = b""
         with contextlib.suppress(BlockingIOError):
             data = os.read(self.fd, _READ_BYTES)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An instance's places: the directory of its sockets, its lock, and the removal of its names.
+"""Files of an instance: the directory of its sockets, its lock, and the removal of its segments.
 
-One daemon per instance: binding takes the place of a live socket, so a lock comes first.
+There is one daemon per instance: binding would replace a live socket, so the lock is taken first.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ __all__ = ["InstanceLock", "lock_path", "make_runtime_dir", "stopped_early", "ta
 
 
 def make_runtime_dir(path: Path, gid: int) -> None:
-    """Make the directory of the socket, for the owner and, where there is one, the group.
+    """Make the directory of the socket, for the owner and, if given, the group.
 
     Raises
     ------
     CannotStart
-        It cannot be made, or in /tmp another account has made it.
+        The directory cannot be made, or it is in /tmp and another account has made it.
     """
     if str(path) == fallback_runtime_dir():
         _make_private(path)
@@ -49,7 +49,7 @@ def make_runtime_dir(path: Path, gid: int) -> None:
 
 
 def _make_private(path: Path) -> None:
-    """Make the directory in /tmp that is used without ``XDG_RUNTIME_DIR``, for the owner alone."""
+    """Make the directory in /tmp that replaces ``XDG_RUNTIME_DIR``, for the owner alone."""
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700)
     if why := why_not_private(str(path)):
@@ -69,16 +69,16 @@ class InstanceLock:
     Parameters
     ----------
     path
-        It says the process id, for the message to a second daemon.
+        The lock file; it contains the process id, for the message to a second daemon.
     check
-        Raises an error if anything else hinders the daemon; called with the lock held, the file unchanged.
+        Called with the lock held and the file unchanged; raises an error if the daemon cannot start.
 
     Raises
     ------
     InstanceBusy
-        Another process holds it; the message names that.
+        Another process holds the lock; the message names it.
     CannotStart
-        The file cannot be made, or is another user's or another program's.
+        The file cannot be created, or belongs to another user or program.
     """
 
     def __init__(self, path: str, check: Callable[[], object] = lambda: None) -> None:
@@ -104,7 +104,7 @@ class InstanceLock:
                 fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
             except OSError as error:
                 raise name_taken("the lock file", path, error, otherwise=_OTHERWISE) from error
-            if os.fstat(fd).st_uid not in (os.geteuid(), 0):  # its owner could hold it without end
+            if os.fstat(fd).st_uid not in (os.geteuid(), 0):  # another owner could hold the lock without end
                 os.close(fd)
                 raise name_taken("the lock file", path, None, otherwise=_OTHERWISE)
             try:
@@ -119,10 +119,10 @@ class InstanceLock:
             with contextlib.suppress(FileNotFoundError):
                 if Path(path).stat().st_ino == os.fstat(fd).st_ino:
                     return fd
-            os.close(fd)  # its owner removed it just before we got the lock: try the new file
+            os.close(fd)  # its owner removed the file just before we got the lock: try the new file
 
     def restore(self) -> None:
-        """Make the file again if another program removed it, unless another daemon has made one."""
+        """Create the file again if another program removed it, unless another daemon has created one."""
         if os.path.exists(self.path):
             return
         with contextlib.suppress(ShmmapError, OSError):
@@ -131,9 +131,9 @@ class InstanceLock:
             self._fd = again._fd
 
     def release(self) -> None:
-        """Remove the file and let the next daemon in.
+        """Remove the file and release the lock.
 
-        If another program removed it meanwhile, the file of this name is another daemon's and stays.
+        If another program removed the file, the present one is another daemon's and stays.
         """
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.stat(self.path), os.fstat(self._fd)):
@@ -142,12 +142,12 @@ class InstanceLock:
 
 
 def lock_path(socket_path: str) -> str:
-    """Return the path of the lock that says whose the request socket is."""
+    """Return the path of the lock that protects the request socket."""
     return socket_path.removesuffix(".sock") + ".lock"
 
 
 def take_away(directory: ShmDirectory, instance: str) -> None:
-    """Remove the instance's names."""
+    """Remove the instance's names from the segment directory."""
     for name in directory.names(segment_prefix(instance)):
         with contextlib.suppress(OSError):
             os.unlink(directory.path + name)
@@ -160,9 +160,9 @@ def stopped_early(
     kind: type[BaseException] | None,
     *_: object,
 ) -> None:
-    """Remove the names at a stop that came before there was anything but what the previous run left.
+    """Remove the previous run's segments when the daemon is stopped before it has any of its own.
 
-    They stay if a daemon with another runtime directory has begun to serve from them meanwhile.
+    They stay if a daemon with another runtime directory serves them by then.
     """
     if kind is SystemExit and not signals.keep and not has_writer(directory, statistics_name(instance)):
         take_away(directory, instance)

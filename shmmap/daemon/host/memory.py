@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory the daemon may use: shared by cells, private to each loader, limited by the control group.
+"""Limits of the daemon's memory: shared for cells, private per loader, restricted by the control group.
 
-Mounts (proc_pid_mountinfo(5)) say where control groups are, and which file system a path is on.
+Mounts (proc_pid_mountinfo(5)) show where control groups are, and which file system a path is on.
 
-Shared memory counts for the control group of the process that wrote it first, and stays charged when that
-process ends.  Beyond the limit there is no error: the kernel kills.  So the limit has to be known beforehand.
+Shared memory is charged to the control group of the process that wrote it first, even after that process has
+ended.  Exceeding the limit raises no error: the kernel kills a process.  So the limit has to be known before.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ RESERVE_BYTES: Final = 256 << 20
 SMALLEST_BYTES: Final = 1 << 20
 LARGEST: Final = 1 << 62
 LOADER_BYTES: Final = (2 << 30, 8 << 30)
-"""Least and most that a loader may use: a layer of the largest cell takes some 3 GiB."""
+"""Lower and upper bound of a loader's memory limit: a layer of the largest cell takes some 3 GiB."""
 
 
 def _memory_bytes(which: str) -> int:
@@ -46,7 +46,7 @@ def _memory_bytes(which: str) -> int:
 
 
 def loader_bytes(limit_bytes: int | None) -> int:
-    """Return how much private memory each loader may use: a quarter of the machine's, from 2 to 8 GiB.
+    """Return each loader's limit of private memory: a quarter of the machine's, from 2 to 8 GiB.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def loader_bytes(limit_bytes: int | None) -> int:
 
 
 def room_in_group(limit_bytes: int) -> int:
-    """Return how much of a control group's memory the segments may have: half is left, at most 256 MiB."""
+    """Return how much of a control group's memory segments may take: all but half, at most 256 MiB."""
     return limit_bytes - min(limit_bytes // 2, RESERVE_BYTES)
 
 
@@ -73,29 +73,29 @@ def choose_budget(
 ) -> int:
     """Return the budget in bytes.
 
-    An explicit one that does not fit the file system, or the control group, is refused.  The default is
-    a quarter of the available memory, at most 4 GiB, less where the file system is smaller (a reserve
-    of 5 %, at most 256 MiB, stays free) or the control group is (a reserve of half of it, at most
-    256 MiB, is left to the processes themselves).
+    An explicit budget that does not fit the file system or the control group is refused.  The default is a
+    quarter of the available memory, at most 4 GiB.  It is less if the file system is small (5 % of it, at
+    most 256 MiB, stay free) or the control group is (half of it, at most 256 MiB, is left to the processes
+    themselves).
 
     Parameters
     ----------
     asked_bytes
         The explicit budget; 0 for the default.
     ours_bytes
-        What a previous run of the daemon left in the directory: it is ours to keep or to free.
+        Bytes that a previous run of the daemon left in the directory: the daemon may keep or free them.
     beside_bytes
-        What the default budget leaves of the file system to live maps.
+        Bytes of the file system that the default budget leaves to live maps.
     limit_bytes
         Memory limit of the control group; None for none.
 
     Raises
     ------
     ConfigError
-        The explicit budget is larger than the file system, the kernel would kill for it, or it is too small
-        for anything.
+        The explicit budget is larger than the file system or exceeds the control group's limit, or it is too
+        small to be useful.
     CannotStart
-        Too little is free.
+        Too little memory is free.
     """
     size, free = directory.size_bytes(), directory.free_bytes() + ours_bytes
     group_room = room_in_group(limit_bytes) if limit_bytes is not None else LARGEST
@@ -138,14 +138,14 @@ def choose_budget(
 
 
 _NO_LIMIT: Final = 1 << 60
-"""Version 1 says "none" with the largest number of pages there is."""
+"""Version 1 expresses "no limit" as the largest possible number of pages."""
 _FILES: Final = {"cgroup2": "memory.max", "cgroup": "memory.limit_in_bytes"}
 
 
 def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
-    """Return the lowest memory limit of this process's group and the groups around it; None for none.
+    """Return the lowest memory limit of this process's control group and its ancestors; None for none.
 
-    Control groups of versions 1 and 2 (cgroups(7)).
+    Covers versions 1 and 2 of control groups (cgroups(7)).
 
     Parameters
     ----------
@@ -169,12 +169,12 @@ def memory_limit_bytes(proc: str = "/proc/self") -> int | None:
 
 
 def out_of_memory_kills(vmstat: str = "/proc/vmstat") -> int:
-    """Return how many processes the kernel has killed for lack of memory, the machine's or a group's."""
+    """Return how many processes the kernel has killed because memory ran out, anywhere on the machine."""
     return next((int(line.split()[1]) for line in _lines(Path(vmstat)) if line.startswith("oom_kill ")), 0)
 
 
 def _groups(path: Path) -> dict[str, str]:
-    """Per kind of hierarchy, the group of the process."""
+    """Return the control group of the process, by hierarchy."""
     found: dict[str, str] = {}
     for line in _lines(path):
         _number, controllers, group = line.split(":", 2)
@@ -190,7 +190,7 @@ def _is_below(group: str, root: str) -> bool:
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines of a file; none where it cannot be read."""
+    """Return the lines of a file; none if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:
@@ -198,7 +198,7 @@ def _lines(path: Path) -> list[str]:
 
 
 class Mount(NamedTuple):
-    """A mount: the type of its file system, the directory of it that is mounted, where, and its options."""
+    """A mount: its file system type, that file system's mounted directory, the mount point, and options."""
 
     kind: str
     root: str
@@ -207,7 +207,7 @@ class Mount(NamedTuple):
 
 
 def mounts(path: str = "/proc/self/mountinfo") -> Iterator[Mount]:
-    """Yield every mount of a process, in the order made; none where they cannot be read."""
+    """Yield every mount of a process, in order of mounting; none if they cannot be read."""
     with contextlib.suppress(OSError), open(path, encoding="utf-8", errors="surrogateescape") as file:
         for line in file:
             before, _, after = line.partition(" - ")
@@ -217,7 +217,7 @@ def mounts(path: str = "/proc/self/mountinfo") -> Iterator[Mount]:
 
 
 def file_system_of(path: str) -> str:
-    """Return the type of the file system a path is on, empty where that is not known."""
+    """Return the type of the file system that a path is on; empty if unknown."""
     below = os.path.realpath(path) + "/"
     around = [mount for mount in mounts() if below.startswith(mount.point.rstrip("/") + "/")]
     return max(reversed(around), key=lambda mount: len(mount.point)).kind if around else ""

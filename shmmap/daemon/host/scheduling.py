@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a warm request does not wait for a loader: short time slices for the loop, a lower weight for loaders.
+"""Scheduling that keeps warm requests fast: short time slices for the loop, less weight for loaders.
 
-On Linux 6.12 and later a thread of the ordinary policy may choose its time slice.  One with a shorter slice
-than the thread that runs on the core preempts it as soon as it wakes; with equal ones it waits
-until that slice ends, which is 1 to 3 ms, and niceness does not change that.  Measured on two cores
-while layers are built: p99 of warm requests 0.3 ms instead of 0.5 to 1.2 ms, idle 0.1 ms.  Threads and
-processes inherit it.  Older kernels do not know it: nothing changes there.
+On Linux 6.12 and later, a thread of the ordinary policy may choose its time slice.  A thread with a shorter
+slice than the running one preempts it on waking; with equal slices it waits until the slice ends, 1 to 3 ms,
+whatever its nice value.  Measured on two cores while layers are built: p99 of warm requests 0.3 ms instead of
+0.5 to 1.2 ms, idle 0.1 ms.  Threads and child processes inherit the slice.  Older kernels ignore the request.
 
-A nice value counts only inside its scheduling group.  The units make one of the service (``CPUWeight=``), and
-there the loaders' nice values count.  Elsewhere every session is a group of its own (autogroup, sched(7)),
-and loaders have sessions of their own: `weigh_less` makes their groups nice.
+A nice value counts only inside its scheduling group.  The systemd units put the service in one group
+(``CPUWeight=``), in which the loaders' nice values count.  Elsewhere every session is its own group
+(autogroup, sched(7)), and loaders have their own sessions: `weigh_less` lowers the weight of these groups.
 """
 
 from __future__ import annotations
@@ -23,23 +22,23 @@ from typing import Final
 __all__ = ["SERVING_SLICE_NS", "slice_ns", "take_slices", "weigh_less"]
 
 SERVING_SLICE_NS: Final = 100_000
-"""The shortest that the kernel grants (``kernel/sched/syscalls.c``)."""
+"""The shortest slice that the kernel grants (``kernel/sched/syscalls.c``)."""
 
 LOADER_GROUP_NICENESS: Final = 5
-"""A third of the usual weight.  Measured on two cores, with a client that asks 500 times a second beside
+"""A third of the usual weight.  Measured on two cores, with a client that sends 500 requests a second during
 loads: at 0, 3, 5, 7 and 10 the p99 of warm requests is 3.6, 3.7, 3.1, 2.5 and 1.9 ms, and loads take 1, 1.1,
-1.1, 1.3 and 1.5 times as long; beside a busy program 1.4 times at 5, 2.7 at 10.  In the unit's group, with
-nice values alone, p99 is 2.8 instead of 4.5 ms, and loads take 1.15 times as long.  Groups within it for
-daemon and loaders, of weights 100 and 11, bring the same."""
+1.1, 1.3 and 1.5 times as long; next to a busy program 1.4 times at 5, 2.7 at 10.  In the unit's group, with
+nice values alone, p99 is 2.8 instead of 4.5 ms, and loads take 1.15 times as long.  Separate groups in it for
+daemon and loaders, with weights 100 and 11, give the same result."""
 
 _SYSCALLS: Final = {"x86_64": (314, 315), "aarch64": (274, 275)}  # sched_setattr, sched_getattr
 _ATTRIBUTES: Final = struct.Struct("=IIQiIQQQ")  # struct sched_attr, first version (linux/sched/types.h)
 
 
 def take_slices(nanoseconds: int) -> bool:
-    """Ask for time slices of this length for the calling thread and what it starts; 0 for the usual ones.
+    """Request time slices of this length for the calling thread and its children; 0 restores the default.
 
-    Policy and niceness stay as they are; under another policy than the ordinary one nothing is asked.
+    Policy and nice value stay unchanged; threads of other policies than the ordinary one are left alone.
     Returns whether the kernel agreed.
     """
     numbers = _SYSCALLS.get(platform.machine())
@@ -53,7 +52,7 @@ def take_slices(nanoseconds: int) -> bool:
 
 
 def slice_ns() -> int:
-    """Return the calling thread's time slice as the kernel reports it; 0 where it does not."""
+    """Return the calling thread's time slice as the kernel reports it; 0 if it reports none."""
     numbers = _SYSCALLS.get(platform.machine())
     if numbers is None:
         return 0
@@ -64,11 +63,11 @@ def slice_ns() -> int:
 
 
 def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") -> bool:
-    """Lower the weight of this process's session against all others on the machine.
+    """Lower the weight of this process's session relative to all others on the machine.
 
     Return True if nothing is left to do, also if the kernel has no such groups or if control groups divide
-    the processors instead.  Return False if the kernel must be asked again: it accepts ten such changes a
-    second from all processes together, except from root.
+    the processors instead.  Return False if the kernel must be asked again: except from root, it accepts only
+    ten such changes a second from all processes together.
 
     Parameters
     ----------
@@ -78,7 +77,7 @@ def weigh_less(niceness: int = LOADER_GROUP_NICENESS, proc: str = "/proc/self") 
         Directory with ``autogroup`` of this process.
     """
     if os.getsid(0) != os.getpid():
-        return True  # the group is another process's, too
+        return True  # the group belongs to another process, too
     try:
         fd = os.open(f"{proc}/autogroup", os.O_WRONLY | os.O_CLOEXEC)
         try:

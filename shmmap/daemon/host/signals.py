@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals: what each means to the daemon, and how it takes them while it starts and while it serves."""
+"""Signals: their meanings, and their handling while the daemon starts and while it serves."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ __all__ = ["KEEP_SIGNAL", "RELOAD_SIGNAL", "STOP_SIGNALS", "ServingSignals", "St
 
 STOP_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
 KEEP_SIGNAL: Final = signal.SIGUSR1
-"""Ends the daemon and leaves the segments to the next run: see `shmmap.daemon.main`."""
+"""Ends the daemon and leaves the segments to the next run, see `shmmap.daemon.main`."""
 RELOAD_SIGNAL: Final = signal.SIGHUP
-_libc: Final = ctypes.CDLL(None)  # found now: it must be quick when signals pile up
+_libc: Final = ctypes.CDLL(None)  # loaded early: the call must be quick when signals pile up
 _ALL: Final = (*STOP_SIGNALS, KEEP_SIGNAL, RELOAD_SIGNAL)
 
 
 def _belongs_to_terminal() -> bool:
-    """Whether a terminal started this process, and neither nohup nor a service manager keeps it."""
+    """Whether a terminal started this process, and neither nohup nor a service manager detached it."""
     if os.getpid() == 1 or "NOTIFY_SOCKET" in os.environ:
         return False
     if os.environ.get("SYSTEMD_EXEC_PID") == str(os.getpid()):
@@ -33,14 +33,14 @@ def _belongs_to_terminal() -> bool:
 
 
 class StartSignals:
-    """Signals while the daemon starts: stop means unwinding at once, a reload waits until it serves.
+    """Signal handling during the start: a stop raises at once, a reload is kept until the daemon serves.
 
-    Masks would not do: they are a thread's, and libraries have threads of their own.
+    Signal masks are not enough: they apply to one thread, and libraries have their own threads.
 
     Attributes
     ----------
     hangup_stops : bool
-        SIGHUP says that the terminal is closed that the daemon belongs to, and stops it.
+        Whether SIGHUP means that the daemon's terminal was closed, and stops the daemon.
     """
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ class StartSignals:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Hold a stop back while something takes a name that nothing would remove yet."""
+        """Delay a stop while a name is created that nothing would remove yet."""
         self._held = True
         try:
             yield
@@ -75,18 +75,18 @@ class StartSignals:
         self.raise_if_stopped()
 
     def raise_if_stopped(self) -> None:
-        """Unwind if a stop has come that was held, or that Python ignored."""
+        """Raise if a stop has arrived that was delayed, or that Python ignored."""
         if self._stop:
             raise SystemExit(0)
 
 
 class ServingSignals:
-    """Signals while the daemon serves: its loop reads them from a descriptor, handlers do nothing.
+    """Signal handling while the daemon serves: the loop reads signals from a descriptor, handlers do nothing.
 
     Attributes
     ----------
     fd
-        Readable when a signal has come: call `take` then.
+        Readable when a signal has arrived: call `take` then.
     """
 
     def __init__(self) -> None:
@@ -99,10 +99,10 @@ class ServingSignals:
         self._before = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
 
     def take(self) -> list[signal.Signals]:
-        """Return what came since, the announcement of a restart first.
+        """Return the signals since the last call, the announcement of a restart first.
 
-        Of signals that were pending together the kernel runs the last one's handler first: what came
-        with the announcement came after it.
+        Of signals pending together, the kernel runs the last one's handler first, so signals read together
+        with the announcement were sent after it.
         """
         try:
             numbers = self._ours.recv(64)
@@ -118,9 +118,10 @@ class ServingSignals:
 
 
 def ignore_signals() -> None:
-    """Ignore signals that stop the daemon: from here on it ends by itself."""
+    """Ignore the signals that stop the daemon: from here on it exits by itself."""
     numbers = (*STOP_SIGNALS, KEEP_SIGNAL)
-    for number in numbers:  # the kernel first: Python complains of one that comes while its handler changes
+    # in the kernel first: Python complains of a signal that arrives while its handler changes
+    for number in numbers:
         _libc.signal(number, 1)  # SIG_IGN
     for number in numbers:
         signal.signal(number, signal.SIG_IGN)

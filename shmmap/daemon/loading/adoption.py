@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a previous run of the daemon left in the shared-memory directory: taken over, watched or removed.
+"""Takes over, watches or removes the segments that a previous run left in the shared-memory directory.
 
-Every name of the instance is looked at once, before anything is served:
+Each file name of the instance is examined once, before anything is served:
 
-- a segment that is published, ours, whole by its header, and of the version its cell has in the map
-  now is *adopted*: it serves again as soon as a worker has compared its bytes with their checksums;
-- one whose version is not known yet, because the page of the map that its box lies in is not here, is
-  *deferred*: it keeps its name, its bytes count, and it is judged when the page comes;
-- any other segment that a process still maps is kept as a retired one, known by name and cell, and is
-  freed when its last reader unmaps it;
-- the rest is removed.  What this user may not remove (another account's file under one of our
-  names) is ignored and never served.
+- a published segment of this user, with a valid header and the version that its cell has in the map now,
+  is *adopted*: it is served again as soon as a worker has compared its bytes with their checksums;
+- a segment whose version is not known yet, because the page of the map with its box is missing, is
+  *deferred*: it keeps its name, its bytes count, and it is judged when the page arrives;
+- any other segment that a process still maps is kept as a retired one, by name and cell, and is freed when
+  its last reader unmaps it;
+- all others are removed.  Files that this user may not remove (another account's file under a name of
+  this instance) are ignored and never served.
 """
 
 from __future__ import annotations
@@ -42,25 +42,23 @@ __all__ = ["Adoption"]
 NOT_IN_MAP: Final = "its cell is not in the map"
 CHANGED: Final = "its cell, or one around it, has changed"
 UNDECIDED: Final = (NOT_IN_MAP, CHANGED)
-"""Reasons that may pass when more of the map is known."""
+"""Reasons for rejection that may disappear when more of the map is known."""
 ADOPTED: Final = 0.5 * BACKGROUND
-"""Priority of pages that segments of an earlier run are judged by: behind all that a client waits for."""
+"""Priority of pages needed to judge an earlier run's segments: after everything that a client waits for."""
 
 
 @dataclass(eq=False, slots=True)
 class Adoption:
-    """Takes over what is in the directory under an instance's name."""
+    """Takes over the files in the directory that have the instance's name."""
 
     cache: CellCache
     loads: Loads
     misplaced: MisplacedCells
-    _deferred: dict[str, tuple[Box, int]] = field(
-        default_factory=dict
-    )  # where to look, and the bytes, by name
-    _by_page: dict[int, list[str]] = field(default_factory=dict)  # names, by a page that they wait for
+    _deferred: dict[str, tuple[Box, int]] = field(default_factory=dict)  # area to look in, and bytes, by name
+    _by_page: dict[int, list[str]] = field(default_factory=dict)  # names by the page that they wait for
 
     def take_over(self, now_s: float) -> None:
-        """Look at every name once."""
+        """Examine every name once."""
         counts = dict.fromkeys(("taken_over", "set_aside", "still_in_use", "dropped"), 0)
         directory, instance = self.cache.directory, self.cache.instance
         for name in directory.names(segment_prefix(instance)):
@@ -71,12 +69,12 @@ class Adoption:
             log.info("leftover segments", **counts)
 
     def pages_came(self, pages: Iterable[int], now_s: float) -> None:
-        """Judge what was deferred for pages that have come."""
+        """Judge the segments deferred for pages that have arrived."""
         for page in pages:
             self._judge(self._by_page.pop(page, ()), now_s)
 
     def map_changed(self, now_s: float) -> None:
-        """Judge what was deferred by the pages of another state of the map."""
+        """Judge deferred segments by the pages of another state of the map."""
         self._by_page.clear()
         self._judge(list(self._deferred), now_s)
 
@@ -90,27 +88,27 @@ class Adoption:
                 self._take(name, now_s)
 
     def close(self, *, keep: bool) -> None:
-        """Remove the names of what is still deferred, or leave them to the next run."""
+        """Remove the names of segments still deferred, or leave them to the next run."""
         if not keep:
             for name in self._deferred:
                 self._remove(name, "the daemon ends")
 
     def _absent_page(self, area: Box) -> int | None:
-        """Return a page of an area that is not here; None if all are."""
+        """Return a page of an area that is not in memory; None if all are."""
         pages = self.cache.pages
         if pages is None:
             return None
         return next((page for page in pages.of_area(area) if not pages.is_here(page)), None)
 
     def _wait_for_page(self, name: str, area: Box) -> bool:
-        """Let a segment wait for one absent page of its area; False if none is absent."""
+        """Let a segment wait for one missing page of its area; return False if none is missing."""
         page = self._absent_page(area)
         if page is not None:
             self._by_page.setdefault(page, []).append(name)
         return page is not None
 
     def _may_become_known(self, resident: Resident) -> Box | None:
-        """Return the area by which a segment is judged, if pages of it are absent; else None."""
+        """Return the area by which a segment is judged if pages of it are missing; else None."""
         catalogue, layers = self.cache.catalogue, self.cache.layers
         if catalogue.complete or is_retired(resident.name):
             return None
@@ -129,7 +127,7 @@ class Adoption:
             pages.want(pages.of_area(area), ADOPTED)
 
     def _take(self, name: str, now_s: float) -> str:
-        """Decide about a name; returns what became of it."""
+        """Decide about a name; return what was done with it."""
         directory = self.cache.directory
         try:
             fd = directory.open(name)
@@ -156,7 +154,7 @@ class Adoption:
     # --- judging ------------------------------------------------------------------------------
 
     def _look(self, fd: int, name: str, now_s: float) -> tuple[Resident, int, str]:
-        """Return a leftover as its header describes it, its points outside, and why it cannot be served."""
+        """Return a segment as its header describes it, its points outside, and why it cannot be served."""
         live_name, nbytes = name.removesuffix(retired_name("")), measured_bytes(fd)
         unknown = Resident(live_name, Key("", ""), 0, nbytes, 0, (0.0,) * 4, 0.0, 0.0, checked=False)
         status = os.fstat(fd)
@@ -175,7 +173,7 @@ class Adoption:
         return resident, header.outside_points, self._why_not(name, status, header, resident)
 
     def _why_not(self, name: str, status: os.stat_result, header: SegmentHeader, resident: Resident) -> str:
-        """Return why a whole segment cannot be served; empty if it can."""
+        """Return why a complete segment cannot be served; empty if it can."""
         catalogue, ledger, layers = self.cache.catalogue, self.cache.ledger, self.cache.layers
         if is_retired(name):
             return "it was retired"
@@ -208,7 +206,7 @@ class Adoption:
             os.fchown(fd, -1, self.cache.gid)
         os.fchmod(fd, self.cache.mode)
         index = self.cache.index_of(resident.key.cell_id)
-        assert index is not None  # noqa: S101  _why_not has found it
+        assert index is not None  # noqa: S101  checked in _why_not
         self.cache.adopt(resident, index)
         if outside:
             self.misplaced.note(resident.key.cell_id, index, outside)
@@ -218,7 +216,7 @@ class Adoption:
         reclaimer = self.cache.reclaimer
         try:
             return os.fstat(fd).st_uid == os.geteuid() and reclaimer.pins.is_used_elsewhere(fd)
-        except OSError:  # nothing that has leases
+        except OSError:  # a file system without leases
             return False
 
     def _remove(self, name: str, why: str) -> None:
@@ -226,6 +224,6 @@ class Adoption:
         try:
             directory.unlink(name)
         except OSError as error:
-            # in a sticky directory only a file's owner may remove it; a directory is no segment
+            # in a sticky directory only the owner may remove a file; a directory is not a segment
             report = log.info if error.errno == errno.EISDIR else log.warning
             report("leftover not removed", name=name, unusable=why, error=error.strerror)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Absent cells: what is wanted, which load comes next, what is under way, what failed.
+"""Absent cells: which are wanted, which load is next, which are running, and which failed.
 
-Processes that ask take turns, and of each one's loads the nearest comes first: however many cells one process
-asks for, another one's cells do not wait for more than a fair share of them.  Turns are by the time that
-loaders spend, as `shmmap.daemon.transport.inbox` has them by that of the loop; until a load has ended it
-counts by its bytes.  What no client waits for (checks of adopted segments, pinned cells) comes when nothing
-else is queued.
+Processes take turns, and of each process's loads the nearest comes first: however many cells one process asks
+for, the cells of another wait only for a fair share of them.  Turns are counted in loader time, as
+`shmmap.daemon.transport.inbox` counts them in the loop's time; a load that has not ended counts by its bytes.
+Loads that no client waits for (checks of adopted segments, pinned cells) come when nothing else is queued.
 """
 
 from __future__ import annotations
@@ -24,21 +23,21 @@ from shmmap.segment.version import Stamp
 __all__ = ["BACKGROUND", "LoadQueue", "Loads"]
 
 BACKGROUND: Final = 1e12
-"""From this priority on no client waits for a load."""
+"""Priority from which on no client waits for a load."""
 PREFETCH: Final = 2.0 * BACKGROUND
-"""From this priority on no client has asked for a load yet; and the asker of those."""
+"""Priority from which on no client has asked for a load yet; also the asker of such loads."""
 FIRST_RETRY_S: Final = 1.0
 LAST_RETRY_S: Final = 30.0
 BUDGET_RETRY_S: Final = 0.1
 MAX_FAILURES: Final = 1 << 14
-"""Failures of a kind that are remembered: requests for always new layers must not fill the memory."""
+"""Failures remembered per kind: requests for always new layers must not fill the memory."""
 LOAD_S: Final = 1e-4
-"""Time charged to a load besides that for its bytes: many tiny cells are work, too."""
+"""Time charged to a load in addition to its bytes: many tiny cells are work, too."""
 BYTE_S: Final = 1e-9
 LOOKED_BEHIND: Final = 8
-"""Loads of each kind of an asker that are looked at to know what room is needed soon."""
+"""Loads of each kind of an asker that are examined to estimate the memory needed soon."""
 MAX_REMEMBERED: Final = 1024
-"""Askers whose clocks are remembered; those forgotten when idle lose a debt of loads that have ended."""
+"""Askers whose clocks are remembered; forgetting an idle asker cancels the debt of its finished loads."""
 
 _Heap = list[tuple[float, int, Load]]
 
@@ -47,7 +46,7 @@ _Heap = list[tuple[float, int, Load]]
 class _Asker:
     """One asker's loads by priority, computed layers in the second heap.
 
-    ``clock_s`` is the time of loaders that it was given, ``running`` how many of its loads are under way.
+    ``clock_s`` is the loader time it has used, ``running`` the number of its loads under way.
     """
 
     clock_s: float
@@ -57,9 +56,9 @@ class _Asker:
 
 
 class LoadQueue:
-    """Loads that wait for a worker or for room; one is here from `push` to `discard`.
+    """Loads that wait for a worker or for memory; a load is queued from `push` to `discard`.
 
-    ``changes`` counts loads that came, went or were moved forward: another one may be next.
+    ``changes`` counts loads added, removed or moved forward: the next load may be another one.
     """
 
     def __init__(self) -> None:
@@ -73,12 +72,12 @@ class LoadQueue:
         return len(self._loads)
 
     def count(self, asker: Hashable) -> int:
-        """Return how many loads of an asker wait."""
+        """Return how many loads of an asker are queued."""
         mine = self._askers.get(asker)
         return 0 if mine is None else sum(number in self._loads for number in mine.best)
 
     def push(self, load: Load, priority: float, asker: Hashable) -> None:
-        """Queue a load for an asker; asked for again, it is never moved back."""
+        """Queue a load for an asker; queued again, it may move forward but never back."""
         self.changes += load.number not in self._loads
         self._loads[load.number] = load
         mine = self._askers.get(asker)
@@ -96,7 +95,7 @@ class LoadQueue:
         self._loads.pop(load.number, None)
 
     def started(self, load: Load) -> None:
-        """Remove a load that begins, and charge it to the asker whose turn it was; `ended` has to follow."""
+        """Remove a load that starts, and charge it to the asker whose turn it was; `ended` has to follow."""
         self.discard(load)
         load.payer, load.charged_s = self._chosen, LOAD_S + load.estimate * BYTE_S
         chosen = self._askers.get(self._chosen)
@@ -105,7 +104,7 @@ class LoadQueue:
             chosen.clock_s += load.charged_s
 
     def ended(self, load: Load) -> None:
-        """Charge a load that has ended, or goes back, for what it took."""
+        """Charge a load that has ended, or is put back, for the time it took."""
         payer = self._askers.get(load.payer)
         if payer is not None:
             payer.running -= 1
@@ -113,7 +112,7 @@ class LoadQueue:
         load.spent_s = 0.0
 
     def next(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """Return the load that comes next, of those that are computed, that are not, or of all; or None."""
+        """Return the next load among points, computed layers, or both; None if there is none."""
         best: tuple[bool, float, float, int] | None = None
         found: Load | None = None
         for asker, mine in list(self._askers.items()):
@@ -131,7 +130,7 @@ class LoadQueue:
         return found
 
     def bytes_behind(self) -> int:
-        """Return the sum of the estimates of some loads that come after what `next` has just found."""
+        """Return the sum of the estimates of some loads that follow the one `next` has just returned."""
         chosen = self._askers.get(self._chosen)
         if chosen is None:
             return 0
@@ -143,13 +142,13 @@ class LoadQueue:
         )
 
     def _is_square(self, mine: _Asker) -> bool:
-        """Whether an asker that waits for nothing can be forgotten: none else waits, or it owes no time."""
+        """Whether an asker without queued loads can be forgotten: it owes no time, or nothing else waits."""
         if mine.running:
             return False
         return mine.clock_s <= self._clock_s or not self._loads or len(self._askers) > MAX_REMEMBERED
 
     def _clean(self, mine: _Asker) -> None:
-        """Drop what no longer waits from the front, and from everywhere once it is the greater part."""
+        """Drop loads no longer queued from the front, and from everywhere once they are the majority."""
         for heap in mine.heaps:
             while heap and heap[0][1] not in self._loads:
                 mine.best.pop(heapq.heappop(heap)[1], None)
@@ -163,15 +162,15 @@ class LoadQueue:
 
 
 class Loads:
-    """What is wanted, queued and under way, and what failed; without any I/O.
+    """Loads that are wanted, queued and running, and those that failed; without any I/O.
 
     Parameters
     ----------
     ledger
-        Promises the bytes of what is under way.
+        Reserves the bytes of running loads.
 
-    ``by_key`` has the loads that have not ended; ``failures`` why the last load of a key failed, until it
-    succeeds or the cause may have passed.
+    ``by_key`` contains the loads that have not ended; ``failures`` contains why the last load of a key
+    failed, until a load succeeds or the cause may have passed.
     """
 
     def __init__(self, ledger: Ledger) -> None:
@@ -183,16 +182,16 @@ class Loads:
         self._numbers = 0
 
     def __len__(self) -> int:
-        """How many loads wait for a worker or for room."""
+        """Return how many loads are queued."""
         return len(self._queue)
 
     @property
     def changes(self) -> int:
-        """How often it may have changed which load comes next."""
+        """Number of changes after which the next load may be another one."""
         return self._queue.changes
 
     def queued_of(self, asker: Hashable) -> int:
-        """Return how many of an asker's loads wait."""
+        """Return how many of an asker's loads are queued."""
         return self._queue.count(asker)
 
     def want(
@@ -204,10 +203,10 @@ class Loads:
         *,
         computed: bool | None = None,
     ) -> Load:
-        """Queue a load, or move a queued one forward; however many ask, there is one load.
+        """Queue a load, or move a queued one forward; all askers of a key share one load.
 
-        Askers take turns, in `LoadQueue`.  ``computed`` says that it may take long; by default what is
-        not ``points`` does.
+        Askers take turns, in `LoadQueue`.  ``computed`` means that the load may take long; by default, that
+        is every layer except ``points``.
         """
         load = self.by_key.get(key)
         if load is None:
@@ -225,35 +224,35 @@ class Loads:
         return load
 
     def prefetch(self, key: Key, estimate: int, needed_in_s: float, *, computed: bool | None = None) -> Load:
-        """Queue a load that no client has asked for yet, behind everything that clients ask for."""
+        """Queue a load that no client has asked for yet, after all loads that clients ask for."""
         load = self.want(key, estimate, PREFETCH + needed_in_s, PREFETCH, computed=computed)
         load.wanted, load.prefetch = False, True
         return load
 
     def is_promised(self, key: Key) -> bool:
-        """Whether a load of this is on its way, more than a look at the file that it failed for."""
+        """Whether a load of a key is on its way, and not merely a check of the file that failed."""
         load = self.by_key.get(key)
         return load is not None and load.unless is None
 
     def check(self, resident: Resident) -> None:
-        """Queue the check of a segment of a previous run, behind everything that clients ask for."""
+        """Queue the check of a previous run's segment, after all loads that clients ask for."""
         load = self.want(resident.key, 0, float("inf"))
         load.adopted, load.wanted = resident, False
 
     def next_queued(self, *, points: bool = True, layers: bool = True) -> Load | None:
-        """Return the nearest load of the asker whose turn it is, of the kinds that a worker can take."""
+        """Return the nearest load of the asker whose turn it is, of the kinds that a worker can take now."""
         while (load := self._queue.next(points=points, layers=layers)) is not None:
             if self.by_key.get(load.key) is load and not load.running:
                 return load
-            self._queue.discard(load)  # given up meanwhile
+            self._queue.discard(load)  # cancelled in the meantime
         return None
 
     def bytes_behind(self) -> int:
-        """Bytes of some loads that come after what `next_queued` has just returned."""
+        """Return the bytes of some loads that follow the one `next_queued` has just returned."""
         return self._queue.bytes_behind()
 
     def start(self, load: Load, now_s: float) -> bool:
-        """Reserve the load's bytes and count it as running; False if they do not fit."""
+        """Reserve the load's bytes and count it as running; return False if they do not fit."""
         if not self._ledger.reserve(load.estimate):
             return False
         self._queue.started(load)
@@ -261,18 +260,18 @@ class Loads:
         return True
 
     def grow(self, load: Load, nbytes: int) -> bool:
-        """Raise a running load's reservation to ``nbytes``; False if that does not fit."""
+        """Raise a running load's reservation to ``nbytes``; return False if that does not fit."""
         extra = max(0, nbytes - load.reserved)
         fits = self._ledger.reserve(extra)
         load.reserved += extra if fits else 0
         return fits
 
     def defer(self, load: Load) -> None:
-        """Take a load that cannot be begun yet out of the queue, until `requeue`."""
+        """Take a load that cannot start yet out of the queue, until `requeue`."""
         self._queue.discard(load)
 
     def requeue(self, load: Load) -> None:
-        """Put a running load back (its worker died before its turn, or what it read is outdated)."""
+        """Put a running load back (its worker died before it began, or the data read is outdated)."""
         self._take_back(load)
         self._queue.push(load, load.priority, load.asker)
 
@@ -284,7 +283,7 @@ class Loads:
             self._queue.ended(load)
 
     def finish(self, load: Load, failure: Failure | None = None) -> None:
-        """End a load; ``failure``, if there is one, stands until a load succeeds or it is cleared."""
+        """End a load; a ``failure`` stays until a load of the key succeeds or it is cleared."""
         self._take_back(load)
         self._queue.discard(load)
         if self.by_key.get(load.key) is load:
@@ -294,7 +293,7 @@ class Loads:
                 self._remember(load.key, failure)
 
     def failure(self, key: Key, code: str, message: str, stamp: Stamp | None, now_s: float) -> Failure:
-        """Describe why a load failed; the back-off doubles when it failed for the same reason before."""
+        """Return why a load failed; the back-off doubles if the previous failure had the same reason."""
         old = self.failures.get(key)
         if code in SPACE_CODES:
             delay_s = BUDGET_RETRY_S
@@ -312,7 +311,7 @@ class Loads:
             self._forget_failure(oldest, failure.code)
 
     def cancel(self, key: Key) -> None:
-        """Drop a queued load and a standing failure of a key (its cell left the map)."""
+        """Drop a queued load and a remembered failure of a key (its cell left the map)."""
         self.failures.pop(key, None)
         load = self.by_key.get(key)
         if load is not None and not load.running:
@@ -320,13 +319,13 @@ class Loads:
             del self.by_key[key]
 
     def forget_refusals(self) -> None:
-        """Forget standing failures for lack of memory: there may be room now."""
+        """Forget failures for lack of memory: there may be room now."""
         for code in SPACE_CODES:
             for key in self._keys_failed.pop(code, ()):
                 self._forget_failure(key, code)
 
     def forget_failures(self) -> None:
-        """Forget all other standing failures: what all of them came from has passed."""
+        """Forget all other failures: their common cause has passed."""
         for code in [code for code in self._keys_failed if code not in SPACE_CODES]:
             for key in self._keys_failed.pop(code):
                 self._forget_failure(key, code)

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cell is fetched next before a client asks: of all clients' paths, what is needed first; no I/O.
+"""Choice of the cell to prefetch next: on all clients' paths, the one needed first; without any I/O.
 
-The area that a client asks for is moved along its path, a step at a time: cells that come into it at a step
-are needed when the client is there.  The path is the route that the client sent; without one, and beyond its
-end, straight ahead and, a little later, to both sides of that, because it is unknown where the client turns;
-the longer it has come straight ahead, the farther.  What it will ask for along a kilometre is not kept: the
-path is looked over repeatedly (a *pass*), and what is not in memory is wished for.  So a wish is never
-out of date, whatever moves, changes or is evicted meanwhile.
+The area that a client asks for is moved along its path in steps: cells that enter it at a step are needed
+when the client arrives there.  The path is the route that the client sent.  Without a route, and beyond its
+end, the path continues straight ahead and, a little later, to both sides, because the client may turn; the
+longer the client has moved straight ahead, the farther.  Cells needed along a kilometre are not stored: the
+path is examined repeatedly (a *pass*), and absent cells become wishes.  So no wish is ever outdated, whatever
+moves, changes or is evicted in the meantime.
 
 `Prefetcher` asks for a wish when no demand waits for a loader (`Prefetch.next`), and reports how loads ended.
-How far ahead is looked, in seconds of travel, is the longest time without the origin that is to be bridged,
-and what a load takes, slow ones included.  Where the path is unknown, an outage is prepared for only after
-there was one, or on a long straight: much of that is fetched in vain.
+The look-ahead, in seconds of travel, is the longest outage of the origin to be bridged plus the time of a
+load, slow loads included.  Where the path is unknown, the daemon prepares for an outage only after one has
+occurred, or on a long straight: most of those cells would be fetched in vain.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ __all__ = ["PASS_S", "URGENT_S", "ClientPath", "LookAhead", "OriginHealth", "Pre
 
 
 LOADS: Final = 64
-"""Number of last loads from which the time of a load is estimated."""
+"""Number of recent loads from which the time of a load is estimated."""
 IN_A_ROW: Final = 4
-"""Loads that fail one after the other before the origin, not single files, is taken to be the cause."""
+"""Consecutive failed loads after which the origin, not single files, is taken to be the cause."""
 PROBE_S: Final = 0.5
-"""Interval at which one load is then tried."""
+"""Interval of trying one load while the origin is out."""
 
 
 @dataclass(eq=False, slots=True)
 class OriginHealth:
-    """State of the origin, as far as loads and other signs show.
+    """State of the origin, inferred from loads and other signs.
 
     Attributes
     ----------
     failed_in_a_row
         Loads that failed since the last success.
     waited_s
-        The longest of these, seconds: about how long nothing has answered.
+        Duration of the longest of these, seconds: roughly how long the origin has not answered.
     unreachable
-        Whether it is known from elsewhere that the origin does not answer.
+        Whether another check found that the origin does not answer.
     slow_s
-        Time that 5 % of the last loads exceeded; 0 before the first.
+        95th percentile of the durations of recent loads, seconds; 0 before the first.
     """
 
     failed_in_a_row: int = 0
@@ -66,13 +66,13 @@ class OriginHealth:
 
     @property
     def is_out(self) -> bool:
-        """Whether nothing can be loaded just now."""
+        """Whether no load can succeed at present."""
         return self.unreachable or self.failed_in_a_row >= IN_A_ROW
 
     def next_try_s(self) -> float:
-        """Until when nothing is tried; minus infinity unless nothing can be loaded.
+        """Time before which nothing is tried; minus infinity unless loads fail at present.
 
-        Loads may succeed although the origin does not answer: from the disk.
+        Loads from the disk may succeed although the origin does not answer.
         """
         return self._tried_s + PROBE_S if self.is_out and self.failed_in_a_row else -math.inf
 
@@ -81,11 +81,11 @@ class OriginHealth:
         self.failed_in_a_row, self.waited_s = 0, 0.0
 
     def tried(self, now_s: float) -> None:
-        """Note that a load begins."""
+        """Note that a load was begun."""
         self._tried_s = now_s
 
     def ended(self, took_s: float, *, failed: bool) -> bool:
-        """Note the end of a load; returns whether loads succeed again after an outage."""
+        """Note the end of a load; return whether loads succeed again after an outage."""
         if failed:
             self.failed_in_a_row += 1
             self.waited_s = max(self.waited_s, took_s)
@@ -99,25 +99,25 @@ class OriginHealth:
 
 
 PASS_S: Final = 2.0
-"""Interval at which a path is looked over from its beginning."""
+"""Interval at which a path is examined from its beginning."""
 SLOWEST_MPS: Final = 0.5
-"""A slower client stands; without a route it is unknown where it will go."""
+"""A slower client counts as standing; without a route its path is unknown."""
 MAX_AHEAD_M: Final = 5000.0
 MAX_CELLS: Final = 20_000
-"""Of an area with more cells nothing is fetched ahead."""
+"""Limit of an area's cells: for a larger area nothing is prefetched."""
 SPREAD_RAD: Final = 0.5
-"""Angle to both sides of straight ahead to which a client without a route is taken to turn."""
+"""Largest turn to either side that is assumed for a client without a route."""
 LATER_S: Final = 1.0
-"""Delay of what lies to the sides against what lies straight ahead."""
+"""Extra delay of cells to the sides compared with cells straight ahead."""
 LONG_STRAIGHT_M: Final = 500.0
-"""Longer than most streets of a town: for each metre that a client has come straight ahead beyond it, another
-one is looked ahead."""
+"""Length of a straight, longer than most streets of a town, beyond which each metre that a client has moved
+straight ahead extends the look-ahead by a metre."""
 BESIDE_M: Final = 2.0
-"""Distance that a client may be to either side of its route, which is the middle of a lane."""
+"""Allowed lateral distance of a client from its route, which is the middle of a lane."""
 
 
 class LookAhead(NamedTuple):
-    """Seconds to look ahead: along a route; straight ahead without one; to the sides of that."""
+    """Look-ahead in seconds: along a route; straight ahead without a route; to the sides of the path."""
 
     route_s: float
     straight_s: float
@@ -126,18 +126,18 @@ class LookAhead(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class ClientPath:
-    """One client's path, and the pass over it.
+    """One client's path, and the current pass over it.
 
     Attributes
     ----------
     motion
         How the client moves, kept up to date by its session.
     area, layers
-        What it asked for last.
+        Last requested area and layers.
     ahead_m
-        How far ahead the pass has come.
+        Distance that the pass has examined so far, metres.
     is_done
-        Whether the pass has come to the end of the look-ahead.
+        Whether the pass has reached the end of the look-ahead.
     """
 
     motion: Motion
@@ -153,12 +153,12 @@ class ClientPath:
 
     @property
     def pace_s(self) -> float:
-        """Seconds that the client takes for a metre at its greatest recent speed."""
+        """Time that the client takes per metre at its greatest recent speed, seconds."""
         return 1.0 / max(self.motion.fastest_mps, SLOWEST_MPS)
 
     @property
     def moves(self) -> bool:
-        """Whether it is known where the client will be."""
+        """Whether the client moves, so that its future positions are known."""
         motion = self.motion
         return (motion.fastest_mps if motion.route is not None else motion.speed_mps) >= SLOWEST_MPS
 
@@ -170,7 +170,7 @@ class ClientPath:
         self._travelled_m, self._jumps = self.motion.travelled_m, self.motion.jumps
 
     def first(self) -> tuple[float, int] | None:
-        """Return what is needed next of what was found: in how many seconds, and its index."""
+        """Return the cell found in this pass that is needed next: seconds until then, and its index."""
         if not self._found or self.has_jumped:
             return None
         ahead_m, index = self._found[0]
@@ -178,15 +178,15 @@ class ClientPath:
 
     @property
     def has_jumped(self) -> bool:
-        """Whether the client is somewhere else than where the pass began."""
+        """Whether the client's position has jumped since the pass began."""
         return self._jumps != self.motion.jumps
 
     def take(self) -> None:
-        """Drop the first one."""
+        """Drop the cell that `first` returns."""
         self._found.popleft()
 
     def look(self, catalogue: CatalogueView, ahead: LookAhead, step_m: float) -> None:
-        """Look a step further along the path."""
+        """Examine the next step along the path."""
         motion = self.motion
         if self.has_jumped:
             self.begin(self.began_s)
@@ -209,14 +209,14 @@ class ClientPath:
         self._inside = inside
 
     def _known(self, catalogue: CatalogueView, area: Area, needed_in_s: float) -> NDArray[np.intp]:
-        """Return cells of an area; have pages fetched that may have others, and keep those that are here."""
+        """Return the known cells of an area; request missing pages of it, and keep its loaded ones."""
         found, _known = catalogue.query(area, MAX_CELLS)
         if (pages := catalogue.pages) is not None and not catalogue.complete:
             pages.want(pages.of_area(area), PREFETCH + needed_in_s)
         return found
 
     def looks_s(self, ahead: LookAhead) -> float:
-        """Return how many seconds ahead is looked."""
+        """Return the look-ahead in seconds."""
         if self.motion.route is not None:
             return ahead.route_s
         return max(
@@ -224,7 +224,7 @@ class ClientPath:
         )
 
     def _end_m(self, ahead: LookAhead) -> float:
-        """Return how far ahead is looked, metres."""
+        """Return the look-ahead in metres."""
         speed = 1.0 / self.pace_s
         if self.motion.route is None:
             return min(speed * self.looks_s(ahead), MAX_AHEAD_M)
@@ -233,17 +233,17 @@ class ClientPath:
 
     @property
     def _left_m(self) -> float:
-        """Length of the route before the client, metres."""
+        """Remaining length of the route ahead of the client, metres."""
         route = self.motion.route
         return 0.0 if route is None else route.length_m - self.motion.along_m
 
     @property
     def _wider_m(self) -> float:
-        """By how much the area is widened: clients do not drive in the very middle of a lane."""
+        """Margin added to the area, metres: clients do not drive in the exact middle of a lane."""
         return BESIDE_M if self.motion.route is not None else 0.0
 
     def _around(self, catalogue: CatalogueView, ahead_m: float, sides: bool) -> NDArray[np.intp]:
-        """Return cells that the client may need after this distance; ``sides``: also beside the path."""
+        """Return cells that the client may need after this distance; with ``sides`` also beside the path."""
         motion, left_m = self.motion, self._left_m
         x, y, heading = motion.x, motion.y, math.atan2(motion.vy, motion.vx)
         if motion.route is not None:
@@ -263,21 +263,21 @@ class ClientPath:
 
 
 COMPARED_PER_TURN: Final = 64
-"""Paths, and cells on them, that are compared in one call: with more clients a wish takes some turns."""
+"""Paths, and cells on them, compared in one call; with more clients, choosing a wish takes several turns."""
 LOOKS_PER_WISH: Final = 2
-"""Steps along paths that are looked at for one wish: a fifth of a millisecond."""
+"""Steps along paths examined for one wish: a fifth of a millisecond."""
 SLOW_LOADS: Final = 1.6
-"""Loads, one after the other, that a cell may have to wait for."""
+"""Consecutive loads that a cell may have to wait for."""
 SLACK_S: Final = 3.0
-"""Beside what is measured: requests, and looks along the path, come a step of the window apart."""
+"""Margin added to the measured times, since requests and steps along the path are discrete."""
 SPARE: Final = 1.25
-"""What was used up in an outage comes back slowly; until it has, cells come just in time or a little late."""
+"""Factor on the outage's duration: cells used up in one outage are replaced only slowly."""
 AFTER_S: Final = 2.0
-"""Until loads are known to succeed again after they did not, and the first ones have come."""
+"""Time until loads are known to succeed again after an outage, and the first cells have arrived."""
 GUESSED_S: Final = 10.0
-"""Longest time for which a client without a route is taken to go straight ahead."""
+"""Longest time for which a client without a route is assumed to move straight ahead."""
 URGENT_S: Final = 2.0
-"""What is needed sooner counts as a demand: it also takes the loader that is kept for those."""
+"""A cell needed sooner counts as a demand: it may also use the loader places kept free for demands."""
 SHORTEST_STEP_M: Final = 5.0
 
 
@@ -290,23 +290,23 @@ class Wish(NamedTuple):
 
 
 class Prefetch:
-    """Chooses what is fetched ahead.
+    """Chooses the cells to prefetch.
 
     Parameters
     ----------
     is_absent
-        Whether a layer of a cell, by index, is neither in memory nor being loaded, and may be tried.
+        Whether a layer of a cell, by index, is neither in memory nor being loaded, and may be loaded.
     outage_tolerance_s
-        Outage of the origin that clients must not notice, seconds.
+        Duration of an outage of the origin that clients must not notice, seconds.
 
     Attributes
     ----------
     paths : dict
-        By client.
+        Paths by client.
     health
         State of the origin.
     more : bool
-        Whether asking again at once may bring a wish, though the last time brought none.
+        Whether asking again at once may return a wish although the last call returned none.
     """
 
     def __init__(
@@ -323,13 +323,13 @@ class Prefetch:
         self.more = False
         self._out_since_s = math.inf
         self._away_s = 0.0
-        self._uncompared: list[ClientPath] = []  # not compared yet for the next wish
-        self._behind: ClientPath | None = None  # of the compared ones: known least far
-        self._chosen: ClientPath | None = None  # ... and the one with the first wish
+        self._uncompared: list[ClientPath] = []  # paths not compared yet for the next wish
+        self._behind: ClientPath | None = None  # among the compared paths: the one examined least far
+        self._chosen: ClientPath | None = None  # ... and the one with the earliest wish
         self._best: Wish | None = None
 
     def follow(self, client: Hashable, motion: Motion, area: Area, layers: tuple[str, ...]) -> None:
-        """Fetch ahead for a client: how it moves, and what it asked for last."""
+        """Prefetch for a client, given its motion and its last requested area and layers."""
         path = self.paths.get(client)
         if path is None or path.motion is not motion:
             self.paths[client] = ClientPath(motion, area, layers)
@@ -337,7 +337,7 @@ class Prefetch:
             path.area, path.layers = area, layers
 
     def follow_like(self, other: Prefetch) -> None:
-        """Fetch ahead for the same clients as ``other``."""
+        """Prefetch for the same clients as ``other``."""
         for client in self.paths.keys() - other.paths.keys():
             del self.paths[client]
         for client, path in other.paths.items():
@@ -345,19 +345,19 @@ class Prefetch:
 
     @property
     def look_ahead(self) -> LookAhead:
-        """How far ahead is looked: what comes into reach later is not wished for yet."""
+        """Current look-ahead; cells beyond it are not wished for yet."""
         load_s = SLOW_LOADS * self.health.slow_s + SLACK_S
         route_s = load_s + SPARE * self._outage_tolerance_s + PASS_S + AFTER_S
         straight_s = load_s + min(self._outage_tolerance_s, self._away_s, GUESSED_S)
         return LookAhead(route_s, straight_s, load_s)
 
     def next(self, catalogue: CatalogueView, now_s: float) -> Wish | None:
-        """Return what is needed first of what is absent; None if nothing is, or not known yet (`more`)."""
+        """Return the absent cell that is needed first; None if there is none, or none known yet (`more`)."""
         self.more = False
         is_back = self._is_back(now_s)
         if is_back or catalogue is not self._catalogue:
             self._uncompared = []
-            # indices mean other cells now, or what was passed over because it had failed may be tried
+            # indices mean other cells now, or cells skipped for a failure may be tried
             self._catalogue = catalogue
             for path in self.paths.values():
                 path.begin(now_s)
@@ -381,11 +381,11 @@ class Prefetch:
         return None
 
     def restart(self) -> None:
-        """Begin all paths from the start: more of the map on them is known now."""
+        """Begin all paths from the start: more of the map along them is known now."""
         self._catalogue = None
 
     def _compare_some(self, now_s: float) -> bool:
-        """Compare some paths: which is known least far, which has the first wish; True after the last."""
+        """Compare some paths for the least examined one and the earliest wish; return True after the last."""
         if not self._uncompared:
             self._uncompared = list(self.paths.values())
             self._behind = self._chosen = self._best = None
@@ -411,9 +411,9 @@ class Prefetch:
         return not self._uncompared
 
     def _is_back(self, now_s: float) -> bool:
-        """Whether loads succeed again after an outage, whose length is noted."""
+        """Whether loads succeed again after an outage; note how long the outage was."""
         if self.health.is_out:
-            # loads fail only after a while: the server was already silent when they began
+            # loads fail after a delay: the server was already silent when they began
             self._out_since_s = min(self._out_since_s, now_s - self.health.waited_s)
             return False
         if self._out_since_s == math.inf:
@@ -430,7 +430,7 @@ class Prefetch:
             path.begin(now_s)
 
     def next_s(self, now_s: float) -> float:
-        """Return when to ask again although nothing happens."""
+        """Return when to ask again if nothing happens until then."""
         if not any(path.moves for path in self.paths.values()):
             return math.inf
         if self.health.is_out:
@@ -441,5 +441,5 @@ class Prefetch:
 
 
 def _is_before(path: ClientPath, wish: Wish) -> bool:
-    """Whether a path whose pass goes on may have an earlier wish than this one."""
+    """Whether an unfinished pass over a path may still find an earlier wish than the given one."""
     return path.ahead_m * path.pace_s < wish.needed_in_s

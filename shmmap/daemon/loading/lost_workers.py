@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Workers that died, could not start or took too long: only the cell they worked on fails."""
+"""Workers that died, could not start or took too long: only the cell that each worked on fails."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ __all__ = ["LostWorkers"]
 KILLED: Final = "signal SIGKILL"
 OUT_OF_MEMORY: Final = "out of memory"
 START_ATTEMPTS: Final = 3
-"""Loaders in a row that could not start before loads fail instead of waiting."""
+"""Consecutive failed starts of loaders before loads fail instead of waiting."""
 
 LOSSES_ALLOWED: Final = 3
-"""How often a load may lose its loader along with the loaders' parent: it may be what ends the parent."""
+"""How often a load may lose its loader because the parent ended: the load itself may be the cause."""
 
 
 @dataclass(eq=False, slots=True)
 class LostWorkers:
-    """Replaces workers, and requeues what they had not begun.
+    """Replaces lost workers, and requeues the jobs that they had not begun.
 
     Parameters
     ----------
     jobs
-        Loads that workers have, by job number.
+        Loads that workers are doing, by job number.
     fail
-        Called with a load, a code, a message, the state of the file it failed for, and the time.
+        Called with a load, a code, a message, the state of the file that failed, and the time.
     """
 
     pool: WorkerPool
@@ -50,7 +50,7 @@ class LostWorkers:
     oom_kills: int = field(default_factory=out_of_memory_kills)
 
     def ended(self, worker: Worker, how: str, now_s: float) -> None:
-        """Handle the end of a worker; ``how`` is for people, and empty where its parent took it along."""
+        """Handle the end of a worker; ``how`` is a text for people, and empty if its parent ended."""
         self.statistics.add("worker_crashes")
         if not worker.ready:
             self._could_not_start(worker, how, now_s)
@@ -62,7 +62,7 @@ class LostWorkers:
             self._vanished(worker, now_s)
 
     def _why_killed(self) -> str:
-        """Say what killed a loader: for lack of memory the kernel does, which is not its file's fault."""
+        """Return why a loader was killed, so that a file is not blamed for a lack of memory."""
         before, self.oom_kills = self.oom_kills, out_of_memory_kills()
         limit = memory_limit_bytes()
         allowed = f" (the control group allows {format_bytes(limit)})" if limit else ""
@@ -71,7 +71,7 @@ class LostWorkers:
         return f"the loader was killed ({KILLED}): by a person or a program"
 
     def end_overdue(self, now_s: float) -> None:
-        """Kill workers whose load, or whose start, took too long."""
+        """Kill workers whose load, or whose start, takes too long."""
         for worker in self.pool.overdue(now_s):
             if worker.ready:
                 self.statistics.add("loads_timed_out")
@@ -94,7 +94,7 @@ class LostWorkers:
                 self.loads.requeue(load)
 
     def _vanished(self, worker: Worker, now_s: float) -> None:
-        """Replace a worker whose parent ended: no job's fault, unless it happens repeatedly."""
+        """Replace a worker whose parent ended: no job is blamed, unless this happens repeatedly."""
         at_work = worker.at_work or next(iter(worker.queue), 0)
         for job in self.pool.remove(worker):
             self.room.forget(job.number)
@@ -108,7 +108,7 @@ class LostWorkers:
                 self.fail(load, "load_failed", f"{job.source.name}: its loaders vanish", None, now_s)
 
     def _replace(self, worker: Worker, code: str, why: str, now_s: float) -> None:
-        """Forget a worker that had begun: the job it worked on fails."""
+        """Remove a worker that had begun: its current job fails."""
         spent_s, at_work = now_s - worker.since_s, worker.at_work
         if worker.queue and not at_work:
             log.error("loader replaced", reason=why)
@@ -121,7 +121,7 @@ class LostWorkers:
                 log.error("loader replaced", path=job.source.name, reason=why)
                 if load is not None:
                     load.spent_s = spent_s
-                    # after a timeout the file is not looked at again: its file system may be what hangs
+                    # after a timeout the file is not accessed again: its file system may be what hangs
                     blamed = code == "load_failed" and not why.startswith(OUT_OF_MEMORY)
                     known = load.sources[0] if blamed and load.sources else None
                     self.fail(load, code, f"{job.source.name}: {why}", known, now_s)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Outages of a published map's store: noticed, bridged from the disk, and followed by another try.
+"""Outages of a published map's store: detected, bridged from the disk, and followed by retries.
 
-`DiskAhead` fetches onto the disk what does not fit in memory.  It looks along the same paths as `Prefetcher`,
-as far ahead, and begins where `Prefetcher` has no room.  It fetches objects of cells that are neither in
-memory nor on the disk, in the order in which they will be needed, and only while no load waits for a loader.
+`DiskAhead` fetches onto the disk cells that do not fit in memory.  It follows the same paths as `Prefetcher`,
+as far ahead, and begins where `Prefetcher` has no memory left.  It fetches the objects of cells that are
+neither in memory nor on the disk, in the order in which they will be needed, and only while no load waits for
+a loader.
 """
 
 from __future__ import annotations
@@ -26,24 +27,24 @@ __all__ = ["DiskAhead", "OriginWatch"]
 
 
 LOOK_S: Final = 0.25
-"""Interval of looking whether memory has room and whether loads wait, seconds."""
+"""Interval of checking whether memory has room and whether loads wait, seconds."""
 KEPT_S: Final = 60.0
 """How long an object is assumed to stay on the disk, seconds: the disk cache drops unused ones."""
 AGAIN_S: Final = 2.0
-"""Pause before an object that could not be fetched is tried again, seconds."""
+"""Delay before a failed fetch of an object is repeated, seconds."""
 MAX_KNOWN: Final = 1 << 16
 
 
 @dataclass(eq=False, slots=True)
 class OriginWatch:
-    """A background task of the serving loop: asks a remote origin whether it answers, when loads fail.
+    """A background task of the serving loop: checks whether a remote origin answers when loads fail.
 
     Parameters
     ----------
     try_again
-        Fetches what is missing of the list of cells.
+        Fetches the missing pages of the list of cells.
     reload
-        Called when there is another version of the map.
+        Called when a new version of the map exists.
     """
 
     link: OriginLink
@@ -53,17 +54,17 @@ class OriginWatch:
 
     @property
     def next_s(self) -> float:
-        """At once when a load could not read what it needs, or never."""
+        """At once when a load could not read its source, else never."""
         failed = self.scheduler.prefetcher.health.failed_in_a_row
         return -math.inf if failed and not self.link.is_doubted else math.inf
 
     def run_step(self, now_s: float) -> None:
-        """Find out whether the origin is out of reach."""
+        """Start a check of whether the origin is reachable."""
         del now_s
         self.link.doubt()
 
     def collect(self) -> None:
-        """Act on what was found out: once the origin answers again, failed loads are repeated."""
+        """Handle the result of the check: once the origin answers again, failed loads are repeated."""
         news = self.link.take()
         self.scheduler.note_origin(unreachable=self.link.is_out, back=news.back)
         if news.back:
@@ -80,24 +81,24 @@ class DiskAhead:
         prefetcher = scheduler.prefetcher
         self._prefetch = Prefetch(self._is_lacking, prefetcher.outage_tolerance_s, prefetcher.health)
         self._map_version = 0
-        self._rest: dict[tuple[int, str], float] = {}  # until when a layer of a cell is not looked at again
-        self._lacking: set[tuple[int, str]] = set()  # not on the disk when they were last looked at
+        self._rest: dict[tuple[int, str], float] = {}  # until when a layer of a cell is not checked again
+        self._lacking: set[tuple[int, str]] = set()  # not on the disk when last checked
         self._next_s = self._resume_s = -math.inf
         self._now_s = 0.0
 
     @property
     def next_s(self) -> float:
-        """When there is something to do: while clients move."""
+        """When there is something to do; never while no client moves."""
         if not self._scheduler.prefetcher.prefetch.paths or self._keeper.free_places <= 0:
             return math.inf
         return self._next_s
 
     def run_step(self, now_s: float) -> None:
-        """Begin with one layer of a cell, if memory has no room for it and no load waits."""
+        """Start fetching one layer of a cell, if memory has no room for it and no load waits."""
         self._now_s = now_s
         is_asked = now_s >= self._resume_s and self._scheduler.prefetcher.lacks_room(now_s)
         if not is_asked or len(self._scheduler.loads):
-            self._prefetch.restart()  # so that it does not keep a catalogue alive meanwhile
+            self._prefetch.restart()  # so that its catalogue can be freed
             if not is_asked:
                 self._forget()
             self._next_s = now_s + LOOK_S
@@ -121,7 +122,7 @@ class DiskAhead:
         self._next_s = now_s
 
     def collect(self) -> None:
-        """Note what has come."""
+        """Note the objects that have been fetched."""
         for kept in self._keeper.take():
             map_version, cell, layer = kept.key
             if map_version == self._map_version:
@@ -137,7 +138,7 @@ class DiskAhead:
         self._cache.statistics.set("disk_ahead", 0)
 
     def _is_lacking(self, index: int, layer: str) -> bool:
-        """Whether a layer of a cell is neither in memory nor on its way there, and may not be on the disk."""
+        """Whether a layer of a cell is neither in memory nor being loaded, and may not be on the disk."""
         if self._now_s < self._rest.get((index, layer), -math.inf):
             return False
         if self._cache.find_warm(index, layer, self._now_s) is not None:
@@ -145,7 +146,7 @@ class DiskAhead:
         return Key(self._cache.catalogue.id(index), layer) not in self._scheduler.loads.by_key
 
     def _objects(self, index: int, layer: str) -> list[ObjectName]:
-        """Return the objects that a loader would need."""
+        """Return the objects that a loader would need for a layer of a cell."""
         catalogue, layers = self._cache.catalogue, self._cache.layers
         own = unpack_source(catalogue.source(index))
         if catalogue.ready(index, layer) is not None:

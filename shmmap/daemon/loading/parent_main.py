@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that loaders are forked from: it has imported what they need, so that one costs milliseconds.
+"""The process that loaders are forked from: its imports are done, so a loader starts within milliseconds.
 
-It has a single thread, opens no file of the map and no segment, and only forks: a packet with one end of a
-channel makes a loader, and when that has ended the same end says how (`worker_messages.Ended`), after
-everything that the loader itself has sent.  It dies with the daemon, and the loaders die with it.
+It has a single thread, opens no map file and no segment, and only forks.  A packet with one end of a channel
+starts a loader.  When that loader has ended, the parent reports how over the same end
+(`worker_messages.Ended`), after everything that the loader itself has sent.  The parent is killed with the
+daemon, and the loaders with the parent.
 
-Another child compiles the kernels of layers before a layer is asked for: once on a machine, for some seconds,
-behind everything else that the machine has to do.  If it dies, or lacks memory, each loader compiles what it
-needs.
+Another child compiles the kernels of layers before a layer is requested: once per machine, for some seconds,
+at the lowest priority.  If that child dies or lacks memory, each loader compiles the kernels it needs.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from shmmap.version import __version__
 __all__ = ["main"]
 
 MAX_SETTINGS_BYTES: Final = 1 << 14
-_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should take a loader, not the daemon
+_OOM_SCORE: Final = b"500"  # if memory runs out, the kernel should kill a loader, not the daemon
 _MAX_NICE: Final = 19
 
 
 def _run_child(parent: int, run: Callable[[], int]) -> NoReturn:
-    """Run in a process that was just forked, with its own turn on the processors, and end it."""
+    """Run a function in the child just forked, in a scheduling group of its own, and exit."""
     code = 1
     try:
         die_with(parent)
         os.setsid()  # see autogroups in sched(7)
         code = run()
-    except BaseException:  # noqa: BLE001  nothing of the parent's may run in here any more
+    except BaseException:  # noqa: BLE001  none of the parent's code may run in the child
         traceback.print_exc()
     finally:
         os._exit(code)
 
 
 def _compile() -> int:
-    """Compile the kernels of layers, unless another daemon is at it; returns the exit code."""
+    """Compile the kernels of layers, unless another daemon is doing so; return the exit code."""
     os.nice(_MAX_NICE)
     from shmmap.layers.build import compile_kernels
 
@@ -64,7 +64,7 @@ def _compile() -> int:
 
 @dataclass(eq=False, slots=True)
 class _Parent:
-    """Forks loaders; ``_children`` are their ids and our ends of their channels, by pidfd."""
+    """Forks loaders; ``_children`` maps pidfds to process ids and the parent's ends of the channels."""
 
     channel: socket.socket
     settings: WorkerSettings
@@ -98,7 +98,7 @@ class _Parent:
                         poller.register(self._fork(socket.socket(fileno=end)), select.POLLIN)
 
     def _fork(self, end: socket.socket) -> int:
-        """Make a loader; returns its pidfd."""
+        """Fork a loader; return its pidfd."""
         ours = os.getpid()
         try:
             pid = os.fork()
@@ -125,7 +125,7 @@ class _Parent:
         _run_child(parent, lambda: work(end, self.settings))
 
     def _start_compiling(self) -> int:
-        """Begin to compile kernels in a child; returns its pidfd."""
+        """Start compiling kernels in a child; return its pidfd."""
         ours = os.getpid()
         pid = os.fork()
         if not pid:
@@ -134,13 +134,13 @@ class _Parent:
         return os.pidfd_open(pid)
 
     def _end_compiling(self) -> None:
-        """Reap the child that compiles; if it failed, each loader compiles what it needs."""
+        """Reap the child that compiles; if it failed, each loader compiles the kernels it needs."""
         os.waitid(os.P_PIDFD, self._compiling, os.WEXITED)
         os.close(self._compiling)
         self._compiling = -1
 
     def _reap(self, pidfd: int) -> None:
-        """Report how a loader has ended."""
+        """Reap a loader and report how it ended."""
         os.close(pidfd)
         pid, end = self._children.pop(pidfd)
         _, status = os.waitpid(pid, 0)
@@ -148,7 +148,7 @@ class _Parent:
 
 
 def _send_last(end: socket.socket, message: worker_messages.Ended) -> None:
-    """Send a loader's last message and close its channel; where that is full, the close has to do."""
+    """Send a loader's last message and close its channel; if the channel is full, only close it."""
     with end, contextlib.suppress(OSError):
         end.send(worker_messages.encode(message), socket.MSG_DONTWAIT)
 
@@ -156,21 +156,21 @@ def _send_last(end: socket.socket, message: worker_messages.Ended) -> None:
 def main(arguments: list[str]) -> int:
     """Run with ``CHANNEL_FD PARENT_PID``.
 
-    The first packet has the settings, separated by zero bytes: the directory of segments; the memory that a
-    loader may take, bytes; the disk cache's directory and size, empty and 0 without one; for a published map
-    also the fields of `shmmap.origin.remote.opened_store.ServedFrom`.
+    The first packet has the settings, separated by zero bytes: the directory of segments; a loader's memory
+    limit, bytes; the disk cache's directory and size, or empty and 0; for a published map also the fields of
+    `shmmap.origin.remote.opened_store.ServedFrom`.
     """
     ours = channel_to_parent(arguments)
     signal.signal(signal.SIGIO, signal.SIG_IGN)
-    take_slices(0)  # the short ones are for processes that serve
+    take_slices(0)  # short time slices are for processes that serve requests
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "wb") as score:
         score.write(_OOM_SCORE)
     with ours as channel, contextlib.suppress(ConnectionError):
         gc.collect()
-        gc.freeze()  # a collection in a loader would copy what all of them share
+        gc.freeze()  # a collection in a loader would copy the memory that all loaders share
         data, _ = receive_packet(channel, bytearray(MAX_SETTINGS_BYTES))
         if not data:
-            return 0  # the daemon did not start after all
+            return 0  # the daemon gave up starting
         shm_dir, memory_bytes, *more = map(os.fsdecode, bytes(data).split(b"\0"))
         limit_memory(int(memory_bytes))
         cache_dir, cache_bytes, *origin = more or ("", "0")

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Carries out what `Prefetch` wishes for, with loaders and memory that no client needs just now.
+"""Carries out the wishes of `Prefetch` with loaders and memory that no client needs at the moment.
 
-A wish becomes a load like any other when nothing else is queued and a loader has a free place: so one at most
-waits, none is out of date, and what a client asks for comes first.  Some places are kept free, so that a
-demand need not wait for a wish, unless the wish is nearly one itself.  Memory: a wish takes the place of what
-will be needed later than itself, never of what will be needed sooner or is in use, and what was fetched ahead
-and not asked for yet takes its share of the budget at most: in a full share, too, what is needed first stays.
+A wish becomes an ordinary load when nothing else is queued and a loader has a free place.  So at most one
+wish waits, none is outdated, and clients' requests come first.  Some places are kept free, so that a demand
+does not wait for a wish, unless the wish is almost a demand itself.  Memory: a wish replaces segments that
+are needed later than itself, never segments that are needed sooner or are in use.  Prefetched segments that
+no client has asked for take at most their share of the budget; in a full share, too, those needed first stay.
 """
 
 from __future__ import annotations
@@ -24,30 +24,29 @@ from shmmap.daemon.transport.sessions import MOVES_PER_STEP, Session
 __all__ = ["Prefetcher"]
 
 MAX_PATHS: Final = 256
-"""Clients for which cells are fetched ahead; each costs a look at every wish."""
+"""Clients for which cells are prefetched; each adds a comparison to every wish."""
 MISSES_PER_TURN: Final = 64
 MAX_COLD: Final = 1 << 14
-"""Cells of all clients that were not in memory, between two turns; of more the first are forgotten."""
+"""Limit of cells noted between two turns as requested but not in memory; the oldest are dropped."""
 MAX_ENDED: Final = 1024
-"""Loads that ended between two turns; of more the first are forgotten."""
+"""Limit of ended loads noted between two turns; the oldest are dropped."""
 FOLLOW_S: Final = 0.005
-"""How long moves of a few clients may wait, and ended loads while no client moves: many of them are looked at
-together."""
+"""How long a few clients' moves may wait, or ended loads while no client moves, to be handled together."""
 KEPT: Final = 4
-"""Part of one loader's places that is kept free for demands: a quarter, one at least."""
+"""Divisor: 1/4 of one loader's places, at least one, is kept free for demands."""
 SWAP_S: Final = 0.25
-"""How long the full share is not looked through again after there was nothing in it to give up."""
+"""How long a full share is not searched again after a search found no segment to give up."""
 FULL_S: Final = 1.0
-"""How long nothing is fetched ahead after there was no room for it."""
+"""How long nothing is prefetched after there was no memory for a wish."""
 
 
 class Prefetcher:
-    """Fetches what clients will ask for.
+    """Prefetches the cells that clients will ask for.
 
     Parameters
     ----------
     share
-        Part of the budget for what was fetched ahead and not asked for yet; 0: nothing is fetched ahead.
+        Share of the budget for prefetched cells that no client has asked for yet; 0: no prefetching.
     outage_tolerance_s
         See `Prefetch`.
     """
@@ -76,21 +75,21 @@ class Prefetcher:
         return self.share * self._ledger.budget_bytes
 
     def note_cold(self, session: Session, key: Key) -> None:
-        """Note that a client is the first to ask for a cell, and that it is not in memory."""
+        """Note that a client is the first to ask for a cell that is not in memory."""
         load = self._loads.by_key.get(key)
         if load is None or load.prefetch:
             self.cold.append((session, key))
             self._statistics.add("prefetch_overtaken", load is not None and load.running)
 
     def restart(self) -> None:
-        """Look along all paths from the start: what is known of the map or its origin has changed."""
+        """Examine all paths from the start: the map or its origin is known better now."""
         self.prefetch.restart()
         self._next_s = -math.inf
 
     # --- clients ----------------------------------------------------------------------------------
 
     def _follow(self, session: Session) -> None:
-        """Follow a client that has moved, asked for another area, or gone."""
+        """Follow a client that has moved, asked for another area, or left."""
         paths = self.prefetch.paths
         if session.area is None or not self.share:
             paths.pop(session, None)
@@ -98,11 +97,11 @@ class Prefetcher:
             self.prefetch.follow(session, session.motion, session.area, session.layers)
 
     def _count_misses(self) -> None:
-        """Count prefetch misses: cells that moving clients wait for; the first request and jumps are none."""
+        """Count prefetch misses: cells that moving clients wait for, except at first requests and jumps."""
         for _ in range(min(MISSES_PER_TURN, len(self.cold))):
             session, key = self.cold[0]
             if session in self._sessions.moved:
-                break  # first where it is
+                break  # first update the client's position
             self.cold.popleft()
             if session.motion.travelled_m > 0.0:
                 self._events.prefetch_missed(session, key)
@@ -111,7 +110,7 @@ class Prefetcher:
 
     @property
     def next_s(self) -> float:
-        """When there is something to do: at once when clients moved, loads ended, or a path is looked at."""
+        """When there is something to do: at once if clients moved, loads ended, or a path is examined."""
         many = len(self._sessions.moved) > MOVES_PER_STEP
         if self.cold or many or (self.ended and self.prefetch.paths):
             return -math.inf
@@ -119,7 +118,7 @@ class Prefetcher:
         return min(next_s, self._followed_s + FOLLOW_S) if self._sessions.moved or self.ended else next_s
 
     def run_step(self, now_s: float) -> None:
-        """Follow some clients that moved, and fetch what is needed first of what is not asked for."""
+        """Follow some clients that moved, and prefetch the cell that is needed first."""
         self._now_s = now_s
         self._followed_s = now_s
         for session in self._sessions.follow_moves():
@@ -135,12 +134,12 @@ class Prefetcher:
             self._wish(now_s)
 
     def _may_begin(self) -> bool:
-        """Whether a loader could begin one more."""
+        """Whether a loader could begin another load."""
         return not len(self._loads) and self._pool.free_places > 0
 
     @property
     def kept_places(self) -> int:
-        """How many places are kept free; not the only one."""
+        """Number of places kept free for demands; never all places."""
         pool = self._pool
         return min(max(1, pool.places // KEPT), pool.limit * pool.places - 1)
 
@@ -151,7 +150,7 @@ class Prefetcher:
             self._next_s = now_s if prefetch.more else prefetch.next_s(now_s)
             return
         if wish.needed_in_s > URGENT_S and self._pool.free_places <= self.kept_places:
-            # the last ones wait for demands, until a load ends or a client comes nearer
+            # the last places are kept for demands, until a load ends or a client comes nearer
             self._next_s = now_s + wish.needed_in_s - URGENT_S
             return
         key, nbytes = cache.key(wish.cell, wish.layer), cache.estimate(wish.cell, wish.layer)
@@ -166,21 +165,21 @@ class Prefetcher:
             self._next_s = now_s
 
     def _swap(self, key: Key, index: int, nbytes: int, shortage: int) -> bool:
-        """Give up what was fetched ahead and is needed later, for a wish that their share has no room for."""
+        """Retire prefetched cells that are needed later than a wish for which their share has no room."""
         if self._now_s < self._swapped_s + SWAP_S:
-            return False  # the next move of a client asks again
+            return False  # the next move of a client repeats the call
         swapped = self._evictor.give_up_prefetched(shortage, self._now_s, self._wished(key, index, nbytes))
         if not swapped:
             self._swapped_s = self._now_s
         return swapped
 
     def _wished(self, key: Key, index: int, nbytes: int) -> Resident:
-        """Return a wish as it would be in memory, to compare it with what is there."""
+        """Return a wish as if it were in memory, to compare it with segments."""
         box = self._cache.catalogue.box(index)
         return Resident("", key, 0, nbytes, 0, box, 0.0, 0.0, last_use_s=self._now_s)
 
     def _is_absent(self, index: int, layer: str) -> bool:
-        """Whether a cell could be fetched ahead; one that is larger than the share never can."""
+        """Whether a cell could be prefetched; a cell larger than the share never can."""
         key = self._cache.key(index, layer)
         if self._cache.find_warm(index, layer, self._now_s) is not None or key in self._loads.by_key:
             return False
@@ -191,7 +190,7 @@ class Prefetcher:
     # --- loads ------------------------------------------------------------------------------------
 
     def make_room(self, load: Load, shortage: int, now_s: float) -> bool:
-        """Free memory for a wish; False if all there is will be needed sooner, or is in use."""
+        """Free memory for a wish; return False if all other segments are needed sooner, or are in use."""
         index = self._cache.index_of(load.key.cell_id)
         if index is not None:
             wished = self._wished(load.key, index, load.estimate)
@@ -201,23 +200,23 @@ class Prefetcher:
         return False
 
     def full(self, now_s: float) -> None:
-        """Note that there is no memory for a wish just now."""
+        """Note that there is no memory for a wish at present."""
         self._full_until_s = now_s + FULL_S
 
     def note_end(self, load: Load, took_s: float, *, out: bool) -> None:
-        """Note the end of a load, the loader's time, and whether what it read was out of reach."""
+        """Note the end of a load, the loader time it took, and whether its source was unreachable."""
         self.ended.append((load, load.running, took_s, out))
 
     def started(self, load: Load) -> None:
-        """Note that a loader has a wish."""
+        """Note that a loader has begun a wish."""
         self._statistics.add("prefetch_started", load not in self._running)
         self._running[load] = load.estimate
 
     def _learn(self, load: Load, ran: bool, took_s: float, out: bool) -> None:
-        """Learn from the end of a load whether its origin answers.
+        """Infer from the end of a load whether its origin answers.
 
-        A broken file counts as an answer.  The failure of a load that began before another one succeeded
-        belongs to an outage that is over.
+        A broken file counts as an answer.  The failure of a load that began before another load succeeded
+        belongs to an outage that has ended.
         """
         self._running.pop(load, None)
         if not ran or not load.sources or (out and self._now_s - took_s < self._answered_s):
@@ -232,7 +231,7 @@ class Prefetcher:
         return self._no_room or now_s < self._full_until_s
 
     def shortage(self, now_s: float) -> int:
-        """Return what keeps cells from being fetched: 0 nothing, 1 their share is full, 2 the budget is."""
+        """Return what prevents prefetching: 0 nothing, 1 the share is full, 2 the budget is full."""
         if self._ledger.prefetched_bytes + sum(self._running.values()) >= self.budget_bytes:
             return 1 if self.share else 0
         return 2 if now_s < self._full_until_s else 0

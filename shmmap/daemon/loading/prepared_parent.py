@@ -18,18 +18,18 @@ from shmmap.version import __version__
 __all__ = ["RESTART", "Early", "PreparedParent", "fork_early"]
 
 Early: TypeAlias = tuple[ForkedProcess, socket.socket]
-"""A parent that has no settings yet, and the channel to it."""
+"""A parent without settings yet, and the channel to it."""
 
 END_TIMEOUT_S: Final = 0.1
-"""How long the loop waits for a killed parent to end; one that hangs in the kernel may never do so."""
+"""How long the loop waits for a killed parent to exit; a parent that hangs in the kernel may never do so."""
 CLOSE_TIMEOUT_S: Final = 5.0
-"""The same when the daemon ends: it waits for its child, on a machine that is busy, too."""
+"""Timeout of the same wait when the daemon stops; long, since the machine may be busy."""
 
 RESTART: Final = "shmmap was upgraded or removed while this daemon runs: restart the daemon"
 
 
 def _installed() -> tuple[int, int] | None:
-    """Return what identifies the loader program on the disk; None where it is gone."""
+    """Return what identifies the installed loader program; None if it is gone."""
     try:
         status = Path(__file__).with_name("worker_main.py").stat()
     except OSError:
@@ -38,9 +38,9 @@ def _installed() -> tuple[int, int] | None:
 
 
 def fork_early() -> Early | None:
-    """Fork the first parent from this process: what both need is imported once.
+    """Fork the first parent from this process, so that the modules both need are imported once.
 
-    Before this process has threads, locks, sockets or anything else that is its own; None if it is too late.
+    Call it before this process has threads, locks, sockets or other state; it returns None if it is too late.
     """
     with contextlib.suppress(OSError):
         return fork_child(_run_parent)
@@ -48,29 +48,29 @@ def fork_early() -> Early | None:
 
 
 def _run_parent(fd: int, daemon: int) -> int:
-    from shmmap.daemon.loading.parent_main import main  # in the child: while the daemon goes on
+    from shmmap.daemon.loading.parent_main import main  # in the child, while the daemon continues
 
     for name in ("LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES", "NOTIFY_SOCKET"):
-        os.environ.pop(name, None)  # are for the daemon
+        os.environ.pop(name, None)  # these variables are for the daemon only
     return main([str(fd), str(daemon)])
 
 
 class PreparedParent:
-    """Forks loaders.  A parent that ends takes its loaders along; another one is started in its place.
+    """Forks loaders through a parent process.  If the parent ends, its loaders end too, and it is replaced.
 
     Parameters
     ----------
     settings
-        Sent to it, see `shmmap.daemon.loading.parent_main.main`.
+        Sent to the parent, see `shmmap.daemon.loading.parent_main.main`.
     watched
-        Watches its descriptor.
+        Watches the parent's descriptor.
     early
-        The first one, if there is one already.
+        The first parent, if it was forked early.
 
     Attributes
     ----------
     why_not : str
-        Why the last one ended before it was ready; empty if it did not.
+        Why the last parent ended before it was ready; empty if it did not.
     """
 
     def __init__(
@@ -88,18 +88,18 @@ class PreparedParent:
 
     @property
     def pid(self) -> int:
-        """The parent's process id; 0 where there is none."""
+        """The parent's process id; 0 if there is none."""
         return self._process.pid if self._process is not None else 0
 
     def start(self) -> None:
-        """Start it where there is none; OSError if that cannot be done."""
+        """Start the parent if there is none; raise OSError if that fails."""
         if self._channel is None:
             early, self._early = self._early, None
             self._process, self._channel = early or start_child(
                 "shmmap.daemon.loading.parent_main", new_session=True
             )
             self._channel.setblocking(False)
-            with contextlib.suppress(ConnectionError):  # it has ended: `poll` finds out
+            with contextlib.suppress(ConnectionError):  # the parent has ended: `poll` finds out
                 self._channel.send(b"\0".join(map(os.fsencode, self._settings)))
             self._watched.watch(self._channel.fileno(), self.poll, "loaders")
             self._ready = False
@@ -110,22 +110,22 @@ class PreparedParent:
         Raises
         ------
         OSError
-            No more processes, memory or descriptors just now.
+            Not enough processes, memory or descriptors at present.
         """
         self.poll()
         self.start()
-        assert self._channel is not None  # noqa: S101  `start` has seen to it
+        assert self._channel is not None  # noqa: S101  `start` has set it
         socket.send_fds(self._channel, [b"loader"], [end.fileno()])
 
     def poll(self) -> None:
-        """Read whether it is ready, or has ended; one that was ready is replaced at once."""
+        """Read whether the parent is ready or has ended; one that was ready is replaced at once."""
         while self._channel is not None:
             try:
                 data, _ = receive_packet(self._channel, self._buffer)
             except BlockingIOError:
                 return
             except ConnectionResetError:
-                continue  # reported once, before what it had still sent
+                continue  # reported once, before the messages that it had sent
             if bytes(data) == __version__.encode():
                 self._ready, self.why_not = True, ""
                 continue
@@ -137,11 +137,11 @@ class PreparedParent:
                     self.start()
 
     def close(self) -> None:
-        """End it, and with it every loader, when the daemon ends."""
+        """End the parent, and with it every loader, when the daemon stops."""
         self.end(timeout_s=CLOSE_TIMEOUT_S)
 
     def end(self, why: str = "", *, timeout_s: float = END_TIMEOUT_S) -> None:
-        """End it, and with it every loader; ``why`` is for people; else how it ended."""
+        """End the parent, and with it every loader; ``why`` is a text for people, by default how it ended."""
         if self._channel is None or self._process is None:
             return
         self._watched.unwatch(self._channel.fileno())

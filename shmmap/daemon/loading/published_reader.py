@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads cells of a published map in a loader: objects are fetched at once, and verified before use."""
+"""Reads cells of a published map in a loader: objects are fetched concurrently, and verified before use."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ from shmmap.segment.version import Source, Stamp
 __all__ = ["CONCURRENT_FETCHES", "PublishedReader"]
 
 CONCURRENT_FETCHES: Final = 32
-"""Objects that a loader fetches at once, as long as they are small."""
+"""Limit of small objects that a loader fetches concurrently."""
 MAX_BYTES: Final = 8 << 20
-"""Most bytes of objects that are fetched or held at once; a single object may be larger."""
+"""Limit of bytes of objects that are fetched or held at a time; a single object may be larger."""
 _STACK_BYTES: Final = 512 << 10
-"""Stack of a thread, small because the loader's limit of memory counts all of it."""
+"""Stack of a thread; small, because it counts in full towards the loader's memory limit."""
 
 
 @dataclass(eq=False, slots=True)
 class _Fetch:
-    """An object that jobs need; ``frame`` is it, or why it could not be fetched, once that is known."""
+    """An object that jobs need; ``frame`` is its data, or why the fetch failed; None until then."""
 
     name: ObjectName
     jobs: set[int] = field(default_factory=set)
@@ -60,19 +60,19 @@ def _get(objects: KeptObjects, name: ObjectName) -> memoryview:
     Raises
     ------
     MapDataError, MapMissing, Offline
-        It is damaged, gone, or out of reach.
+        The object is damaged, missing, or unreachable.
     """
     try:
         return objects.read(name.sha256, name.size)
-    except MapDataError:  # it may have been damaged on its way
+    except MapDataError:  # the data may have been damaged in transit
         return objects.read(name.sha256, name.size)
 
 
 class ObjectFetcher:
-    """Fetches what jobs need, in threads; see `shmmap.layers.sources.Fetcher`.
+    """Fetches the objects that jobs need, in threads; see `shmmap.layers.sources.Fetcher`.
 
-    What two jobs need is fetched once.  As soon as one object is out of reach, so are those that have not
-    been begun: else the jobs would fail one after the other, each in its time.
+    An object that two jobs need is fetched once.  As soon as one object is unreachable, all fetches that have
+    not begun fail too: else the jobs would fail one after the other, each after its own timeout.
     """
 
     def __init__(self, objects: KeptObjects) -> None:
@@ -81,7 +81,7 @@ class ObjectFetcher:
         threading.stack_size(_STACK_BYTES)
         self._threads = ThreadPoolExecutor(
             CONCURRENT_FETCHES, "fetch"
-        )  # the loader's end waits for none of them
+        )  # the loader exits without waiting for these threads
         self.fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK | os.EFD_SEMAPHORE)
         self._fetches: dict[bytes, _Fetch] = {}
         self._lacking: dict[int, set[bytes]] = {}
@@ -93,7 +93,7 @@ class ObjectFetcher:
         self._held_bytes = 0
 
     def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
-        """Begin to fetch what a layer of a cell is made from."""
+        """Begin to fetch the objects that a layer of a cell is made from."""
         names = {name.sha256: name for name in _needed(spec, job)}
         with self._lock:
             self._forget_last()
@@ -112,7 +112,7 @@ class ObjectFetcher:
             self._begin_some()
 
     def done(self) -> int | None:
-        """Return the number of a job for which all is here, or will not come."""
+        """Return the number of a job whose objects have all been fetched, or have failed."""
         with self._lock:
             self._forget_last()
             try:
@@ -124,7 +124,7 @@ class ObjectFetcher:
             return self._at_work
 
     def get(self, name: ObjectName) -> memoryview:
-        """Return an object that was fetched for the job at work, or fetch it."""
+        """Return an object that was fetched for the current job, or fetch it now."""
         with self._lock:
             fetch = self._fetches.get(name.sha256)
             frame = fetch.frame if fetch is not None else None
@@ -152,7 +152,7 @@ class ObjectFetcher:
     # --- under the lock ---------------------------------------------------------------------------
 
     def _forget_last(self) -> None:
-        """Drop what the last job needed, now that it has been worked on."""
+        """Drop the objects of the last job, which is done."""
         for digest in self._needs.pop(self._at_work, ()):
             fetch = self._fetches[digest]
             fetch.jobs.discard(self._at_work)
@@ -172,7 +172,7 @@ class ObjectFetcher:
             fetch = self._queue[0]
             is_much = self._held_bytes and self._held_bytes + fetch.name.size > MAX_BYTES
             if is_much and (self._under_way or self._done):
-                break  # what is held goes when its job is done; without one to do there would be no end
+                break  # held objects are freed when their job is done; without such a job, go on
             self._queue.popleft()
             fetch.begun = True
             self._under_way += 1
@@ -190,7 +190,7 @@ class ObjectFetcher:
 
 
 def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
-    """Objects that a layer of a cell is made from."""
+    """Yield the objects that a layer of a cell is made from."""
     own = unpack_source(job.source)
     if job.ready:
         yield own[str(spec)].name
@@ -201,7 +201,7 @@ def _needed(spec: LayerSpec, job: CellJob) -> Iterator[ObjectName]:
 
 
 class PublishedReader:
-    """Reads sources that are objects of a published map; see `shmmap.layers.sources.SourceReader`."""
+    """Reads sources stored as objects of a published map; see `shmmap.layers.sources.SourceReader`."""
 
     def __init__(self, served: ServedFrom, cache_dir: str, cache_bytes: int) -> None:
         store = open_for_serving(served)
@@ -211,16 +211,16 @@ class PublishedReader:
         self.fetcher = ObjectFetcher(self._objects)
 
     def stamp(self, source: Source) -> Stamp:
-        """Return the state that its objects are of: they never change."""
+        """Return the stamp of a source, whose objects never change."""
         return stamp_of(source)
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
-        """Read the columns that a layer needs of a cell's points.
+        """Read the columns of a cell's points that a layer needs.
 
         Raises
         ------
         LoadFailed
-            They are damaged: a layer made without them would be another one than its version says.
+            The objects are damaged: a layer made without them would not match its version.
         """
         name = unpack_source(source)[LAYER].name
         try:
@@ -255,7 +255,7 @@ class PublishedReader:
         reserve: Callable[[int], None] | None,
         warn: Callable[[str], None],
     ) -> SegmentHeader | None:
-        """Write a layer that is published into a segment file; None: it has to be computed."""
+        """Write a published layer into a segment file; return None if it has to be computed."""
         del warn
         if not job.ready and spec.kind.name != LAYER:
             return None
@@ -274,16 +274,16 @@ class PublishedReader:
         return header
 
     def named(self, message: str) -> str:
-        """Return the message as it is: it names cells by their ids."""
+        """Return the message unchanged: it names cells by their ids."""
         return message
 
     def explain(self, source: Source, message: str) -> str:
-        """Return the message as it is."""
+        """Return the message unchanged."""
         del source
         return message
 
     def take_counts(self) -> tuple[int, ...]:
-        """Return what was read since the last call; empty for nothing."""
+        """Return the counts of reads since the last call; empty if there were none."""
         before, self._counts = self._counts, self._objects.counts
         more = self._counts.since(before)
         return tuple(more) if any(more) else ()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Room for loads where memory is short: it is freed, promised or refused."""
+"""Memory for loads when it is short: it is freed, promised or refused."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from shmmap.quantities import format_bytes
 __all__ = ["Room"]
 
 AHEAD_SHARE: Final = 32
-"""Part of the budget in which room is made, at most, for loads that come after the next one."""
+"""Fraction of the budget (1/32) up to which memory is also freed for loads that follow the next one."""
 AGAIN_S: Final = 0.05
-"""After this time a load that waits for room asks again even if nothing has changed: a precaution."""
+"""Delay after which a load that waits for memory asks again even if nothing has changed: a precaution."""
 
 
 @dataclass(eq=False, slots=True)
 class Room:
-    """Has room made for loads, and tries again what was refused when memory may be free."""
+    """Frees memory for loads, and retries refused loads when memory may be free."""
 
     ledger: Ledger
     evictor: Evictor
@@ -38,13 +38,13 @@ class Room:
     loads: Loads
     pool: WorkerPool
     prefetcher: Prefetcher
-    waited_for: bool = False  # by the load that comes next, as far as is known
-    awaiting_grant: dict[int, tuple[Worker, int]] = field(default_factory=dict)  # and bytes, by job number
+    waited_for: bool = False  # by the next load, as far as is known
+    awaiting_grant: dict[int, tuple[Worker, int]] = field(default_factory=dict)  # by job number
     _waited_at: tuple[int, ...] = ()
     _waited_until_s: float = 0.0
 
     def watch(self, watched: WatchedDescriptors, clock: Callable[[], float]) -> None:
-        """Register for the kernel's reports of what may free memory."""
+        """Register for the kernel's reports of events that may free memory."""
         for fd, call in (
             (self.reclaimer.closer.fd, self.on_freed),
             (self.reclaimer.pins.fd, lambda: self.on_closes(clock())),
@@ -54,30 +54,30 @@ class Room:
                 watched.watch(fd, call, "memory")
 
     def on_closes(self, now_s: float) -> None:
-        """Follow the kernel's report that segments were closed."""
+        """Handle the kernel's report that segments were closed."""
         if self.reclaimer.on_closes(now_s):
             self.loads.forget_refusals()
 
     def on_names_vanished(self, now_s: float) -> None:
-        """Follow the kernel's report that names of segments were removed."""
+        """Handle the kernel's report that names of segments were removed."""
         if self.lost.retire_vanished(now_s):
             self.loads.forget_refusals()
 
     def on_freed(self) -> None:
-        """Count memory that is back with the kernel."""
+        """Count memory that the kernel has taken back."""
         if self.reclaimer.collect():
             self.loads.forget_refusals()
 
     def release(self, residents: Iterable[Resident], now_s: float) -> None:
-        """Release segments that a client has dropped: what was refused for lack of memory may fit now."""
+        """Release segments that a client has dropped: loads refused for lack of memory may fit now."""
         self.reclaimer.release(residents, now_s)
         self.loads.forget_refusals()
 
     def refusal(self, load: Load, shortage: int, behind: int, now_s: float) -> str:
-        """Make room for a load; returns why there is none, or nothing where it is on its way.
+        """Free memory for a load; return why that is impossible, or an empty text if it is under way.
 
-        What is evicted is free a moment later.  At the same time more is evicted, for the loads of
-        ``behind`` bytes that come next: else each of them would have to wait for a moment of its own.
+        Evicted memory is free a moment later.  At the same time more is evicted, for the loads of ``behind``
+        bytes that come next: else each of them would have to wait for its own eviction.
         """
         ledger = self.ledger
         if load.prefetch:
@@ -93,31 +93,31 @@ class Room:
         return f"the budget of {format_bytes(ledger.budget_bytes)} is in use"
 
     def wait(self, running: int, now_s: float) -> None:
-        """Make the load that comes next wait for room, while this many loads are ``running``."""
+        """Make the next load wait for memory, while ``running`` loads are running."""
         self.waited_for = True
         self._waited_at, self._waited_until_s = self._state(running), now_s + AGAIN_S
 
     def still_waited_for(self, running: int, now_s: float) -> bool:
-        """Whether nothing has changed since a load began to wait; else it is worth another try."""
+        """Whether nothing has changed since a load began to wait; otherwise it should try again."""
         until_s = min(self._waited_until_s, self.evictor.wake_s)
         self.waited_for = now_s < until_s and self._waited_at == self._state(running)
         return self.waited_for
 
     def _state(self, running: int) -> tuple[int, ...]:
-        """Return what differs whenever there may be room, or another load comes next."""
+        """Return a value that differs whenever memory may be free, or another load is next."""
         ledger = self.ledger
         return ledger.shortage(0), ledger.coming_bytes, ledger.order.changes, self.loads.changes, running
 
     def ask(self, worker: Worker, message: Need) -> None:
-        """Note that a worker needs more than was reserved; it waits for `grant`."""
+        """Note that a worker needs more than was reserved for it; it waits for `grant`."""
         self.awaiting_grant[message.number] = (worker, message.bytes)
 
     def forget(self, number: int) -> None:
-        """Forget what a job asked for: it has ended."""
+        """Forget the request of a job that has ended."""
         self.awaiting_grant.pop(number, None)
 
     def grant(self, jobs: Mapping[int, Load], now_s: float) -> None:
-        """Grant, hold or refuse the extra bytes that workers asked for; ``jobs`` are loads by job number."""
+        """Grant, defer or refuse the extra bytes that workers asked for; ``jobs`` are loads by job number."""
         ledger = self.ledger
         for number, (worker, nbytes) in list(self.awaiting_grant.items()):
             load = jobs.get(number)
@@ -135,10 +135,10 @@ class Room:
             del self.awaiting_grant[number]
 
     def _may_be_given_back(self) -> bool:
-        """Whether a load runs that will end by itself: it may need less than is reserved for it.
+        """Whether a running load will end without more memory: it may use less than is reserved for it.
 
-        Loads that wait for room do not end by themselves, nor do those that come after them in the
-        same loader's queue.
+        Loads that wait for memory do not end by themselves, nor do the loads queued after them in the same
+        loader.
         """
         return any(
             worker.queue and self.awaiting_grant.keys().isdisjoint(worker.queue) for worker in self.pool

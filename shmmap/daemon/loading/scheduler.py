@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loads from the queue to their end: room is made, a worker is given the job, its messages are handled.
+"""Runs loads from the queue to their end: frees memory, gives jobs to workers, handles their messages.
 
-However a load ends, only its own cell is concerned: a worker that dies or takes too long is replaced,
-and the jobs behind the one it died of go back into the queue.  Only workers look at files: it may take long.
+However a load ends, only its own cell is affected: a worker that dies or takes too long is replaced, and the
+jobs queued after the one that it died of return to the queue.  Only workers read files: reading may take
+long.
 """
 
 from __future__ import annotations
@@ -36,22 +37,22 @@ __all__ = [
 
 
 LOOKS_PER_PUMP: Final = 16
-"""Loads, and misplaced cells, that one `pump` finds to be of cells that left the map."""
+"""Loads, and misplaced cells, that one `pump` checks for having left the map."""
 
 
 class MisplacedCells:
-    """Cells with points outside their box: moved, or the map's metadata is another map's.
+    """Cells with points outside their box: the cell moved, or the map's metadata belongs to another map.
 
-    Each is logged once for each of its states; they are counted.
+    Each cell is logged once per version; the number of cells is counted.
     """
 
     def __init__(self, cache: CellCache) -> None:
         self._cache = cache
-        self._versions: dict[str, int] = {}  # of the cell, when it was loaded
+        self._versions: dict[str, int] = {}  # version of the cell when it was loaded
         self._to_check: deque[str] = deque()
 
     def note(self, cell_id: str, index: int, outside: int) -> None:
-        """Note what a loaded or adopted segment says of its cell's points."""
+        """Note how many points of a loaded or adopted segment lie outside its cell's box."""
         if not outside:
             self._forget(cell_id)
             return
@@ -68,11 +69,11 @@ class MisplacedCells:
             )
 
     def map_changed(self) -> None:
-        """Let `check_some` look at all of them again: they may have changed, or left the map."""
+        """Let `check_some` check all cells again: they may have changed, or left the map."""
         self._to_check = deque(self._versions)
 
     def check_some(self, most: int) -> None:
-        """Check at most this many cells, and forget those that have changed or left the map."""
+        """Check at most ``most`` cells, and forget those that have changed or left the map."""
         for _ in range(min(most, len(self._to_check))):
             cell_id = self._to_check.popleft()
             index = self._cache.catalogue.find(cell_id)
@@ -88,19 +89,19 @@ class MisplacedCells:
 
 
 class LoadObserver(Protocol):
-    """Follows loads."""
+    """Is notified of loads."""
 
     def load_finished(self, key: Key) -> None:
-        """Follow a load that ended, in whichever way."""
+        """Handle the end of a load, successful or not."""
 
 
 class Scheduler:
-    """Carries out loads.
+    """Runs loads.
 
     Parameters
     ----------
     make_pool
-        Makes the pool, given what it calls with a worker that has sent something.
+        Makes the pool, given the function to call with a worker that has sent a message.
     clock
         The serving loop's clock, seconds.
     prefetch_share, outage_tolerance_s
@@ -109,12 +110,12 @@ class Scheduler:
     Attributes
     ----------
     loads
-        What is wanted, queued and under way, and what failed.
+        Loads that are wanted, queued and running, and those that failed.
     prefetcher, room, misplaced, lost
-        Loads what was not asked for yet; asks the cache for room; counts cells with points outside
-        their box; replaces workers.
+        Loads cells before they are requested; frees memory for loads; counts cells with points outside their
+        box; replaces workers.
     unfinished : bool
-        Whether there may be more for `pump` to do at once.
+        Whether `pump` may have more to do at once.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class Scheduler:
         self.pool = pool = make_pool(lambda worker: self.on_worker(worker, clock()))
         self._jobs: dict[int, Load] = {}
         self._to_recheck: deque[Key] = deque()
-        self._for_pages: dict[Load, None] = {}  # that wait until it is known which cells they look into
+        self._for_pages: dict[Load, None] = {}  # loads that wait until the cells they read are known
         self._job_numbers, self.unfinished = 0, False
         self.prefetcher = Prefetcher(
             cache, self.loads, pool, share=prefetch_share, outage_tolerance_s=outage_tolerance_s
@@ -147,7 +148,7 @@ class Scheduler:
         self.lost = LostWorkers(pool, self._jobs, self.loads, self.room, cache.statistics, self._fail)
 
     def start_loader(self) -> None:
-        """Start a loader before there is a load."""
+        """Start a loader before the first load."""
         self.pool.start_one()
 
     # --- requests -------------------------------------------------------------------------------
@@ -155,10 +156,10 @@ class Scheduler:
     def want(
         self, index: int, layer: str, priority: float, now_s: float, asker: Hashable = None
     ) -> Load | None:
-        """Make sure that a load of an absent cell is under way; None if it failed too recently.
+        """Make sure that an absent cell is being loaded; return None if its load failed too recently.
 
-        A cell that failed too recently is loaded if its file has changed since: a worker looks, if it is
-        known for which state of the file it failed.
+        A cell that failed too recently is loaded only if its file has changed since.  A worker checks that,
+        if the state of the file that failed is known.
         """
         cache = self._cache
         key = cache.key(index, layer)
@@ -176,14 +177,14 @@ class Scheduler:
         return load
 
     def map_changed(self) -> None:
-        """Serve another state of the map: loads of cells that left it are ended, some at each `pump`."""
+        """Handle another state of the map: loads of cells that left it are ended, some in each `pump`."""
         self._to_recheck = deque([*self.loads.by_key, *self.loads.failures])
         self.pages_finished()
         self.misplaced.map_changed()
         self.pool.read_through(self._opened)
 
     def pages_finished(self) -> None:
-        """Begin loads that wait for pages of the map, or find out what still lacks: some have come."""
+        """Start loads that waited for pages which have arrived, or request the pages still missing."""
         waiting, self._for_pages = self._for_pages, {}
         for load in waiting:
             if self.loads.by_key.get(load.key) is load:
@@ -191,7 +192,7 @@ class Scheduler:
         self.prefetcher.restart()
 
     def _waits_for_pages(self, load: Load, now_s: float) -> bool:
-        """Whether a load cannot be begun because it is not known yet which cells it looks into."""
+        """Whether a load cannot start because the cells it reads are not known yet."""
         cache, pages = self._cache, self._cache.pages
         if pages is None or load.unless is not None or load.adopted is not None:
             return False
@@ -211,14 +212,14 @@ class Scheduler:
 
     @property
     def _opened(self) -> Opened:
-        """The directory that files of the map are read through."""
+        """The directory through which files of the map are read."""
         catalogue = self._cache.catalogue
         if catalogue.opened is None:
             return NOT_OPENED
         return catalogue.opened.innermost(catalogue.id_prefix.rstrip("/"))
 
     def note_origin(self, *, unreachable: bool, back: bool) -> None:
-        """Note whether the origin is out of reach; if it is back, what failed may be tried again."""
+        """Note whether the origin is unreachable; if it is ``back``, failed loads may be retried."""
         self.prefetcher.health.unreachable = unreachable
         if back:
             self.prefetcher.health.answers()
@@ -235,12 +236,12 @@ class Scheduler:
     # --- handing out jobs -----------------------------------------------------------------------
 
     def free(self, now_s: float) -> None:
-        """Free what is due: what was refused for lack of memory may fit now."""
+        """Free the retired segments that are due: loads refused for lack of memory may fit now."""
         if self._cache.reclaim(now_s):
             self.loads.forget_refusals()
 
     def pump(self, now_s: float) -> None:
-        """Hand a queued load to a worker if memory and workers allow; see `unfinished`."""
+        """Give a queued load to a worker if memory and workers allow it; see `unfinished`."""
         if self.room.awaiting_grant:
             self.room.grant(self._jobs, now_s)
         self._drop_some()
@@ -248,7 +249,7 @@ class Scheduler:
         self.unfinished = len(self.loads) > 0 and self._hand_out_one(now_s)
 
     def _hand_out_one(self, now_s: float) -> bool:
-        """Hand out the load that comes next; False if there is none, or it has to wait."""
+        """Hand out the next load; return False if there is none, or it has to wait."""
         if self.room.waited_for and self.room.still_waited_for(len(self._jobs), now_s):
             return False
         points, layers = self.pool.has_room(computed=False), self.pool.has_room(computed=True)
@@ -269,7 +270,7 @@ class Scheduler:
             self._end(load)
             return True
         if load.estimate > estimate:
-            return True  # it has become a load that needs room
+            return True  # the check was turned into a load that needs memory
         self.loads.start(load, now_s)
         self._job_numbers += 1
         try:
@@ -297,7 +298,7 @@ class Scheduler:
         if load.adopted is not None:
             if self._ledger.resident_named(load.adopted.name) is load.adopted:
                 return Check(number, catalogue.source(index), load.adopted.name, catalogue.stamp(index))
-            load.adopted = None  # it was retired before its turn came
+            load.adopted = None  # the segment was retired before its check began
             if not load.wanted:
                 return None
             load.estimate = cache.estimate(index, load.key.layer)
@@ -326,7 +327,7 @@ class Scheduler:
         return Neighbour.of(catalogue.id(index), catalogue.source(index), catalogue.box(index))
 
     def next_event_s(self) -> float:
-        """Return when there is something to do although nothing arrives; infinity for never."""
+        """Return when there is something to do if nothing arrives; infinity for never."""
         if self._to_recheck or self.unfinished:
             return 0.0
         return min(self._cache.next_reclaim_s(), self.pool.next_deadline_s())
@@ -350,7 +351,7 @@ class Scheduler:
             os.close(fd)
         if isinstance(message, Ended):
             self.lost.ended(worker, message.reason or how_ended(message.code), now_s)
-        elif isinstance(message, Ready):  # this process had no descriptor left to receive it
+        elif isinstance(message, Ready):  # this process had no free descriptor to receive the pidfd
             self.lost.ended(worker, "too many open files", now_s)
         elif isinstance(message, Begun):
             self.pool.works_on(worker, message.number, now_s)
@@ -361,7 +362,7 @@ class Scheduler:
             self._on_end(worker, message, now_s)
 
     def _on_end(self, worker: Worker, message: Done | Checked | Failed, now_s: float) -> None:
-        """Handle the end of a job, in whichever way."""
+        """Handle the end of a job, successful or not."""
         fd, spent_s = self.pool.finished(worker, message.number, now_s)
         if not isinstance(message, Checked) and message.objects:
             self._statistics.add_objects_read(message.objects)
@@ -381,14 +382,14 @@ class Scheduler:
             elif fd >= 0:
                 step("daemon.received")
                 self._publish(load, message, fd, now_s)
-            else:  # it was only to be checked
+            else:  # the job was only a check
                 self._fail(load, "load_failed", "the loader says it has a segment", None, now_s)
         finally:
             if fd >= 0:
                 os.close(fd)
 
     def _publish(self, load: Load, done: Done, fd: int, now_s: float) -> None:
-        """Hand out a finished segment from now on."""
+        """Publish a finished segment."""
         cache, catalogue, key = self._cache, self._cache.catalogue, load.key
         index = cache.index_of(key.cell_id)
         if index is None:
@@ -396,7 +397,7 @@ class Scheduler:
             self._end(load)
             return
         if done.version != self._layers.version(index, key.layer):
-            # its file, or one around it, changed while it was made; or the map did
+            # its file, a neighbour's file or the map changed while it was made
             reads = (done.stamp, *done.neighbours)
             if reads == load.sources and done.version != load.version:
                 message = f"the loader builds {key.layer} otherwise than the daemon knows: restart it"
@@ -424,7 +425,7 @@ class Scheduler:
             replaces = cache.publish(fd, done.header_bytes, resident, index, now_s)
         except OSError as error:
             code = failure_code(error)
-            limit = limit_behind(error) if code not in SPACE_CODES else None  # of shared memory there is none
+            limit = limit_behind(error) if code not in SPACE_CODES else None  # else memory is full
             why = f"{limit.message} ({limit.hint})" if limit is not None else str(error.strerror)
             self._fail(load, code, f"its segment cannot be published: {why}", None, now_s)
             return
@@ -438,7 +439,7 @@ class Scheduler:
         self._end(load)
 
     def _on_checked(self, load: Load, message: Checked, now_s: float) -> None:
-        """Handle the check of an adopted segment, or of a file that a load failed for."""
+        """Handle the result of checking an adopted segment, or a file that failed."""
         if load.unless is not None:
             self._on_looked(load, message)
             return
@@ -451,7 +452,7 @@ class Scheduler:
         self._load_after_all(load)
 
     def _on_looked(self, load: Load, message: Checked) -> None:
-        """Handle the check of a file that a load failed for: another state is tried at once."""
+        """Handle the check of a file that failed: if its state has changed, it is loaded at once."""
         failure, load.unless = self.loads.failures.get(load.key), None
         if not message.wrong:
             self._end(load, failure)
@@ -472,7 +473,7 @@ class Scheduler:
             self._end(load)
 
     def _fail(self, load: Load, code: str, message: str, stamp: Stamp | None, now_s: float) -> None:
-        """End a load without a segment; the back-off doubles when it failed for the same reason before."""
+        """End a load without a segment; the back-off doubles if the previous failure had the same reason."""
         if load.adopted is not None or load.unless is not None:
             self._on_checked(load, Checked(0, message if load.unless is None else ""), now_s)
             return
@@ -485,9 +486,9 @@ class Scheduler:
         else:
             self._statistics.add("loads_failed")
             cell, layer = load.key
-            if code != "offline" or not self.prefetcher.health.unreachable:  # which is logged once
+            if code != "offline" or not self.prefetcher.health.unreachable:  # an outage is logged once
                 log.warning("load failed", cell=cell, layer=layer, code=code, message=message)
-        if self._cache.index_of(load.key.cell_id) is None:  # it left the map: nothing is remembered of it
+        if self._cache.index_of(load.key.cell_id) is None:  # the cell left the map: its failure is not kept
             self._end(load)
             return
         failure = self.loads.failure(load.key, code, message, stamp, now_s)

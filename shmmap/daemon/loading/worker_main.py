@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loader worker: a process of its own that reads files and fills segments, one job after another.
+"""A loader worker: a separate process that reads files and fills segments, one job after another.
 
-It is forked from one that has imported what is needed (`shmmap.daemon.loading.parent_main`).
+It is forked from a process with its imports done (`shmmap.daemon.loading.parent_main`).
 
-It is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish: it fills a file
-without a name that the daemon has made, so that an orphan leaves nothing behind.
+The worker is expendable: a file that crashes or hangs it costs that one cell.  It cannot publish.  It fills
+an unnamed file that the daemon has made, so that an orphaned worker leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ _NICENESS: Final = 10  # a warm request never waits for a load
 _PAGE_BYTES: Final = 4096
 
 _Work: TypeAlias = tuple[worker_messages.Job, int]
-"""A job, and the file that its segment goes into."""
+"""A job, and the descriptor of the file that its segment is written to."""
 
 
 class _Refused(Exception):
-    """The daemon has no room for the segment."""
+    """The daemon has no memory for the segment."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerSettings:
-    """Where segments are made; where finished layers are kept, and how much of them (empty: nowhere).
+    """Directory of segments; directory and size of the disk cache of finished layers (empty: no cache).
 
-    ``origin`` are the words of `shmmap.origin.remote.opened_store.ServedFrom`; none: cells are files.
+    ``origin`` contains the fields of `shmmap.origin.remote.opened_store.ServedFrom`; empty: cells are files.
     """
 
     shm_dir: str
@@ -96,9 +96,10 @@ class _Worker:
                 self.reader = Files(opened.at, opened.named)
 
     def _next(self) -> tuple[worker_messages.ToWorker | None, int]:
-        """Return what is to be done next; None when the channel is closed.
+        """Return the next message to act on and its descriptor; None when the channel is closed.
 
-        Where what jobs need is fetched, that begins when they come, and they are done as it has come.
+        A reader with a fetcher begins to fetch when a job arrives; jobs are done in the order their data
+        arrives.
         """
         fetcher = self.reader.fetcher
         while fetcher is not None:
@@ -126,7 +127,7 @@ class _Worker:
         return self._waiting.pop(0) if self._waiting else self._receive()
 
     def _receive(self) -> tuple[worker_messages.ToWorker | None, int]:
-        """Return the next message and the descriptor that came with it; None when the channel is closed."""
+        """Return the next message and the descriptor sent with it; None when the channel is closed."""
         data, fd = receive_packet(self.channel, self._buffer)
         return (worker_messages.decode_to_worker(data) if data else None), fd
 
@@ -138,7 +139,7 @@ class _Worker:
             socket.send_fds(self.channel, [packet], [fd])
 
     def _reserve(self, job: worker_messages.Job, nbytes: int) -> None:
-        """Ask for more room where the segment needs more than was reserved for it."""
+        """Ask for more memory if the segment needs more than was reserved for it."""
         nbytes = -(-nbytes // _PAGE_BYTES) * _PAGE_BYTES
         if nbytes > job.granted:
             self._send(worker_messages.Need(job.number, nbytes))
@@ -155,7 +156,7 @@ class _Worker:
                     return
 
     def _load(self, job: worker_messages.Job, fd: int) -> None:
-        """Fill the file that came with a job, and close it before its end is reported."""
+        """Fill the file of a job, and close it before the end of the job is reported."""
         started_ns = time.monotonic_ns()
         try:
             try:
@@ -192,7 +193,7 @@ class _Worker:
             self._fail(job, "load_failed", str(error))
         except OSError as error:
             limit = limit_behind(error) if error.errno == errno.EFBIG else None
-            if limit is not None:  # of the segment, whatever the map's file is like
+            if limit is not None:  # the segment's file is limited, whatever the source is like
                 self._fail(
                     job, "load_failed", f"{job.source.name}: its segment: {limit.message} ({limit.hint})"
                 )
@@ -202,7 +203,7 @@ class _Worker:
             most = format_bytes(resource.getrlimit(resource.RLIMIT_DATA)[0])
             why = f"making {job.layer} takes more than the {most} of memory that a loader may use"
             self._fail(job, "load_failed", f"{job.source.name}: {why} (divide the map into smaller cells)")
-        except Exception as error:  # noqa: BLE001  a builder of another package, say: it costs one cell
+        except Exception as error:  # noqa: BLE001  e.g. in another package's builder: it costs one cell
             self._fail(job, "load_failed", f"{job.source.name}: building {job.layer} failed: {error!r}")
 
     def _make(self, job: worker_messages.Job, fd: int) -> Made:
@@ -220,7 +221,7 @@ class _Worker:
             self._cell(job),
             fd,
             cache=self.cache,
-            keep=job.layer != LAYER,  # `shmmap prepare` alone stores the source: it is as quick to read
+            keep=job.layer != LAYER,  # only `shmmap prepare` stores the source: it is as quick to read
             source=lambda: self._points_in_memory(job, spec),
             reserve=lambda nbytes: self._reserve(job, nbytes),
         )
@@ -229,7 +230,7 @@ class _Worker:
         return CellJob(job.cell_id, job.source, job.box, job.frame_id, job.neighbours, self.reader, job.ready)
 
     def _points_in_memory(self, job: worker_messages.Job, spec: LayerSpec) -> CellSource | None:
-        """Read the cell's points out of their segment, if it is there and of this state of the source."""
+        """Return the cell's points from their segment, if that exists and has this state of the source."""
         if not job.points:
             return None
         try:
@@ -261,9 +262,9 @@ class _Worker:
 
 
 def _test_hook(path: str) -> None:
-    """Crash or hang on a named file, for the tests of exactly that (``SHMMAP_TEST_WORKER``).
+    """Crash or hang on a named file, for the tests of that (``SHMMAP_TEST_WORKER``).
 
-    Or find the origin of each out of reach while a file of that name and ``.offline`` lies beside it.
+    Or treat the origin as unreachable while a file of that name plus ``.offline`` exists.
     """
     what, _, name = os.environ.get("SHMMAP_TEST_WORKER", "").partition(":")
     if what == "offline" and os.path.exists(path + ".offline"):
@@ -276,7 +277,7 @@ def _test_hook(path: str) -> None:
 
 
 def limit_memory(nbytes: int) -> None:
-    """Limit this process's memory: what goes beyond it is an error of the cell at work."""
+    """Limit this process's memory: exceeding the limit is an error of the current cell."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard != resource.RLIM_INFINITY:
         nbytes = min(nbytes, hard)
@@ -284,7 +285,7 @@ def limit_memory(nbytes: int) -> None:
 
 
 def work(channel: socket.socket, settings: WorkerSettings) -> int:
-    """Work in this process until the daemon closes the channel; returns the exit code."""
+    """Work in this process until the daemon closes the channel; return the exit code."""
     os.nice(_NICENESS)
     cache = None
     if settings.cache_dir and settings.cache_bytes:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages between the daemon and its loader workers.
 
-One packet of a SEQPACKET socket pair is one message (MessagePack array, kind first); `Job` also carries the
-descriptor of the file that the segment goes into, which has no name.  Both ends are always the same version
-of shmmap, so this is no public protocol.
+Each message is one packet of a SEQPACKET socket pair (MessagePack array, kind first).  A `Job` also carries
+the descriptor of the unnamed file that the segment is written to.  Both ends always have the same version of
+shmmap, so this is not a public protocol.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ __all__ = [
 
 
 class Job(msgspec.Struct, array_like=True, tag="job"):
-    """Load one layer of one cell; ``granted`` bytes are reserved for it.
+    """Order to load one layer of one cell; ``granted`` bytes are reserved for it.
 
-    ``points`` names the cell's ``points`` segment where that is in memory: a computed layer need not
-    read the source then.  ``neighbours`` are the cells around it, for a layer with a halo; ``ready`` is the
-    version of a layer that the origin has ready made, 0 of one that is computed.
+    ``points`` names the cell's ``points`` segment if it is in memory: a computed layer then need not read the
+    source.  ``neighbours`` are the surrounding cells, for a layer with a halo.  ``ready`` is the version of a
+    layer that the origin has ready-made, 0 for one that has to be computed.
     """
 
     number: int
@@ -56,7 +56,7 @@ class Job(msgspec.Struct, array_like=True, tag="job"):
 
 
 class Check(msgspec.Struct, array_like=True, tag="check"):
-    """Compare a source with ``stamp``, and a segment of an earlier run, if named, with its checksums."""
+    """Order to compare a source with ``stamp``, and a previous segment, if named, with its checksums."""
 
     number: int
     source: Source
@@ -65,50 +65,51 @@ class Check(msgspec.Struct, array_like=True, tag="check"):
 
 
 class Root(msgspec.Struct, array_like=True, tag="root"):
-    """Read files below the directory ``path`` through the descriptor that comes with the packet."""
+    """Order to read files below the directory ``path`` through the descriptor sent with the packet."""
 
     path: str
 
 
 class Decision(msgspec.Struct, array_like=True, tag="decision"):
-    """Whether the bytes asked for are reserved, or do not fit."""
+    """Answer to a `Need`: whether the requested bytes are reserved, or do not fit."""
 
     granted: bool
 
 
 class Ready(msgspec.Struct, array_like=True, tag="ready"):
-    """The worker has started: from now on its death is its job's fault.
+    """Report that the worker has started: from now on, its death is blamed on its job.
 
-    Its pidfd comes with the packet; ``pid`` is for operators and tests.
+    Its pidfd is sent with the packet; ``pid`` is for operators and tests.
     """
 
     pid: int
 
 
 class Begun(msgspec.Struct, array_like=True, tag="begun"):
-    """What a job needs has been fetched, and the worker works on it from now on.
+    """Report that the data of a job has been fetched, and that the worker works on the job from now on.
 
-    Only a worker that fetches for several jobs at once sends it; any other works on its jobs as they came.
+    Only a worker that fetches for several jobs at a time sends it; any other works on its jobs in order.
     """
 
     number: int
 
 
 class Need(msgspec.Struct, array_like=True, tag="need"):
-    """The segment needs more than was granted; the worker waits for a `Decision`."""
+    """Report that the segment needs more than was granted; the worker waits for a `Decision`."""
 
     number: int
     bytes: int
 
 
 class Done(msgspec.Struct, array_like=True, tag="done"):
-    """The segment is finished, and the worker has closed its own descriptor of it.
+    """Report that the segment is finished, and that the worker has closed its own descriptor of it.
 
-    So the daemon can ask the kernel from the first moment on which processes use the segment.
-    ``version`` is that of its bytes, ``points`` are the layer's rows, ``z_min`` and ``z_max`` bound the
-    source's points; ``neighbours`` are the stamps of the job's, as they were read; ``cached``: it came out of
-    the disk cache; ``outside`` points lie outside the cell's box; ``objects``: what the worker has read of a
-    published map since its last report (`shmmap.origin.remote.object_tier.ObjectCounts`).
+    So the daemon can ask the kernel from the first moment on which processes use the segment.  ``version`` is
+    the version of its bytes, ``points`` the number of the layer's rows; ``z_min`` and ``z_max`` bound the
+    source's points.  ``neighbours`` are the stamps of the job's neighbours as they were read.  ``cached``:
+    the layer came from the disk cache.  ``outside``: number of points outside the cell's box.  ``objects``:
+    counts of the worker's reads from a published map since its last report
+    (`shmmap.origin.remote.object_tier.ObjectCounts`).
     """
 
     number: int
@@ -128,9 +129,9 @@ class Done(msgspec.Struct, array_like=True, tag="done"):
 
 
 class Checked(msgspec.Struct, array_like=True, tag="checked"):
-    """Source and segment are what they should be, or ``wrong`` says why not; the worker has closed both.
+    """Report that source and segment are valid, or why not (``wrong``); the worker has closed both.
 
-    ``stamp`` is the source's state, if it could be looked at.
+    ``stamp`` is the source's state, if it could be read.
     """
 
     number: int
@@ -139,7 +140,7 @@ class Checked(msgspec.Struct, array_like=True, tag="checked"):
 
 
 class Failed(msgspec.Struct, array_like=True, tag="failed"):
-    """No segment; ``stamp`` is the source's, if it is known; ``unread``: it could not be read.
+    """Report that a job failed; ``stamp`` is the source's, if known; ``unread``: it could not be read.
 
     ``objects`` as in `Done`.
     """
@@ -153,9 +154,9 @@ class Failed(msgspec.Struct, array_like=True, tag="failed"):
 
 
 class Ended(msgspec.Struct, array_like=True, tag="ended"):
-    """The worker's process has ended: its exit code (a signal's number below zero), or why there was none.
+    """How the worker's process ended: its exit code (negative signal number), or why it could not start.
 
-    Its parent sends it over the worker's channel, after everything that the worker has sent.
+    The worker's parent sends it over the worker's channel, after everything that the worker has sent.
     """
 
     code: int

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pool of loader workers: started on demand, given several jobs ahead, killed at a deadline.
+"""Pool of loader workers: started on demand, given several jobs in advance, killed at a deadline.
 
-Computed layers may take seconds each.  So a cell's points never wait behind them: they go to workers that
-compute nothing, and while all compute one more is kept for points alone.
+Computed layers may take seconds each.  So that a cell's points never wait for them, points are given to
+workers that compute nothing, and while all workers compute, an extra worker is kept for points alone.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ __all__ = ["NOT_OPENED", "Opened", "Work", "Worker", "WorkerPool"]
 
 Work = worker_messages.Job | worker_messages.Check
 Opened: TypeAlias = tuple[str, int]
-"""A directory that files are read through: its path, and a descriptor of it."""
+"""Directory through which files are read: its path, and its descriptor."""
 NOT_OPENED: Final = ("", -1)
 
 JOBS_AHEAD: Final = 4
-"""Jobs a worker is given beyond the one it works on, so that it never waits for the daemon's loop."""
+"""Jobs given to a worker beyond its current one, so that it never waits for the daemon's loop."""
 
 LAYERS_AHEAD: Final = 1
-"""Computed layers among them: each may take long, and the next request waits for all that were given out."""
+"""Computed layers among these: each may take long, and a later request waits for all that were given out."""
 
 START_DEADLINE_S: Final = 60.0
-"""How long a worker may take from its first job until it is ready: its parent's imports, and a fork."""
+"""How long a worker may take from its first job until it is ready: the parent's imports and a fork."""
 
 
 def _has_ended(pidfd: int) -> bool:
@@ -51,33 +51,33 @@ def _has_ended(pidfd: int) -> bool:
 
 
 def is_computed(job: Work) -> bool:
-    """Whether a job may take long; a look at a file or a segment does not."""
+    """Whether a job may take long; a check of a file or a segment does not."""
     return isinstance(job, worker_messages.Job) and job.layer != LAYER and not job.ready
 
 
 @dataclass(eq=False, slots=True)
 class Worker:
-    """One worker process; ``queue`` holds its jobs.
+    """One worker process; ``queue`` contains its jobs.
 
-    It works on the first of them, or, if it fetches for several jobs at once, on the one that it said it has
-    ``begun``.
+    It works on the first job of the queue.  A worker that fetches for several jobs at a time works on the one
+    that it reported as ``begun``.
 
     Attributes
     ----------
     for_points
-        It is the one more that computes nothing.
+        Whether it is the extra worker that computes nothing.
     layers
-        How many of its jobs are layers to be computed.
+        Number of its jobs that compute layers.
     pid, pidfd
-        Its process, from when it is ``ready``.
+        Its process, once it is ``ready``.
     segments
-        Files without names that its jobs' segments go into, by job.
+        Unnamed files for its jobs' segments, by job.
     prefetched
-        Those of its jobs that no client waited for when they were given out.
+        Its jobs that no client waited for when they were given out.
     since_s
-        When it began with its job; or when its last message came, if it only fetches.
+        When it began its current job; while it only fetches, when its last message arrived.
     opened
-        Directory that it reads files through.
+        Directory through which it reads files.
     """
 
     channel: socket.socket
@@ -95,50 +95,50 @@ class Worker:
 
     @property
     def fd(self) -> int:
-        """Descriptor to poll."""
+        """File descriptor to poll."""
         return self.channel.fileno()
 
     @property
     def load(self) -> tuple[int, bool]:
-        """How busy it is; a demand had better not come behind what is fetched ahead."""
+        """How busy it is, as a sort key: a demand should not queue behind prefetched cells."""
         return len(self.queue) + len(self.prefetched), bool(self.prefetched)
 
     @property
     def ready(self) -> bool:
-        """Whether it has begun: its death is its job's fault from then on."""
+        """Whether the worker has started: its death is blamed on its job from then on."""
         return self.pid != 0
 
     @property
     def at_work(self) -> int:
-        """Number of the job that it works on; 0 for none."""
+        """Number of its current job; 0 for none."""
         return self.begun if self.fetches else next(iter(self.queue), 0)
 
 
 @dataclass(eq=False, slots=True)
 class WorkerPool:
-    """Up to ``limit`` worker processes, and one more for points while all of them compute.
+    """Up to ``limit`` worker processes, and an extra one for points while all of them compute.
 
     Parameters
     ----------
     limit
         Most workers at a time.
     directory
-        Where segments are made.
+        Directory in which segments are made.
     parent
-        Makes them.
+        Forks the workers.
     deadline_s
-        How long one load may take; then its worker is killed.
+        Time limit of one load; its worker is killed when it expires.
     watched
         Watches the workers' descriptors.
     on_message
         Called with a worker whose channel can be read.
     places
-        Jobs that a worker can do at once: more than one where what they need has to be fetched.
+        Jobs that a worker can do at a time: more than one where their data has to be fetched.
 
     Attributes
     ----------
     failed_starts
-        Workers in a row that ended before they were ready: not their job's fault.
+        Consecutive workers that ended before they were ready, which is not their job's fault.
     """
 
     limit: int
@@ -162,19 +162,19 @@ class WorkerPool:
     # --- giving jobs ------------------------------------------------------------------------
 
     def has_room(self, *, computed: bool) -> bool:
-        """Whether a worker could take a job: one that computes a layer, or another one."""
+        """Whether a worker could take a job: one that computes a layer, or any other."""
         found = self._least_busy(computed=computed) is not None
         return found or self._may_start or (not computed and self._may_start_one_for_points)
 
     @property
     def free_places(self) -> int:
-        """How many jobs could be begun at once."""
+        """Number of jobs that could begin at once."""
         queues = [len(worker.queue) for worker in self._workers.values() if not worker.for_points]
         free = sum(max(0, self.places - jobs) for jobs in queues)
         return free + self.places * max(0, self.limit - len(queues) - len(self._ending))
 
     def _least_busy(self, *, computed: bool) -> Worker | None:
-        """Return the worker for the next job of a kind; None if none has room for it."""
+        """Return the worker for the next job of a kind; None if no worker has room for it."""
         able = [
             worker
             for worker in self._workers.values()
@@ -186,21 +186,21 @@ class WorkerPool:
 
     @property
     def _may_start(self) -> bool:
-        """Whether there may be one more that does everything.
+        """Whether another worker for all kinds of jobs may be started.
 
-        Workers that were killed and have not ended count: on a file system that hangs they would pile up.
+        Workers that were killed and have not exited count: on a file system that hangs they would pile up.
         """
         count = sum(not worker.for_points for worker in self._workers.values())
         return count + len(self._ending) < self.limit
 
     @property
     def _may_start_one_for_points(self) -> bool:
-        """Whether all compute, so that there may be one more for what is not computed."""
+        """Whether all workers compute, so that an extra one for points may be started."""
         count = len(self._workers) + len(self._ending)
         return bool(self._workers) and count <= self.limit and all(w.layers for w in self)
 
     def start_one(self, *, for_points: bool = False) -> Worker:
-        """Start a worker process; OSError if that cannot be done."""
+        """Start a worker process; raise OSError if that fails."""
         ours, theirs = channel()
         try:
             with theirs:
@@ -220,14 +220,14 @@ class WorkerPool:
         Parameters
         ----------
         prefetch
-            Whether no client waits for it.
+            Whether no client waits for the job.
         opened
-            Directory that its files are to be read through: its path and a descriptor; -1 for none.
+            Directory through which its files are to be read: path and descriptor; -1 for none.
 
         Raises
         ------
         OSError
-            No file can be made for its segment.
+            The file for its segment cannot be created.
         """
         computed = is_computed(job)
         worker, start = self._least_busy(computed=computed), self._may_start
@@ -236,12 +236,12 @@ class WorkerPool:
         if worker is None or (len(worker.queue) >= self.places and start):
             try:
                 worker = self.start_one(for_points=not start)
-            except OSError as error:  # no more processes, memory or descriptors just now
+            except OSError as error:  # not enough processes, memory or descriptors at present
                 log.error("loader could not start", reason=error)
                 if worker is None:
                     return False
         if worker.ready and _has_ended(worker.pidfd):
-            return False  # its parent is about to say so: the job would be taken for what it died of
+            return False  # its end is about to be reported: the job would be taken for the cause
         fd = -1 if isinstance(job, worker_messages.Check) else self.directory.create()
         try:
             self._send_root(worker, opened)
@@ -249,7 +249,7 @@ class WorkerPool:
         except OSError:
             if fd >= 0:
                 os.close(fd)
-            return False  # full or dying: its end is reported by its channel
+            return False  # full or dying: its channel reports its end
         if fd >= 0:
             worker.segments[job.number] = fd
         if not worker.queue:
@@ -261,10 +261,10 @@ class WorkerPool:
         return True
 
     def read_through(self, opened: Opened) -> None:
-        """Make all workers read what they are given from now on through another directory."""
+        """Make all workers read through another directory from their next job on."""
         for worker in self._workers.values():
             worker.opened = ("unknown", -1)
-            with contextlib.suppress(OSError):  # full or dying: with its next job, if there is one
+            with contextlib.suppress(OSError):  # full or dying: sent with its next job, if there is one
                 self._send_root(worker, opened)
 
     def _send_root(self, worker: Worker, opened: Opened) -> None:
@@ -273,7 +273,7 @@ class WorkerPool:
             worker.opened = opened
 
     def _send(self, worker: Worker, job: Work | worker_messages.Root, fd: int) -> None:
-        """Send a job, and an empty file with one that makes a segment; or a directory."""
+        """Send a job, with the empty file for its segment if it makes one; or a directory."""
         packet = worker_messages.encode(job)
         if fd < 0:
             worker.channel.send(packet)
@@ -288,19 +288,19 @@ class WorkerPool:
     # --- messages --------------------------------------------------------------------------
 
     def receive(self, worker: Worker) -> tuple[worker_messages.FromWorker, int] | None:
-        """Return the next message of a worker and its descriptor (-1: none); None when there is none now.
+        """Return a worker's next message and its descriptor (-1: none); None if there is no message now.
 
         Raises
         ------
         EOFError
-            When the worker's parent is gone, and it with it, or its message cannot be read.
+            The worker's parent is gone, and the worker with it, or the message cannot be read.
         """
         while True:
             try:
                 data, fd = receive_packet(worker.channel, self._buffer)
                 break
             except ConnectionResetError:
-                continue  # reported once, before what the dead worker had still sent
+                continue  # reported once, before the messages that the dead worker had sent
             except BlockingIOError:
                 return None
             except OSError as error:
@@ -316,24 +316,24 @@ class WorkerPool:
             raise EOFError("its message could not be read") from error
 
     def begun(self, worker: Worker, pid: int, pidfd: int, now_s: float) -> None:
-        """Note that a worker is ready; its pidfd is the pool's now."""
+        """Note that a worker is ready; the pool now owns its pidfd."""
         worker.pid, worker.pidfd = pid, pidfd
         worker.since_s = now_s
         self.failed_starts = 0
 
     def works_on(self, worker: Worker, number: int, now_s: float) -> None:
-        """Note that a worker that fetches has what a job needs, and works on it from now on."""
+        """Note that a worker that fetches has a job's data, and works on that job from now on."""
         worker.begun, worker.since_s = number, now_s
 
     def finished(self, worker: Worker, number: int, now_s: float) -> tuple[int, float]:
-        """Note the end of a job; the worker's next one begins now, unless it fetches.
+        """Note the end of a job; the worker's next job begins now, unless the worker fetches.
 
         Returns
         -------
         fd
-            The file that its segment is in, the caller's to close; -1 for none.
+            The file that its segment is in, to be closed by the caller; -1 for none.
         spent_s
-            How long it worked on it, seconds.
+            How long the worker worked on the job, seconds.
         """
         began_s, at_work = worker.since_s, worker.at_work == number
         job = worker.queue.pop(number, None)
@@ -348,7 +348,7 @@ class WorkerPool:
     # --- their end ------------------------------------------------------------------------------
 
     def remove(self, worker: Worker) -> list[Work]:
-        """Forget a worker that is dead, or is to be; returns its unfinished jobs."""
+        """Remove a worker that is dead, or about to be killed; return its unfinished jobs."""
         self.watched.unwatch(worker.fd)
         self._workers.pop(worker.fd, None)
         worker.channel.close()
@@ -372,18 +372,18 @@ class WorkerPool:
         os.close(pidfd)
 
     def overdue(self, now_s: float) -> list[Worker]:
-        """Return workers whose load or start is past its deadline, or that fetch without a message."""
+        """Return workers whose load or start has passed its deadline, or that fetch without messages."""
         return [w for w in self._workers.values() if w.queue and now_s >= self._due_s(w)]
 
     def _due_s(self, worker: Worker) -> float:
         return worker.since_s + (self.deadline_s if worker.ready else START_DEADLINE_S)
 
     def next_deadline_s(self) -> float:
-        """Return when the next load becomes overdue; infinity when nothing loads."""
+        """Return when the next load becomes overdue; infinity when nothing is being loaded."""
         return min((self._due_s(w) for w in self._workers.values() if w.queue), default=float("inf"))
 
     def close(self) -> None:
-        """End every worker, and their parent."""
+        """End every worker, and the parent process."""
         for worker in self:
             self.remove(worker)
         self.parent.close()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The catalogue of the map served, its files, and changing from one to the next."""
+"""The catalogue of the served map, its files, and the switch from one catalogue to the next."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading the map's catalogue again, beside the serving loop.
+"""Reload of the map's catalogue, outside the serving loop.
 
-Looking at every file of a large map takes seconds, so it happens in a thread; an event descriptor
-wakes the loop, which then changes over in one step; what has changed is found out in the
-thread, too.  A state whose list of cells comes in pages may be held back until those have come that are
-needed; one that is loaded meanwhile takes its place.  Requests for another reload while
-one runs are answered by the next one, which sees everything that they could mean.
+Checking every file of a large map takes seconds, so it runs in a thread, which also compares the new state
+with the old one.  An event descriptor wakes the loop, which then switches in one step.  If the list of cells
+is paged, the new state may be held back until the needed pages have arrived; a state loaded in the meantime
+replaces it.  Requests that arrive during a reload are answered by the next one, which sees all changes made
+before them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["Reloader", "Reread"]
 
 @dataclass(frozen=True, slots=True)
 class Reread:
-    """Another state of the map, and what it differs in from the one that was served when it was asked for."""
+    """Another state of the map, and its difference from the state served when the reload was requested."""
 
     catalogue: CatalogueView
     change: CatalogueChange
@@ -33,7 +33,7 @@ class Reread:
 
 Answer = Callable[[Reread | ShmmapError], None]
 Apply = Callable[[Reread], Reread | None]
-"""Serves what was loaded, and returns what changed with that; None where it has to be held back."""
+"""Serves a loaded state and returns it with its final difference; returns None if it has to be held back."""
 
 
 class Reloader:
@@ -42,14 +42,14 @@ class Reloader:
     Parameters
     ----------
     origin
-        Where the map comes from.
+        Where the map is loaded from.
     served
-        Gives the state of the map that is served.
+        Returns the state of the map that is served.
 
     Attributes
     ----------
     fd
-        Readable when a result is there: call `collect` then.
+        Readable when a result is available: call `collect` then.
     """
 
     def __init__(self, origin: ViewOrigin, served: Callable[[], CatalogueView]) -> None:
@@ -65,7 +65,7 @@ class Reloader:
 
     @property
     def map_path(self) -> str:
-        """The map as a person would name it."""
+        """The map's name for people."""
         return self._origin.path
 
     def ask(self, answer: Answer) -> None:
@@ -79,7 +79,7 @@ class Reloader:
         self._thread = threading.Thread(target=self._load, args=(self._served(),), name="reload", daemon=True)
         try:
             self._thread.start()
-        except RuntimeError as error:  # there are as many threads as there may be
+        except RuntimeError as error:  # the limit of threads is reached
             self._thread = None
             self._result = ShmmapError(
                 f"{self._origin.path}: {error}", hint="raise the limit of processes (TasksMax=, ulimit -u)"
@@ -89,7 +89,7 @@ class Reloader:
     def _load(self, before: CatalogueView) -> None:
         try:
             catalogue = self._origin.load(fresh=True, before=before)
-            _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # found here, not in the loop
+            _ = catalogue.map_version, catalogue.bounds, catalogue.mean_size  # compute here, not in the loop
             self._result = Reread(catalogue, catalogue.changes_from(before))
         except ShmmapError as error:
             self._result = error
@@ -101,7 +101,7 @@ class Reloader:
         os.eventfd_write(self.fd, 1)
 
     def collect(self, apply: Apply, failed: Callable[[ShmmapError], None]) -> None:
-        """Apply a finished load, answer its callers, start the next if one was asked for since."""
+        """Apply a finished load, answer its callers, and start the next load if one was requested."""
         os.eventfd_read(self.fd)
         if self._thread is not None:
             self._thread.join()
@@ -120,7 +120,7 @@ class Reloader:
             self._begin()
 
     def apply_held(self, apply: Apply) -> None:
-        """Apply what was loaded last, unless it is still held back, and answer its callers."""
+        """Apply the held-back load unless it must still wait, and answer its callers."""
         applied = apply(self._held) if self._held is not None else None
         if applied is None:
             return

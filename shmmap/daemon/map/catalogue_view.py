@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of one state of the map, as requests see them: by index, whatever keeps the tables.
+"""View of the cells of one state of the map: access by index, however the tables are stored.
 
-**What a partial catalogue answers.**  Of a map whose list of cells comes in pages, a view (`CatalogueView`)
-answers for the cells of the pages that are here, and its `Pages` say which there are and have others fetched.
+**Partial catalogues.**  If a map's list of cells is paged, its view (`CatalogueView`) answers for the cells
+of the pages in memory.  Its `Pages` list all pages and fetch missing ones.
 
-- A view is one version of the map.  `map_version`, `len`, `bounds`, `mean_size`, `id_prefix` and `frame` are
-  those of the whole version, known before any page is, and never change while it is served.
-- A cell's index is the first index of its page (the counts of the pages before, summed) and its row there.
-  So it is fixed, whatever comes or goes: that is no other state of the map, and no event says so.
-- Rows, ``find`` and ``query`` answer for pages that are here.  To ask for a row of another page is a defect
-  (`KeyError`): a page stays while it has a segment, a load, a pin, a request in the making or a session's
-  area in it.  The daemon alone drops pages, when `Pages.spare` names one.
-- ``query`` says whether all pages of the area are here; ``find`` of an id in no page that is here is None.
-- Nothing waits: not for the network, not for a disk.  Pages are decoded elsewhere (a thread, say), and taken
-  into the tables in `Pages.collect`, in the serving loop, in less than a millisecond each.
-- Another version is another view: `ViewOrigin.load` returns it, in a thread, with what it can share of the
-  view before, which goes on changing in the serving loop meanwhile.  It is held back until `Pages.lacking`
-  says that nothing is missing where the view before knows cells; until then that one is served.  What differs
-  is then asked of `changes_from`, as far as both know it, in the serving loop.
-- What loads read is said by `source`.  A layer that the origin has ready made is not computed here: its size
-  in memory and its version are those that `ready` gives, and it looks into no other cells.
+- A view is one version of the map.  `map_version`, `len`, `bounds`, `mean_size`, `id_prefix` and `frame`
+  describe the complete version; they are known before any page and do not change while the view is served.
+- A cell's index is the first index of its page (the sum of the counts of the pages before) plus its row.  So
+  it is fixed, whichever pages are in memory: loading or dropping a page is no new state and causes no event.
+- Rows, ``find`` and ``query`` answer for pages in memory.  Asking for a row of another page is a defect
+  (`KeyError`): a page stays while one of its cells has a segment, a load, a pin, a request being answered or
+  a session's area in it.  Only the daemon drops pages, when `Pages.spare` names one.
+- ``query`` reports whether all pages of the area are in memory; ``find`` returns None for an id on a missing
+  page.
+- Nothing blocks on the network or a disk.  Pages are decoded elsewhere (in a thread, for example) and merged
+  into the tables by `Pages.collect`, in the serving loop, in less than a millisecond each.
+- Another version is another view.  `ViewOrigin.load` returns it, in a thread, and shares what it can with the
+  previous view, which the serving loop keeps changing.  The new view is held back until `Pages.lacking`
+  reports no missing page where the previous view knows cells; until then the previous view is served.  Then
+  the serving loop calls `changes_from` for the difference, as far as both views know their cells.
+- `source` names what loads read.  A layer that the origin has ready-made is not computed here: `ready` gives
+  its size in memory and its version, and it reads no other cells.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ __all__ = ["CatalogueView", "PageNews", "Pages", "Ready", "ViewOrigin"]
 
 
 class Ready(NamedTuple):
-    """A layer that the origin has ready made: its bytes in memory, and its version."""
+    """A layer that the origin has ready-made: its bytes in memory, and its version."""
 
     nbytes: int
     version: int
 
 
 class PageNews(NamedTuple):
-    """News of wanted pages: ``come`` are here, ``out_of_reach`` cannot be fetched at present."""
+    """Results for wanted pages: ``come`` are in memory now, ``out_of_reach`` cannot be fetched at present."""
 
     come: Sequence[int]
     out_of_reach: Sequence[int]
@@ -56,63 +57,63 @@ class PageNews(NamedTuple):
 class Pages(Protocol):
     """The pages of a map's list of cells, numbered from 0 in the order of their cells' indices.
 
-    All is asked in the serving loop and answered at once.
+    All methods are called in the serving loop and return at once.
     """
 
     @property
     def fd(self) -> int:
-        """Readable when there are news: call `collect` then."""
+        """Readable when there are results: call `collect` then."""
 
     def __len__(self) -> int:
-        """How many there are, here or not."""
+        """Return the number of pages, in memory or not."""
 
     def of_area(self, area: Area) -> Sequence[int]:
-        """Pages that may have cells which touch an area, here or not, ascending."""
+        """Return pages that may have cells which intersect an area, in memory or not, ascending."""
 
     def of_cell(self, index: int) -> int:
         """Return the page of a cell."""
 
     def cells(self, page: int) -> range:
-        """Return the indices of a page's cells, here or not."""
+        """Return the indices of a page's cells, in memory or not."""
 
     def cells_surely_in(self, area: Area) -> int:
-        """How many cells the pages have that lie wholly in an area: it has as many at least."""
+        """Return how many cells are on pages wholly in an area: a lower bound of the area's cells."""
 
     @property
     def known_cells(self) -> int:
-        """How many cells the pages have that are here."""
+        """Number of cells on pages in memory."""
 
     @property
     def known_pages(self) -> int:
-        """How many pages are here."""
+        """Number of pages in memory."""
 
     def is_here(self, page: int) -> bool:
-        """Whether the page's cells are known."""
+        """Whether a page is in memory."""
 
     def is_out_of_reach(self, page: int) -> bool:
-        """Whether it could not be fetched when it was last tried: no request waits for it.
+        """Whether the last attempt to fetch a page failed: requests do not wait for it.
 
-        It is tried again by itself, after a while; when it comes, that is news like any other.
+        The page is fetched again automatically after a while; its arrival is reported like any other.
         """
 
     def want(self, pages: Iterable[int], priority: float) -> None:
-        """Fetch pages, those with the lowest ``priority`` first, as loads have it.
+        """Fetch pages, those with the lowest ``priority`` first, with priorities as for loads.
 
-        That is metres from a client that asks, `shmmap.daemon.loading.loads.PREFETCH` and seconds for what
-        one will ask for.  A page that is wanted already only moves forward; one that is here counts as just
-        needed.
+        The priority is the distance from the asking client in metres, or for prefetching
+        `shmmap.daemon.loading.loads.PREFETCH` plus seconds.  A page that is already wanted only moves
+        forward; a page in memory counts as just needed.
         """
 
     def collect(self) -> PageNews:
-        """Take in what has come since the last time."""
+        """Merge pages that have arrived since the last call."""
 
     def lacking(self, before: Pages) -> Sequence[int]:
-        """Pages that are not here, and that lie where the version ``before`` has some that are."""
+        """Return the missing pages in the places where the version ``before`` has pages in memory."""
 
     def spare(self) -> int | None:
-        """Return the page that was needed least recently, if they take more memory than they may.
+        """Return the page that was needed least recently if pages exceed their memory limit, else None.
 
-        This is asked at every turn of the loop: it must cost nothing.
+        This is called in every turn of the loop, so it must be cheap.
         """
 
     def drop(self, page: int) -> None:
@@ -120,18 +121,18 @@ class Pages(Protocol):
 
 
 class CatalogueView(Protocol):
-    """What the daemon asks of a catalogue (`shmmap.origin.catalogue.Catalogue` is one).
+    """Interface of a catalogue for the daemon (`shmmap.origin.catalogue.Catalogue` implements it).
 
-    Nothing here looks at a file or asks a server: a stamp is what was known when the catalogue was made, or
-    what a loader has found since.
+    No method accesses a file or a server: a stamp is the one known when the catalogue was made, or one that a
+    loader has found since.
     """
 
     def __len__(self) -> int:
-        """How many cells the map has, known or not."""
+        """Return the number of cells in the map, known or not."""
 
     @property
     def pages(self) -> Pages | None:
-        """The map's pages; None where all cells are known from the beginning."""
+        """The map's pages; None if all cells are known from the beginning."""
 
     @property
     def complete(self) -> bool:
@@ -143,7 +144,7 @@ class CatalogueView(Protocol):
 
     @property
     def id_prefix(self) -> str:
-        """What all ids start with."""
+        """Common prefix of all ids."""
 
     @property
     def frame_id(self) -> str:
@@ -151,11 +152,11 @@ class CatalogueView(Protocol):
 
     @property
     def frame(self) -> MapFrame:
-        """Where the map frame lies in the world."""
+        """Position of the map frame in the world."""
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all cells, metres, map frame; None where there are none."""
+        """Box around all cells, metres, map frame; None if there are no cells."""
 
     @property
     def mean_size(self) -> tuple[float, float]:
@@ -167,61 +168,61 @@ class CatalogueView(Protocol):
 
     @property
     def opened(self) -> OpenedDirectories | None:
-        """Directories that its cells are to be read through; None: their sources have to do."""
+        """Directories through which its cells are read; None: the sources' paths are used."""
 
     def query(self, area: Area, most: int | None = None) -> tuple[NDArray[np.intp], bool]:
-        """Known cells whose box touches ``area``, in id order, and whether these are all.
+        """Return known cells whose box intersects ``area``, in id order, and whether these are all.
 
-        Where all cells are known, id order is that of the indices.  If there are more than ``most``, some of
-        them, more than ``most``, in no order.
+        If all cells are known, id order is index order.  If there are more than ``most``, the result is some
+        of them, more than ``most``, unordered.
         """
 
     def find(self, cell: str) -> int | None:
-        """Index of a cell by its id or a unique base name; None where there is none, or none known."""
+        """Return a cell's index by its id or a unique base name; None if no such cell is known."""
 
     def id(self, index: int) -> str:
-        """Id of a cell."""
+        """Return the id of a cell."""
 
     def box(self, index: int) -> tuple[float, float, float, float]:
-        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+        """Return ``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
 
     def boxes_of(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(K, 4) float64, boxes of these cells."""
+        """Return the boxes of these cells, (K, 4) float64."""
 
     def version(self, index: int) -> int:
-        """64-bit version of a cell."""
+        """Return the 64-bit version of a cell."""
 
     def source(self, index: int) -> Source:
-        """Where a cell's points come from, for loaders."""
+        """Return the source of a cell's points, for loaders."""
 
     def stamp(self, index: int) -> Stamp:
-        """Stamp of a cell's source as last known."""
+        """Return the last known stamp of a cell's source."""
 
     def source_bytes(self, index: int) -> int:
-        """Size of a cell's source as last known."""
+        """Return the last known size of a cell's source."""
 
     def ready(self, index: int, layer: str) -> Ready | None:
-        """Return what is known of a layer that the origin has ready made; None: it is computed here.
+        """Return size and version of a layer that the origin has ready-made; None if it is computed here.
 
-        Of ``points`` it may be None, too: where their size is only guessed, and their version is `version`.
+        For ``points`` it may also be None if their size is only estimated; their version is then `version`.
         """
 
     def set_stamp(self, index: int, stamp: Stamp) -> None:
-        """Correct a cell's stamp: a loader has found another one; versions follow."""
+        """Replace a cell's stamp by the one that a loader found; versions follow."""
 
     def changes_from(self, before: CatalogueView) -> CatalogueChange:
-        """Find what differs from an earlier state, as far as both know it."""
+        """Return the difference from an earlier state, as far as both know their cells."""
 
 
 class ViewOrigin(Protocol):
-    """What views come from (`shmmap.origin.catalogue.MapOrigin` is one)."""
+    """Source of views (`shmmap.origin.catalogue.MapOrigin` implements it)."""
 
     @property
     def path(self) -> str:
-        """The map as a person would name it."""
+        """The map's name for people."""
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> CatalogueView:
-        """Find out which cells are known now; errors are those of `MapOrigin.load`.
+        """Load the cells that are known now; raises the errors of `MapOrigin.load`.
 
-        What has not changed since ``before``, an earlier view, may be shared with it.
+        Parts that have not changed since ``before``, an earlier view, may be shared with it.
         """

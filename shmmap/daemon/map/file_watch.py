@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noticing by inotify(7) that the map's files change, so that the map is reloaded by itself.
+"""Watches the map's files with inotify(7), so that the map is reloaded automatically when they change.
 
-What a path names may change without anything in the directory: a link in it, ``maps/current`` say, leads
-somewhere else, or a directory above gets another name.  That is noticed, too.
+The meaning of a path may change without any event in its directory: a link in the path, for example
+``maps/current``, is redirected, or a parent directory is renamed.  Such changes are detected, too.
 
-A change is acted upon once the files have been left alone for a moment, for a map is written file by
-file; however long that takes, not later than some seconds after it began.  The kernel reports only
-changes made on this machine: on NFS and the like, a reload has to be asked for.
+A map is written file by file, so a change takes effect once the files have been left alone for a moment, and
+at the latest some seconds after it began.  The kernel reports only changes made on this machine: on network
+file systems such as NFS, a reload has to be requested.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ __all__ = ["FileWatch", "directories_of"]
 SETTLE_S: Final = 0.5
 MAX_DELAY_S: Final = 5.0
 MAX_LINKS: Final = 40
-"""As many as the kernel follows."""
+"""Number of links that the kernel follows."""
 LOOK_S: Final = 1.0
-"""How often a directory that has vanished is looked for."""
+"""Interval of checking whether a vanished directory exists again."""
 
 _REMOTE: Final = (
     "nfs",
@@ -58,7 +58,7 @@ _REMOTE: Final = (
 
 
 def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
-    """Return the directories whose files make up a map; all its cells' ids start with ``id_prefix``."""
+    """Return the directories whose files make up a map; all cell ids start with ``id_prefix``."""
     found = {map_path if os.path.isdir(map_path) else os.path.dirname(map_path)}
     if metadata:
         found.add(os.path.dirname(os.path.abspath(metadata)))
@@ -69,7 +69,7 @@ def directories_of(map_path: str, metadata: str, id_prefix: str) -> set[str]:
 
 
 def steps_to(path: str) -> dict[str, set[str]]:
-    """Return the real directories along an absolute path, each with the links in it that lead on."""
+    """Return the real directories along an absolute path, each with its links that the path follows."""
     steps: dict[str, set[str]] = {}
     names, here, links = path.split("/")[::-1], "/", 0
     while names:
@@ -83,7 +83,7 @@ def steps_to(path: str) -> dict[str, set[str]]:
         next_step = os.path.join(here, name)
         try:
             target = os.readlink(next_step)
-        except OSError:  # no link
+        except OSError:  # not a link
             here = next_step
             continue
         followed.add(name)
@@ -96,22 +96,22 @@ def steps_to(path: str) -> dict[str, set[str]]:
 
 
 class FileWatch:
-    """Watches directories for changes of the files in them.
+    """Watches directories for changes of their files.
 
     Parameters
     ----------
     directories
-        What to watch; those that vanish are watched again when something is there, which is a change.
+        Directories to watch; one that vanishes is watched again when it reappears, which counts as a change.
 
     Attributes
     ----------
     fd : int
-        Readable when something changed: call `drain` then.
+        Readable after a change: call `drain` then.
 
     Raises
     ------
     CannotStart
-        The kernel lets this user watch nothing more.
+        The kernel's limit of watches for this user is reached.
     """
 
     def __init__(self, directories: Iterable[str]) -> None:
@@ -139,15 +139,15 @@ class FileWatch:
                 )
 
     def follow(self, directories: Iterable[str]) -> None:
-        """Watch these too, as soon as they can be; watching one twice is the same as once."""
+        """Watch further directories as soon as they exist; repeated calls have no effect."""
         for directory in directories:
             self._add(directory)
 
     def _add(self, directory: str) -> OSError | None:
-        """Watch a directory, or return why that cannot be."""
+        """Watch a directory; return the error if that fails."""
         for place, links in steps_to(os.path.abspath(directory)).items():
             mask = ALSO | SELF_GONE | (NAMES_CHANGED if links else 0)
-            with contextlib.suppress(OSError):  # to where this user may not look
+            with contextlib.suppress(OSError):  # a directory that this user may not read
                 self._steps.setdefault(self._inotify.add(place, mask), set()).update(links)
         try:
             self._paths[self._inotify.add(directory, CHANGED | ALSO)] = directory
@@ -158,7 +158,7 @@ class FileWatch:
         return None
 
     def drain(self, now_s: float) -> None:
-        """Read what the kernel reports, a bounded number of events at a time."""
+        """Read the kernel's events, a bounded number at a time."""
         for event in self._inotify.read():
             lost = event.mask & OVERFLOW
             if lost or event.mask & SELF_GONE or event.name in self._steps.get(event.watch, ()):
@@ -167,16 +167,16 @@ class FileWatch:
                 self._steps.pop(event.watch, None)
             if event.watch not in self._paths:
                 continue
-            if event.mask & SELF_MOVED:  # what is followed is a path, not what used to be there
+            if event.mask & SELF_MOVED:  # watch the path, not the directory that was moved
                 self._inotify.remove(event.watch)
             if event.mask & (SELF_MOVED | ENDED):
                 self._missing.add(self._paths.pop(event.watch))
-            # a file that is only created has nothing in it yet: its writer closes or renames it
+            # a file that was only created is still empty: its writer will close or rename it
             if not event.mask & ENDED and (event.mask & DIRECTORY or not event.mask & CREATED):
                 self._note(now_s)
 
     def _path_changed(self, now_s: float) -> None:
-        """Watch the paths again when they are there: another directory may have one of them."""
+        """Watch the paths again as soon as they exist: they may lead to other directories now."""
         for watch in {**self._paths, **self._steps}:
             self._inotify.remove(watch)
         self._missing.update(self._paths.values())
@@ -191,7 +191,7 @@ class FileWatch:
         self._last_s = now_s
 
     def due(self, now_s: float) -> bool:
-        """Return whether it is time to read the map again; True once per change."""
+        """Return whether to read the map again now; True once per change."""
         if self._missing and now_s >= self._look_s:
             self._look_s = now_s + LOOK_S
             before = len(self._missing)

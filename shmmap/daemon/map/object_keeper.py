@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fetches objects of a published map onto the disk before any loader needs them, in a few threads.
 
-They are fetched and checked against their hash as loaders do it; they are not unpacked.
+Objects are fetched and verified against their hash as loaders do it; they are not unpacked.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ __all__ = ["Kept", "KeptCell", "ObjectKeeper"]
 
 THREADS: Final = 8
 END_S: Final = 0.5
-"""How long a daemon that ends waits for a thread that waits for the store, seconds."""
+"""How long a daemon that stops waits for a thread that waits for the store, seconds."""
 
 
 class KeptCell(NamedTuple):
-    """The layer of a cell that objects belong to; the cell by its index in a version of the map."""
+    """The layer of a cell that objects belong to; the cell is given by its index in a version of the map."""
 
     map_version: int
     cell: int
@@ -36,14 +36,14 @@ class KeptCell(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What has become of the objects asked for.
+    """Result of keeping a cell's objects.
 
     Attributes
     ----------
     is_here
-        They are on the disk.
+        The objects are on the disk.
     has_no_room
-        They were fetched, but the disk has no room for them.
+        The objects were fetched, but the disk has no room for them.
     """
 
     key: KeptCell
@@ -52,7 +52,7 @@ class Kept(NamedTuple):
 
 
 class ObjectKeeper:
-    """Fetches into the disk tier alone.
+    """Fetches objects into the disk tier only.
 
     Parameters
     ----------
@@ -75,16 +75,16 @@ class ObjectKeeper:
 
     @property
     def counts(self) -> ObjectCounts:
-        """What was read so far."""
+        """Counts of reads so far."""
         return self._objects.counts
 
     @property
     def free_places(self) -> int:
-        """How many more can be begun at once."""
+        """Number of further cells that could be begun now."""
         return THREADS - self._under_way
 
     def keep(self, key: KeptCell, names: Sequence[ObjectName]) -> None:
-        """Bring these objects to the disk."""
+        """Fetch objects onto the disk."""
         self._under_way += 1
         if len(self._threads) < min(self._under_way, THREADS):
             thread = threading.Thread(target=self._run, name="keep", daemon=True)
@@ -97,7 +97,7 @@ class ObjectKeeper:
             self._finish(Kept(key, False))
 
     def take(self) -> list[Kept]:
-        """Return what was done since the last time."""
+        """Return the results since the last call."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         found = [self._done.popleft() for _ in range(len(self._done))]
@@ -123,15 +123,15 @@ class ObjectKeeper:
         except Offline:
             self._failed()
             return Kept(key, False)
-        except ShmmapError:  # a loader that needs it reports it, with the cell's name
+        except ShmmapError:  # a loader that needs the object reports the error with the cell's name
             return Kept(key, False)
-        except Exception:  # noqa: BLE001  else it would stay under way
+        except Exception:  # noqa: BLE001  else the cell would stay under way
             log.exception("an object cannot be kept on disk ahead", cause="a defect in shmmap")
             return Kept(key, False)
         return Kept(key, True)
 
     def close(self) -> bool:
-        """End the threads; False if one still waits for the store."""
+        """End the threads; return False if one still waits for the store."""
         with contextlib.suppress(queue.Empty):
             while True:
                 self._wanted.get_nowait()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks, in a thread, whether an origin elsewhere has another version, and whether it is back in reach."""
+"""Polls a remote origin in a thread: whether it has another version, and whether it is reachable again."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from shmmap.logfmt import log
 __all__ = ["LinkNews", "OriginLink"]
 
 PROBE_S: Final = 1.0
-"""How often an origin that is out of reach is asked."""
+"""Interval of polling an origin that is unreachable."""
 JITTER: Final = 0.2
-"""Of the time between two questions: a fleet must not ask all at once."""
+"""Random part of the polling interval: the vehicles of a fleet must not poll simultaneously."""
 LONG_TRUST_S: Final = 32.0
-"""Most time that an origin which answers is not doubted for single things that cannot be fetched."""
+"""Longest delay of a poll after a failed fetch, for an origin that keeps answering."""
 END_S: Final = 0.5
 
 
 class LinkNews(NamedTuple):
-    """What was found since the last time: another version is there; the origin answers again."""
+    """Results since the last call: another version exists; the origin answers again."""
 
     changed: bool
     back: bool
 
 
 class OriginLink:
-    """One origin, as it answers.
+    """Link to one origin, and whether it answers.
 
     Parameters
     ----------
     ask
-        Asks it whether there is another version than the one that was taken last; raises `Offline`.
+        Polls the origin: whether its version differs from the last one taken; raises `Offline`.
     poll_s
-        How often, seconds; 0: only to find out whether it answers again.
+        Polling interval, seconds; 0: poll only to find out whether the origin answers again.
 
     Attributes
     ----------
     fd
-        Readable when there are news: call `take` then.
+        Readable when there are results: call `take` then.
     """
 
     def __init__(self, ask: Callable[[], bool], poll_s: float) -> None:
@@ -65,18 +65,18 @@ class OriginLink:
 
     @property
     def is_out(self) -> bool:
-        """Whether it did not answer when it was last asked for anything."""
+        """Whether the origin failed to answer the last poll or fetch."""
         return self._is_out
 
     @property
     def is_doubted(self) -> bool:
-        """Whether it may be out of reach, or is: it is being asked."""
+        """Whether the origin is or may be unreachable, so that it is being polled."""
         return self._is_out or self._is_doubted
 
     def doubt(self) -> None:
-        """Something could not be fetched: find out whether anything can.  May be called in any thread.
+        """Note a failed fetch, and poll whether the origin answers.  May be called in any thread.
 
-        Where it just has answered, that one thing is what cannot be fetched: it is asked again later.
+        If the origin has just answered, only that object cannot be fetched, and the poll is delayed.
         """
         with self._condition:
             if self.is_doubted or self._closed:
@@ -89,14 +89,14 @@ class OriginLink:
             self._condition.notify()
 
     def ask_now(self) -> None:
-        """Ask without waiting for the next time."""
+        """Poll without waiting for the interval."""
         with self._condition:
             self._now = True
             self._start()
             self._condition.notify()
 
     def take(self) -> LinkNews:
-        """Return what was found since the last time."""
+        """Return the results since the last call."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         with self._condition:
@@ -107,7 +107,7 @@ class OriginLink:
     def _start(self) -> None:
         if self._thread is None:
             thread = threading.Thread(target=self._run, name="origin", daemon=True)
-            with contextlib.suppress(RuntimeError):  # as many threads as there may be: at the next doubt
+            with contextlib.suppress(RuntimeError):  # limit of threads reached: start at the next doubt
                 thread.start()
                 self._thread = thread
 
@@ -143,7 +143,7 @@ class OriginLink:
         except ShmmapError as error:
             log.error("the map's origin names no usable version", reason=error)
             changed, answers = False, True
-        except Exception:  # noqa: BLE001  else it would never be asked again
+        except Exception:  # noqa: BLE001  else the origin would never be polled again
             log.exception("the map's origin cannot be asked", cause="a defect in shmmap")
             changed, answers, reason = False, False, "a defect in shmmap"
         with self._condition:
@@ -162,12 +162,12 @@ class OriginLink:
             log.info("the map's origin answers again")
         if self._has_failed or now_s > self._answered_s + LONG_TRUST_S:
             self._trust_s = PROBE_S
-        elif self.is_doubted:  # it answers, and yet something cannot be fetched
+        elif self.is_doubted:  # the origin answers, and yet an object cannot be fetched
             self._trust_s = min(2 * self._trust_s, LONG_TRUST_S)
         self._answered_s = now_s
 
     def close(self) -> bool:
-        """End the thread; False if it still waits for the origin."""
+        """End the thread; return False if it still waits for the origin."""
         with self._condition:
             self._closed = True
             self._condition.notify()

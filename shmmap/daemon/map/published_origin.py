@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map as the daemon's origin: which version is taken, its root, and what fetches the rest."""
+"""A published map as the daemon's origin: choice of the version, its root, and fetching of its pages."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ __all__ = ["PublishedOrigin"]
 
 NOTHING: Final = CurrentState(None, None)
 VERIFY_S: Final = 30.0
-"""Time limit for verifying, seconds: requests to a silent server end long before."""
+"""Time limit for verification, seconds; requests to a silent server time out long before."""
 
 
 class _Offer(NamedTuple):
-    """The version that the origin names as current; if signed, when it was signed and when that expires."""
+    """The version that the origin names as current; if signed, with the times of signature and expiry."""
 
     current: Current
     signed_s: float = 0.0
@@ -62,7 +62,7 @@ class _Offer(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """What is wrong with an offer, by the names that errors have for it."""
+    """Why an offered version is refused, as the error's fields."""
 
     code: str
     cause: str
@@ -73,41 +73,41 @@ class _Problem(NamedTuple):
 
 
 class PublishedOrigin:
-    """What views of a published map come from; see `shmmap.daemon.map.catalogue_view.ViewOrigin`.
+    """Source of the views of a published map; see `shmmap.daemon.map.catalogue_view.ViewOrigin`.
 
-    The first view is of the version that was taken last, whatever the origin offers then.  A reload reports
-    an offer that cannot be taken once, not with each poll; the next reload follows when the problem changes
-    or ends.
+    The first view is of the version taken last, whatever the origin offers then.  A reload reports an
+    unacceptable offer once, not with each poll; the next reload follows when the problem changes or ends.
 
     Parameters
     ----------
     instance, state_dir
-        Of the daemon; what was taken is remembered in its state directory, if it has one.
+        The daemon's instance and its state directory, if it has one, where the version taken is recorded.
     cache_dir, cache_bytes
-        Where objects are kept on the disk, and how much; 0: none.
+        Disk cache of objects, and its size; 0: no cache.
     catalogue_bytes
-        What the decoded list of cells of a large map may take of memory.
+        Memory limit of a large map's decoded list of cells.
     poll_s
-        How often it is asked whether there is another version; 0: never.
+        Interval of checking for another version, seconds; 0: never.
     accept_version
         A version that is taken although a later one was taken before; 0: none.
     trust
-        Path of the root of trust: the current version is then the one signed under it, as a separate process
-        verifies, and only a version taken under it is served at the start.  Empty: the one in ``CURRENT``.
+        Path of the root of trust.  The current version is then the one signed under it, as a separate process
+        verifies, and at the start only a version taken under it is served.  Empty: the version in
+        ``CURRENT``.
 
     Raises
     ------
     ConfigError
-        The root of trust cannot be read or is not one, or there is no state directory for what was verified.
+        The root of trust is unreadable or invalid, or no state directory exists to record verified versions.
 
     Attributes
     ----------
     served
-        For loaders.
+        Where loaders fetch objects.
     link
-        Says whether it is in reach, and has another version.
+        Reports whether the origin is reachable, and whether it has another version.
     keeper
-        Keeps objects of cells on the disk ahead; None where nothing is kept.
+        Keeps objects of cells on the disk ahead of use; None without a disk cache.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class PublishedOrigin:
         self._poll_s = poll_s
         self._accept_version = accept_version
         self._taken: TakenVersion | None = None
-        self._lock = threading.Lock()  # of `_taken`: a reload changes it, and the thread that asks
+        self._lock = threading.Lock()  # of `_taken`: reloads change it, and the polling thread reads it
         self._saving = threading.Lock()
         self._problem: _Problem | None = None
         self._refused = 0
@@ -161,19 +161,19 @@ class PublishedOrigin:
     # --- taking a version -------------------------------------------------------------------------
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> PublishedView:
-        """Take the version that is current; at the start the one that was taken last.
+        """Take the current version; at the start the version taken last.
 
         Raises
         ------
         MapMissing
-            Nothing is published there.
+            Nothing is published at the origin.
         MapDataError
-            Its index is damaged, the version is lower than one taken before, or the root of trust refuses it:
-            see `verify_apart`, whose other errors are raised, too.
+            The version's index is damaged, the version is lower than one taken before, or the root of trust
+            refuses it: see `verify_apart`, whose other errors are raised, too.
         Offline
-            It is out of reach.
+            The origin is unreachable.
         CannotStart
-            The same at the start, when nothing was taken before.
+            The origin is unreachable at the start, and no version was taken before.
         """
         view = before if isinstance(before, PublishedView) else None
         self._is_loading = True
@@ -189,13 +189,13 @@ class PublishedOrigin:
         except Offline as error:
             if fresh:
                 raise
-            # its exit code says to the service manager that a later start may succeed
+            # by the exit code, the service manager knows that a later start may succeed
             raise CannotStart(error.message, hint=error.hint) from None
         finally:
             self._is_loading = False
 
     def _offered(self, view: PublishedView | None) -> PublishedView:
-        """Take the version that is current."""
+        """Take the current version."""
         try:
             offer = self._read_offer()
             self._judge(offer)
@@ -224,7 +224,7 @@ class PublishedOrigin:
         return self._take(taken, root, known)
 
     def _read_offer(self) -> _Offer:
-        """Ask which version is current: the signed one, or without a root of trust the one in ``CURRENT``."""
+        """Ask for the current version: the signed one, or without a root of trust the one in ``CURRENT``."""
         self._refused = 0
         if self._trust:
             return self._verify()
@@ -238,7 +238,7 @@ class PublishedOrigin:
     def _verify(self) -> _Offer:
         """Verify in a separate process which version is signed."""
         tag = None
-        with contextlib.suppress(MapMissing, MapDataError):  # verifying names what is wrong
+        with contextlib.suppress(MapMissing, MapDataError):  # verification reports what is wrong
             _, tag = self._store.get_tagged(TIMESTAMP, MAX_METADATA_BYTES)
         settings = VerifySettings(
             self.path,
@@ -259,7 +259,7 @@ class PublishedOrigin:
         return _Offer(verified.current, verified.signed_s, verified.expires_s)
 
     def _judge(self, offer: _Offer) -> None:
-        """Refuse what must not be taken; the version that was taken may have been signed again."""
+        """Refuse an unacceptable version; the version taken may have been signed again."""
         with self._lock:
             taken = self._taken
             judged = judge_offer(taken, offer.current, accept=self._accept_version)
@@ -275,7 +275,7 @@ class PublishedOrigin:
         return frame, unpack_root(frame, name=f"{self.path}/{root_path(current)}")
 
     def _remembered(self) -> tuple[TakenVersion, Root] | None:
-        """Return the version that was taken before the start, if that is known."""
+        """Return the version taken before the start, if known."""
         if self._state is None:
             return None
         taken = self._state.load()
@@ -285,7 +285,7 @@ class PublishedOrigin:
             return None
         try:
             root = unpack_root(taken.root, name=self._state.path)
-        except MapDataError as error:  # of a later version of shmmap, say
+        except MapDataError as error:  # for example, written by a later version of shmmap
             log.warning("the version taken last cannot be served", reason=error)
             return None
         with self._lock:
@@ -293,7 +293,7 @@ class PublishedOrigin:
         return taken, root
 
     def _restored(self, taken: TakenVersion, root: Root) -> PublishedView:
-        """Serve what was taken before the start, as far as it is on the disk."""
+        """Return a view of the version taken before the start, with the pages that are on the disk."""
         known: dict[int, Shard] = {}
         if self._tier is not None and len(root.keys) <= FEW_SHARDS:
             self._fetch_all(root, known, _OnDisk(self._index))
@@ -313,13 +313,13 @@ class PublishedOrigin:
         return view
 
     def _fetch_all(self, root: Root, known: dict[int, Shard], objects: ObjectReader) -> None:
-        """Read what is lacking of few shards, as far as they can be fetched."""
+        """Read the missing shards of a map with few shards, as far as they can be fetched."""
 
         def fetch(number: int) -> Shard | None:
             try:
                 return unpack_shard(read_shard_object(objects, root, number), root, number)
             except ShmmapError:
-                return None  # tried again, and its error said, in the background
+                return None  # fetched again in the background, which reports the error
 
         lacking = [number for number in range(len(root.keys)) if number not in known]
         with ThreadPoolExecutor(THREADS, "shards") as pool:
@@ -327,15 +327,15 @@ class PublishedOrigin:
             known.update((number, shard) for number, shard in fetched if shard is not None)
 
     def _has_another(self) -> bool:
-        """Whether a reload would find something else than is known; asked in a thread.
+        """Whether a reload would find something new; called in a thread.
 
-        That is another version than the one taken, a new problem with the offer, or the end of one.
+        That is another version than the one taken, a new problem with the offer, or the end of a problem.
         """
         if self._taken is None:
             return False
         is_same = self._is_same(self._probe if self.link.is_out else self._store)
         before = self._problem
-        if self._is_loading or (is_same and before is None):  # a reload that runs says what it finds
+        if self._is_loading or (is_same and before is None):  # a running reload reports what it finds
             return False
         try:
             offer = self._read_offer()
@@ -343,14 +343,14 @@ class PublishedOrigin:
             if offer.current != self._taken.current:
                 self._read_root(offer.current)
                 return True
-        except ShmmapError as error:  # out of reach, too: it has just answered
+        except ShmmapError as error:  # also if unreachable, although the origin has just answered
             return not self._is_loading and _Problem.of(error) != self._problem
         return before is not None
 
     def _is_same(self, store: Store) -> bool:
-        """Whether the origin still offers what it offered when it was last read."""
+        """Whether the origin still offers what it offered at the last read."""
         path, tag = TIMESTAMP if self._trust else CURRENT, self._seen.tag
-        with contextlib.suppress(MapMissing, MapDataError):  # reading it names what is wrong
+        with contextlib.suppress(MapMissing, MapDataError):  # reading the offer reports what is wrong
             if tag is not None:
                 return store.get_if_changed(path, MAX_METADATA_BYTES, tag) is None
             store.get_tagged(path, MAX_METADATA_BYTES)
@@ -359,15 +359,15 @@ class PublishedOrigin:
     # --- while it is served -----------------------------------------------------------------------
 
     def note_served(self, view: object) -> None:
-        """Remember which version is served now."""
+        """Record which version is served now."""
         taken = self._taken
         if taken is None or not isinstance(view, PublishedView) or view.number != taken.version:
-            return  # another one was taken, and waits for its pages
+            return  # another version was taken, and waits for its pages
         self._in_service = taken
         if taken is self._saved or self._state is None:
             return
         self._saved = taken
-        with contextlib.suppress(RuntimeError):  # as many threads as there may be: then with the next one
+        with contextlib.suppress(RuntimeError):  # limit of threads reached: saved with the next version
             threading.Thread(target=self._save, args=(self._state, taken), name="taken").start()
 
     def _save(self, state: TakenVersionFile, taken: TakenVersion) -> None:
@@ -387,13 +387,13 @@ class PublishedOrigin:
 
     @property
     def signed_s(self) -> float:
-        """When that version was signed, Unix time; 0: it is not."""
+        """When the version taken was signed, Unix time; 0 if it is not signed."""
         taken = self._taken
         return taken.signed_s if taken is not None else 0.0
 
     @property
     def refusal(self) -> str:
-        """Why the offer is not taken, one of `REFUSALS`; empty if it is, or is out of reach."""
+        """Why the offer is refused, one of `REFUSALS`; empty if it is accepted, or unreachable."""
         problem = self._problem
         if problem is None or problem.code == Offline.code:
             return ""
@@ -406,24 +406,24 @@ class PublishedOrigin:
 
     @property
     def refused_version(self) -> int:
-        """Number of the version that is offered and was refused; 0: none, or it is not known."""
+        """Number of the offered version that was refused; 0: none, or it is not known."""
         return self._refused if self.refusal else 0
 
     @property
     def counts(self) -> ObjectCounts:
-        """What the daemon itself has read so far: of the index, and of what is kept on the disk ahead."""
+        """Counts of the daemon's own reads: of the index, and of objects kept on the disk ahead of use."""
         index = self._index.counts
         if self.keeper is None:
             return index
         return ObjectCounts(*map(sum, zip(index, self.keeper.counts, strict=True)))
 
     def try_again(self) -> None:
-        """Fetch again what is missing of the list of cells; called in the serving loop."""
+        """Fetch the missing pages of the list of cells again; called in the serving loop."""
         for pages in list(self._pages):
             pages.try_again()
 
     def close(self) -> bool:
-        """End all threads; False if one still waits for the origin."""
+        """End all threads; return False if one still waits for the origin."""
         ended = [self.link.close(), self._fetcher.close()]
         if self.keeper is not None:
             ended.append(self.keeper.close())
@@ -431,7 +431,7 @@ class PublishedOrigin:
 
 
 class _OnDisk:
-    """Reads index pages that are on the disk, and no others."""
+    """Reads only index pages that are on the disk."""
 
     def __init__(self, index: KeptObjects) -> None:
         self._index = index
@@ -445,7 +445,7 @@ class _OnDisk:
 
 
 def _same_shards(view: PublishedView, root: Root) -> dict[int, Shard]:
-    """Shards of another root that are here already."""
+    """Return the shards of another root that are in memory already."""
     here = {view.root.shard_sha256(number): shard for number, shard in view.pages.shards().items()}
     known = {}
     for number in range(len(root.keys)):

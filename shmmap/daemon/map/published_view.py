@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One version of a published map as requests see it: its root, and the shards that are here."""
+"""View of one version of a published map: its root, and the shards in memory."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ Indices: TypeAlias = NDArray[np.intp]
 _Found: TypeAlias = tuple[Indices, Indices, Indices, Indices]
 """Cells that were added, removed, changed and moved."""
 _Pair: TypeAlias = tuple[int | None, int | None]
-"""Numbers of the shards at one place in an earlier version and in a later one."""
+"""Numbers of the shards that cover one place in an earlier version and in a later one."""
 MM_BYTES: Final = 6
-"""What a point takes more in memory than in millimetres."""
+"""Bytes by which a point in memory exceeds one stored in millimetres."""
 _NOTHING: Final = np.empty(0, np.intp)
 
 
 @dataclass(frozen=True, slots=True)
 class _Difference:
-    """Rows of a shard, before or now, that differ: added, removed, changed, moved."""
+    """Rows of a shard that differ between two versions: added, removed, changed, moved."""
 
     added: tuple[int, ...] = ()
     removed: tuple[int, ...] = ()
@@ -51,9 +51,9 @@ class PublishedView:
     Parameters
     ----------
     number
-        Of the version.
+        Number of the version.
     known
-        Shards that are here from the beginning, by number.
+        Shards that are in memory from the beginning, by number.
     """
 
     problems: Final = ()
@@ -77,7 +77,7 @@ class PublishedView:
 
     @cached_property
     def _ready(self) -> dict[str, int]:
-        """Builder versions of published layers that this program would make the same way."""
+        """Builder versions of published layers that this program would build identically."""
         found = {}
         for spec, builder_version in self.root.layers.items():
             try:
@@ -99,7 +99,7 @@ class PublishedView:
     # --- cells ------------------------------------------------------------------------------------
 
     def query(self, area: Area, most: int | None = None) -> tuple[Indices, bool]:
-        """Known cells that touch an area, in id order, and whether these are all."""
+        """Return known cells that intersect an area, in id order, and whether these are all."""
         found: list[Indices] = []
         names: list[list[bytes]] = []
         known, count = True, 0
@@ -123,7 +123,7 @@ class PublishedView:
         return indices, known
 
     def find(self, cell: str) -> int | None:
-        """Index of a known cell by its id or a unique base name."""
+        """Return the index of a known cell by its id or a unique base name."""
         name = cell
         if cell.startswith("/"):
             if not cell.startswith(self.id_prefix):
@@ -139,7 +139,7 @@ class PublishedView:
         return index
 
     def id(self, index: int) -> str:
-        """Id of a cell."""
+        """Return the id of a cell."""
         page, row = self.pages.row(index)
         return page.shard.id(row, self.id_prefix)
 
@@ -148,16 +148,16 @@ class PublishedView:
         return [self.id(index) for index in indices.tolist()]
 
     def box(self, index: int) -> tuple[float, float, float, float]:
-        """Box of a cell."""
+        """Return the box of a cell."""
         page, row = self.pages.row(index)
         return page.shard.box(row)
 
     def boxes_of(self, indices: Indices) -> NDArray[np.float64]:
-        """(K, 4) float64, boxes of these cells."""
+        """Return the boxes of these cells, (K, 4) float64."""
         return self.pages.boxes_of(indices)
 
     def version(self, index: int) -> int:
-        """64-bit version of a cell."""
+        """Return the 64-bit version of a cell."""
         page, row = self.pages.row(index)
         version = int(page.versions[row])
         if not version:
@@ -166,7 +166,7 @@ class PublishedView:
         return version
 
     def source(self, index: int) -> Source:
-        """Return the objects of a cell that are of use here."""
+        """Return the objects of a cell that this program can use."""
         page, row = self.pages.row(index)
         shard = page.shard
         layers = {
@@ -176,7 +176,7 @@ class PublishedView:
         return pack_source(shard.id(row, self.id_prefix), layers)
 
     def stamp(self, index: int) -> Stamp:
-        """Stamp of a cell."""
+        """Return the stamp of a cell."""
         page, row = self.pages.row(index)
         return page.shard.stamp(row)
 
@@ -184,12 +184,12 @@ class PublishedView:
         """Do nothing: within a version no cell changes."""
 
     def source_bytes(self, index: int) -> int:
-        """Size of a cell's points in memory, or near it."""
+        """Return the size of a cell's points in memory, at least approximately."""
         page, row = self.pages.row(index)
         return int(page.shard.layers[POINTS].raws[row])
 
     def ready(self, index: int, layer: str) -> Ready | None:
-        """Return what is known of a layer that is published; None: it is computed here."""
+        """Return size and version of a published layer; None if the layer is computed here."""
         builder_version = self._ready.get(layer)
         if builder_version is None:
             return None
@@ -206,9 +206,9 @@ class PublishedView:
     # --- what changed -----------------------------------------------------------------------------
 
     def changes_from(self, before: object) -> CatalogueChange:
-        """Find what differs from another version, as far as both know it.
+        """Return the difference from another version, as far as both know their cells.
 
-        Each shard is compared once, when it has been fetched, so a call for each new page is cheap.
+        Each shard is compared once, when it is in memory, so a call for each new page is cheap.
         """
         if not isinstance(before, PublishedView):
             raise TypeError(f"{type(before).__name__} is no version of a published map")
@@ -237,7 +237,7 @@ class PublishedView:
         return CatalogueChange(before, self, *self._changed)
 
     def _put_together(self, before: PublishedView, *, same_ids: bool) -> _Found:
-        """Return what was found in all shards, ascending."""
+        """Return the differences of all shards, ascending."""
         found: dict[str, list[int]] = {"added": [], "removed": [], "changed": [], "moved": []}
         for (was, now), difference in self._compared.items():
             old_first = before.pages.cells(was).start if was is not None else 0
@@ -251,7 +251,7 @@ class PublishedView:
         return added, removed, changed, moved
 
     def _note_moved(self, found: dict[str, list[int]], before: PublishedView) -> None:
-        """Cells that left one shard and came to another one have only moved."""
+        """Note as moved the cells that left one shard and appear in another."""
         left = {before.id(index): index for index in found["removed"]}
         came = {self.id(index): index for index in found["added"]}
         moved = left.keys() & came.keys()
@@ -261,7 +261,7 @@ class PublishedView:
 
 
 def _differing_shards(old: Root, new: Root, *, same_ids: bool) -> list[_Pair]:
-    """Which shards are not the same in both."""
+    """Return the pairs of shards that differ between two versions."""
 
     def by_place(root: Root) -> dict[tuple[int, int], int]:
         return {(row, column): number for number, (row, column) in enumerate(root.keys.tolist())}
@@ -280,13 +280,13 @@ def _differing_shards(old: Root, new: Root, *, same_ids: bool) -> list[_Pair]:
 
 
 def _shard(view: PublishedView, number: int) -> Shard | None:
-    """Return a shard of a version if it is here."""
+    """Return a shard of a version if it is in memory."""
     page = view.pages.page(number)
     return page.shard if page is not None else None
 
 
 def _compare(old: Shard | None, new: Shard | None, *, same_ids: bool) -> _Difference:
-    """Find which cells differ in two states of a shard; None: it has none."""
+    """Return the cells that differ between two states of a shard; None stands for no shard."""
     before = {name: row for row, name in enumerate(old.names)} if old is not None else {}
     after = {name: row for row, name in enumerate(new.names)} if new is not None else {}
     both = before.keys() & after.keys() if same_ids else set[bytes]()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shards of a published map: fetched by threads, and seen as pages of its list of cells."""
+"""The shards of a published map: fetched by threads, and served as pages of its list of cells."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ __all__ = ["FEW_SHARDS", "THREADS", "Page", "ShardFetcher", "ShardPages"]
 
 THREADS: Final = 8
 END_S: Final = 0.5
-"""How long the end of the daemon waits for a thread that waits for the origin."""
+"""How long a daemon that stops waits for a thread that waits for the origin."""
 FEW_SHARDS: Final = 16
-"""Up to this number, all shards are fetched at the start, and kept."""
+"""Up to this number of shards, all are fetched at the start, and kept."""
 NAME_BYTES: Final = 150
-"""What a cell's name takes in memory, and its entry in the table of names."""
+"""Memory of a cell's name with its entry in the table of names."""
 NAME_TABLES: Final = 64
-"""Names are shared out among many dicts: one of all would stop the loop whenever it grows."""
+"""Names are distributed over many dicts: a single one would stop the loop whenever it grows."""
 BACKGROUND_FETCHES: Final = 2
-"""Pages that nothing needs yet are fetched few at a time, so that pages an area needs have most of the link.
-With 8 at a time over 20 Mbit/s and 50 ms, those took twice as long."""
+"""Limit of concurrent fetches of pages that nothing needs yet, so that needed pages get most of the link.
+With 8 at a time over 20 Mbit/s and 50 ms, needed pages took twice as long."""
 BACKGROUND: Final = 1e15
-"""Priority of pages that nothing needs yet: behind all that something does."""
+"""Priority of pages that nothing needs yet: after all needed ones."""
 NAMED: Final = 3
-"""Cells of one base name that an error lists."""
+"""Cells with the same base name that an error lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Page:
-    """A shard that is here; ``first`` is the index of its first cell, ``versions`` are 0 if not computed."""
+    """A shard in memory; ``first`` is the index of its first cell, ``versions`` are 0 until computed."""
 
     number: int
     shard: Shard
@@ -70,9 +70,9 @@ class Page:
 
 
 class _News:
-    """A descriptor that is open as long as this is.
+    """An event descriptor that is closed with this object.
 
-    It is no part of the pages: these may still be found by a weak reference while they are being deleted.
+    It is a separate object because weak references may still reach the pages while they are being deleted.
     """
 
     def __init__(self) -> None:
@@ -82,12 +82,12 @@ class _News:
         os.close(self.fd)
 
     def notify(self) -> None:
-        """Make it readable."""
+        """Make the descriptor readable."""
         os.eventfd_write(self.fd, 1)
 
 
 def _shared_out(page: Page) -> list[dict[bytes, int]]:
-    """Map names to indices of a page's cells, for each table of names."""
+    """Return the indices of a page's cells by name, for each table of names."""
     tables: list[dict[bytes, int]] = [{} for _ in range(NAME_TABLES)]
     for index, name in enumerate(page.shard.names, page.first):
         tables[hash(name) % NAME_TABLES][name] = index
@@ -95,12 +95,12 @@ def _shared_out(page: Page) -> list[dict[bytes, int]]:
 
 
 class ShardFetcher:
-    """Fetches shards of published maps in a few threads, the most urgent first; verified and decoded.
+    """Fetches shards of published maps in a few threads, most urgent first; verifies and decodes them.
 
     Parameters
     ----------
     failed
-        Called, in a thread, when something could not be fetched.
+        Called, in a thread, when a fetch has failed.
     """
 
     def __init__(self, objects: ObjectReader, failed: Callable[[], None]) -> None:
@@ -115,9 +115,9 @@ class ShardFetcher:
         self._closed = False
 
     def want(self, pages: ShardPages, root: Root, number: int, priority: float) -> None:
-        """Request a shard, unless it is being fetched; those with the lowest priority come first.
+        """Request a shard unless it is being fetched; shards with the lowest priority come first.
 
-        One that is wanted again with a lower priority may be delivered twice.
+        A shard that is requested again with a lower priority may be delivered twice.
         """
         with self._condition:
             if (id(pages), number) in self._under_way:
@@ -129,7 +129,7 @@ class ShardFetcher:
                 thread = threading.Thread(target=self._run, name="shards", daemon=True)
                 try:
                     thread.start()
-                except RuntimeError:  # there are as many threads as there may be
+                except RuntimeError:  # the limit of threads is reached
                     return
                 self._threads.append(thread)
 
@@ -165,15 +165,15 @@ class ShardFetcher:
         try:
             return unpack_shard(read_shard_object(self._objects, root, number), root, number)
         except Offline:
-            pass  # `OriginLink` says so, once
+            pass  # `OriginLink` reports it, once
         except ShmmapError as error:
             log.error("part of the list of cells cannot be used", part=name, reason=error)
-        except Exception:  # noqa: BLE001  else it would never be tried again
+        except Exception:  # noqa: BLE001  else the shard would never be fetched again
             log.exception("part of the list of cells cannot be used", part=name, cause="a defect in shmmap")
         return None
 
     def close(self) -> bool:
-        """End the threads; False if one still waits for the origin."""
+        """End the threads; return False if one still waits for the origin."""
         with self._condition:
             self._closed = True
             self._condition.notify_all()
@@ -186,14 +186,14 @@ class ShardFetcher:
 class ShardPages:
     """Pages of one version of a map; see `shmmap.daemon.map.catalogue_view.Pages`.
 
-    All but `deliver` is called in the serving loop.
+    All methods except `deliver` are called in the serving loop.
 
     Parameters
     ----------
     known
-        Shards that are here from the beginning, by number.
+        Shards that are in memory from the beginning, by number.
     max_bytes
-        What pages may take of memory; those of a map of few shards are all kept.
+        Memory limit of pages; if the map has few shards, all are kept.
     """
 
     def __init__(
@@ -219,14 +219,14 @@ class ShardPages:
             0.5 * (root.bounds[1] + root.bounds[3]),
         )
         self._news = _News()
-        self._news.notify()  # pages that nothing needs are asked for in the first `collect`
+        self._news.notify()  # the first `collect` requests pages that nothing needs
         for number, shard in known.items():
             page = self._page(number, shard)
             self._take(page, _shared_out(page))
 
     @property
     def fd(self) -> int:
-        """Readable when there are news."""
+        """Readable when there are results."""
         return self._news.fd
 
     def __len__(self) -> int:
@@ -235,7 +235,7 @@ class ShardPages:
     # --- which there are --------------------------------------------------------------------------
 
     def of_area(self, area: Area) -> Sequence[int]:
-        """Pages that may have cells which touch an area."""
+        """Return pages that may have cells which intersect an area."""
         found: list[int] = self.root.shards_near(area.bounds).tolist()
         return found
 
@@ -248,7 +248,7 @@ class ShardPages:
         return range(self._first[page], self._first[page + 1])
 
     def cells_surely_in(self, area: Area) -> int:
-        """How many cells the pages have that lie wholly in an area."""
+        """Return how many cells are on pages that lie wholly in an area."""
         min_x, min_y, max_x, max_y = area.bounds
         boxes = self._boxes
         inside = (boxes[:, 0] >= min_x) & (boxes[:, 1] >= min_y)
@@ -265,37 +265,37 @@ class ShardPages:
 
     @property
     def complete(self) -> bool:
-        """Whether all pages are here."""
+        """Whether all pages are in memory."""
         return len(self._here) == len(self)
 
     @property
     def known_pages(self) -> int:
-        """How many pages are here."""
+        """Number of pages in memory."""
         return len(self._here)
 
     def is_here(self, page: int) -> bool:
-        """Whether the page's cells are known."""
+        """Whether a page is in memory."""
         return page in self._here
 
     def is_out_of_reach(self, page: int) -> bool:
-        """Whether it could not be fetched when it was last tried."""
+        """Whether the last attempt to fetch a page failed."""
         return page in self._lost
 
     def shards(self) -> dict[int, Shard]:
-        """Shards that are here, by number; may be called in another thread."""
+        """Return the shards in memory, by number; may be called in another thread."""
         return {number: page.shard for number, page in self._here.copy().items()}
 
     def page(self, number: int) -> Page | None:
-        """Return a page if it is here."""
+        """Return a page if it is in memory."""
         return self._here.get(number)
 
     def row(self, index: int) -> tuple[Page, int]:
-        """Page and row of a cell; `KeyError` if it is not here."""
+        """Return page and row of a cell; raise `KeyError` if its page is not in memory."""
         page = self._here[self.of_cell(index)]
         return page, index - page.first
 
     def boxes_of(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(K, 4) float64, boxes of these cells; `KeyError` if one is not here."""
+        """Return the boxes of these cells, (K, 4) float64; raise `KeyError` if a page is not in memory."""
         boxes = np.empty((len(indices), 4))
         numbers = np.searchsorted(self.root.first_indices, indices, side="right") - 1
         for number in np.unique(numbers).tolist():
@@ -304,16 +304,16 @@ class ShardPages:
         return boxes
 
     def find(self, name: bytes) -> int | None:
-        """Index of a known cell by what follows the map's prefix in its id."""
+        """Return the index of a known cell by its id without the map's prefix."""
         return self._by_name[hash(name) % NAME_TABLES].get(name)
 
     def find_base(self, base: bytes) -> int | None:
-        """Index of a known cell by its base name.
+        """Return the index of a known cell by its base name.
 
         Raises
         ------
         BadRequest
-            Several have it.
+            Several cells have it.
         """
         found = self._by_base.get(base, ())
         if len(found) > 1:
@@ -345,13 +345,13 @@ class ShardPages:
             self._around, self._nearest = (x, y), None
 
     def deliver(self, number: int, shard: Shard | None) -> None:
-        """Take a shard; None: it cannot be fetched at present.  Called in a thread."""
+        """Queue an arrived shard; None: it cannot be fetched at present.  Called in a thread."""
         page = self._page(number, shard) if shard is not None else None
         self._arrived.append((number, page, _shared_out(page) if page is not None else []))
         self._news.notify()
 
     def collect(self) -> PageNews:
-        """Take in what has come since the last time: one page, a tenth of a millisecond, and go on later."""
+        """Merge one arrived page, a tenth of a millisecond; further pages wait for later calls."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         come: list[int] = []
@@ -374,25 +374,25 @@ class ShardPages:
         return PageNews(come, lost)
 
     def try_again(self) -> None:
-        """Fetch again the pages that could not be fetched before."""
+        """Fetch the pages again that could not be fetched before."""
         lost, self._lost = self._lost, set()
         self.want(lost, 0.0)
-        self._lost |= lost  # until they come
+        self._lost |= lost  # until they arrive
 
     def lacking(self, before: Pages) -> Sequence[int]:
-        """Pages that are not here where another version has some that are."""
+        """Return the missing pages in the places where another version has pages in memory."""
         if not isinstance(before, ShardPages):
             return [] if self.complete else list(range(len(self)))
         keys = {key for number, key in enumerate(before.keys()) if before.is_here(number)}
         return [n for n, key in enumerate(self.keys()) if key in keys and n not in self._here]
 
     def keys(self) -> list[tuple[int, int]]:
-        """Row and column of each page, in metres: a version may have shards of another size."""
+        """Return row and column of each page, in metres: versions may differ in shard size."""
         rows = (self.root.keys * self.root.shard_m).tolist()
         return [(row, column) for row, column in rows]
 
     def spare(self) -> int | None:
-        """Return the page that was needed least recently, if they take more memory than they may."""
+        """Return the page that was needed least recently if pages exceed their memory limit."""
         if self._bytes <= self._max_bytes or len(self) <= FEW_SHARDS:
             return None
         return next(iter(self._here), None)
@@ -428,9 +428,9 @@ class ShardPages:
                     self._by_base[base] = (*self._by_base.get(base, ()), index)
 
     def _fill(self) -> None:
-        """Fetch some more pages that nothing needs yet, the nearest first, while there is room.
+        """Fetch some pages that nothing needs yet, the nearest first, while there is memory.
 
-        None while others are needed.
+        No page is fetched this way while needed ones are missing.
         """
         is_needed = any(priority < BACKGROUND for priority in self._wanted.values())
         if self._lost or is_needed or len(self._wanted) >= BACKGROUND_FETCHES or self.complete:
@@ -447,7 +447,7 @@ class ShardPages:
                 continue
             room -= cell_bytes * int(counts[number])
             if room < 0:
-                self._nearest = iter((number,))  # there is no room, until an area needs other pages
+                self._nearest = iter((number,))  # no memory is left, until an area needs other pages
                 return
             self._wanted[number] = BACKGROUND
             self._fetcher.want(self, self.root, number, BACKGROUND)

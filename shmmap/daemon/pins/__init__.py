@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which segments are in use, according to the kernel."""
+"""Detection of segments in use, by queries to the kernel."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well this machine knows which processes use a segment: tried out, not guessed from versions.
+"""Checks by experiment which queries show on this machine which processes use a segment.
 
-Of three sources the first that works is taken: leases (no process is overlooked), the locks that the client
-library takes (a process that opens segments otherwise is overlooked), and what sessions say they hold
-(one that does not say is overlooked, too).  A process that is overlooked keeps the bytes it maps, always; the
-daemon then only believes to have more memory left than it has.
+The first of three sources that works is used: leases (they miss no process), the locks that the client
+library takes (they miss processes that open segments in another way), and the clients' own reports (they also
+miss clients that do not report).  A process that is missed always keeps the bytes it maps; the daemon merely
+believes that it has more memory left than it has.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SLOT: Final = 12345
 
 
 class PinSource(enum.Enum):
-    """What shows which processes use a segment, best first; the value is for people."""
+    """Source that shows which processes use a segment, best first; the value is a text for people."""
 
     LEASES = "leases"
     LOCKS = "locks of clients"
@@ -34,16 +34,16 @@ class PinSource(enum.Enum):
 
 
 class PinSupport(NamedTuple):
-    """What works in a directory of segments.
+    """Mechanisms that work in a directory of segments.
 
     Attributes
     ----------
     leases
-        A lease is granted exactly while no other process has a file open or mapped.
+        Whether a lease is granted exactly while no other process has a file open or mapped.
     locks
-        A lock on an open file lasts as long as its mapping, and shows.
+        Whether a lock on an open file lasts as long as its mapping, and can be queried.
     close_events
-        inotify reports when a process closes a file.
+        Whether inotify reports when a process closes a file.
     """
 
     leases: bool
@@ -57,9 +57,9 @@ class PinSupport(NamedTuple):
 
 
 def probe_pins(directory: ShmDirectory) -> PinSupport:
-    """Try out everything, with an unnamed file in the directory; takes well under a millisecond.
+    """Try all mechanisms with an unnamed file in the directory; takes well under a millisecond.
 
-    ``SHMMAP_TEST_PINS`` (``locks``, ``sessions``) makes it find less than there is.
+    ``SHMMAP_TEST_PINS`` (``locks``, ``sessions``) hides better sources.
     """
     less = os.environ.get("SHMMAP_TEST_PINS", "")
     fd = directory.create()
@@ -78,7 +78,7 @@ def probe_pins(directory: ShmDirectory) -> PinSupport:
 def _works(attempt: Callable[..., bool], *arguments: object) -> bool:
     try:
         return attempt(*arguments)
-    except (OSError, ValueError):  # what it needs is not there
+    except (OSError, ValueError):  # not supported here
         return False
 
 
@@ -96,7 +96,7 @@ def _locks_work(fd: int, path: str) -> bool:
 
 
 def _mapped(path: str, slot: int | None = None) -> mmap.mmap:
-    """Map a file as a reader does (Python's mapping keeps a descriptor: the same open file)."""
+    """Map a file as a reader does (Python's mapping duplicates the descriptor: the same open file)."""
     other = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         if slot is not None:

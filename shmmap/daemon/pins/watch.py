@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ask the kernel which processes use a segment, and have it report when a process closes one.
+"""Queries the kernel for the processes that use a segment, and gets reports when a process closes one.
 
-The daemon keeps a retired segment open while a client maps it.  The kernel reports when any process closes
-or unmaps it, so no timer has to look.  The daemon asks through the descriptor that it keeps open, which the
-kernel does not count: looking opens and closes nothing, and causes no report itself.
+The daemon keeps a retired segment open while a client maps it.  The kernel reports when any process closes or
+unmaps the segment, so no timer is needed.  Queries use the descriptor that the daemon keeps open, which the
+kernel does not count: a query opens and closes nothing, and causes no report itself.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from shmmap.segment.pins import holders, in_use
 __all__ = ["PinWatch"]
 
 KEPT_OPEN: Final = 1024
-"""Most retired segments that are kept open; further ones are looked at now and then."""
+"""Limit of retired segments that are kept open; others are queried periodically."""
 KEPT_SHARE: Final = 8
-"""A part of the descriptors this process may have at most, an eighth: clients need them more."""
+"""Limit as a fraction (1/8) of this process's descriptors: clients need them more."""
 
 
 class PinWatch:
-    """What the kernel says about the files of one directory.
+    """Use of the files of one directory, as the kernel reports it.
 
     Parameters
     ----------
     source
-        Which source is asked; for `PinSource.SESSIONS` the caller asks the sessions.
+        The source to query; for `PinSource.SESSIONS` the caller asks the sessions.
     events
-        Whether to have closes reported.
+        Whether the kernel is to report closes.
 
     Attributes
     ----------
     fd
-        Readable when `closed` has something to report; -1 where nothing is reported.
+        Readable when `closed` has something to report; -1 if closes are not reported.
     """
 
     def __init__(
@@ -68,13 +68,13 @@ class PinWatch:
 
     @contextlib.contextmanager
     def opened(self, name: str) -> Iterator[int]:
-        """Yield a descriptor of a segment, the kept one or one for the moment; OSError as from opening."""
+        """Yield a descriptor of a segment, kept or temporary; raise OSError as opening does."""
         kept = self._kept.get(name)
         if kept is not None:
             yield kept[0]
             return
         once = self._once.pop(name, -1)
-        if once >= 0 and self._inotify is not None:  # or what follows would be reported as a close
+        if once >= 0 and self._inotify is not None:  # else closing the temporary descriptor would be reported
             self._inotify.remove(once)
         with self._directory.opened(name) as fd:
             yield fd
@@ -82,23 +82,23 @@ class PinWatch:
             self.watch_next_close(name)
 
     def is_used_elsewhere(self, fd: int) -> bool:
-        """Whether another process uses an open segment, as the kernel says; False where it does not know."""
+        """Whether another process uses an open segment; False if the kernel does not show it."""
         if self.source is PinSource.LEASES:
             return in_use(fd)
         return self.source is PinSource.LOCKS and bool(holders(fd, limit=1))
 
     def is_used(self, name: str) -> bool | None:
-        """Whether a process uses a segment; None if its name is gone."""
+        """Whether a process uses a segment; None if the segment's name is gone."""
         try:
             with self.opened(name) as fd:
                 return self.is_used_elsewhere(fd)
         except FileNotFoundError:
             return None
         except OSError:
-            return True  # out of descriptors, say: what cannot be looked at must not count as free
+            return True  # e.g. out of descriptors: a segment not queried must not count as free
 
     def keep(self, name: str) -> bool:
-        """Keep a retired segment open and have its closes reported; False if that cannot be."""
+        """Keep a retired segment open and have its closes reported; return False if that fails."""
         if self._inotify is None or len(self._kept) >= self._max_kept:
             return False
         try:
@@ -110,13 +110,13 @@ class PinWatch:
         except OSError:
             os.close(fd)
             return False
-        self._once.pop(self._names.get(watch, ""), None)  # what was to be reported once is now kept
+        self._once.pop(self._names.get(watch, ""), None)  # the one-time watch is now permanent
         self._kept[name] = fd, watch
         self._names[watch] = name
         return True
 
     def keeps(self, name: str) -> bool:
-        """Whether closes of this segment are reported for as long as it is kept."""
+        """Whether closes of this segment are being reported."""
         return name in self._kept
 
     def release(self, name: str) -> None:
@@ -129,7 +129,7 @@ class PinWatch:
             os.close(fd)
 
     def watch_next_close(self, name: str) -> bool:
-        """Watch for the next close of a segment in service; False if that is impossible."""
+        """Watch for the next close of a segment in service; return False if that is impossible."""
         if self._inotify is None:
             return False
         try:
@@ -140,7 +140,7 @@ class PinWatch:
         return True
 
     def closed(self) -> set[str] | None:
-        """Return the names that were closed since the last call; None: any of them, the kernel lost some."""
+        """Return the names closed since the last call; None if the kernel lost reports of some."""
         if self._inotify is None:
             return set()
         names: set[str] = set()
@@ -150,7 +150,7 @@ class PinWatch:
             name = self._names.get(event.watch)
             if name is None:
                 continue
-            if event.mask & ENDED:  # it was reported, or ended by our own look; what came before that counts
+            if event.mask & ENDED:  # it was reported, or ended by our own query; reports before that count
                 del self._names[event.watch]
                 if self._once.get(name) == event.watch:
                     del self._once[name]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From one request to one answer."""
+"""Handling of client requests, from decoding to the answer."""

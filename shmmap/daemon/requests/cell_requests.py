@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests for cells: area, differential and selected.
 
-A request first becomes a `PendingRequest`: which cells in which order, minus what the client holds.  If all
-of it is warm the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the answer
-leaves when the last one has ended or the client's time is up, whichever is first: a handle for each cell that
-is in memory, and for each other why not.  What concerns many cells takes several turns of the loop.
+A request first becomes a `PendingRequest`: which cells in which order, minus those that the client holds.
+If all of them are warm, the answer leaves at once.  Otherwise loads are queued, nearest cells first, and the
+answer leaves when the last load has ended or the client's timeout expires.  It contains a handle for each
+cell in memory, and a reason for each other cell.  Work on many cells takes several turns of the loop.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ __all__ = ["CellRequests"]
 
 MAX_WAIT_S: Final = 3600.0
 MAX_COMPARED: Final = 4096
-"""Cells of an area that are compared with what a client holds in one turn, if all are in memory."""
+"""Cells of an area compared in one turn with those that a client holds, if all are in memory."""
 MAX_LOOKED_AT: Final = 20_000
-"""Cells of requests that are looked through before a page of the map is given up."""
+"""Cells of unanswered requests that are searched for a page of the map; with more, the page is kept."""
 PACKED_PER_CELL: Final = 256
 HELD_PER_CELL: Final = 2
-"""Bytes of packed versions, and cells held by name, of a request that waits: they take a cell's memory."""
+"""Bytes of packed versions, and cells held by name, that count as one cell of a waiting request's memory."""
 MAX_HOLDERS: Final = 16
-"""Named beside each cell that does not fit: those that have most."""
+"""Holders named beside each cell that does not fit: those with the most memory."""
 PROMISED: Final = 1e9
-"""Priority of a load that only a "pending" promises: behind the distances of all that is asked for."""
+"""Priority of a load promised by a "pending" alone: after the distances of all requested cells."""
 
 _UNNAMED: Final = (Holder(0, 0, -1, "", 0, 0),)
-"""Stands for the holders of memory until they are found."""
+"""Stands for the holders of memory until they are looked up."""
 
 Result = TypeVar("Result")
 
 
 @dataclass(eq=False, slots=True)
 class _Answer:
-    """What a reply says of cells.
+    """Cells of a reply.
 
     Attributes
     ----------
@@ -74,23 +74,23 @@ class _Answer:
     encoded_pending: PackedArray = field(default_factory=PackedArray)
 
     def encode(self) -> None:
-        """Encode the cells that were added since the last call: very many at once take long."""
+        """Encode the cells added since the last call: encoding very many at once takes long."""
         self.encoded_handles.add_encoded(self.handles)
         self.encoded_pending.add(self.pending)
         self.handles, self.pending = [], []
 
 
 class CellRequests:
-    """Answers requests for cells from the cache, and has loaded what is absent.
+    """Answers requests for cells from the cache, and requests loads of absent cells.
 
     Parameters
     ----------
     waiting
-        Requests that wait; it observes the ends of loads.
+        Requests that wait; this list observes the ends of loads.
     quota_bytes
-        Most bytes one session may keep that no other session also holds.
+        Limit of the bytes that one session alone holds.
     due
-        Given a connection and what answers it, to be done in its process's turns.
+        Queues the steps that answer a request, to run in the turns of the connection's process.
     clock
         The serving loop's clock, seconds.
     """
@@ -111,7 +111,7 @@ class CellRequests:
         self._due = due
         self._now_s = clock
         self._quota = limits.SessionQuota(quota_bytes, cache, clock)
-        self._open: dict[PendingRequest, None] = {}  # that are not answered yet
+        self._open: dict[PendingRequest, None] = {}  # not answered yet
         self._waiting = waiting
 
     def __len__(self) -> int:
@@ -120,7 +120,7 @@ class CellRequests:
     # --- the three verbs ------------------------------------------------------------------------
 
     def area(self, session: Session, message: messages.Area) -> Iterator[None]:
-        """Answer with all cells that touch an area."""
+        """Answer with all cells that intersect an area."""
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
         layers = self._layers(message.layers)
@@ -136,7 +136,7 @@ class CellRequests:
         return self._serve(self._pending(session, message, find, area), message.wait)
 
     def selected(self, session: Session, message: messages.Selected) -> Iterator[None]:
-        """Answer with cells by id, in the order asked for."""
+        """Answer with cells by id, in the order of the request."""
         _check_wait(message.wait)
         layers = self._layers(message.layers)
         limits.check_count(len(message.ids) * len(layers))
@@ -157,7 +157,7 @@ class CellRequests:
         return self._serve(wanted, message.wait)
 
     def differential(self, session: Session, message: messages.Differential) -> Iterator[None]:
-        """Answer with the cells that touch an area, minus those the client holds."""
+        """Answer with the cells that intersect an area, minus those that the client holds."""
         limits.check_held(message)
         _check_wait(message.wait)
         area = messages.area_from_message(message.area)
@@ -207,17 +207,17 @@ class CellRequests:
             versions.check_reach(layer)
 
     def _known(self, wanted: PendingRequest, layers: tuple[str, ...]) -> list[int]:
-        """Find the known cells of an area; note whether these are all, and which pages may have others.
+        """Find the known cells of an area; note whether more may exist, and the pages that may list them.
 
-        A layer that looks into the cells around needs the pages of these, too.
+        A layer that reads neighbouring cells needs the pages of these, too.
 
         Raises
         ------
         BadRequest
-            They are too many.
+            The area has too many cells.
         """
         area, found, catalogue = wanted.area, wanted.found, self._cache.catalogue
-        assert area is not None  # noqa: S101  only requests by ids have none
+        assert area is not None  # noqa: S101  only requests by ids have no area
         pages = catalogue.pages
         if pages is not None:
             limits.check_count(pages.cells_surely_in(area) * len(layers))
@@ -239,7 +239,7 @@ class CellRequests:
     # --- loading and waiting --------------------------------------------------------------------
 
     def _serve(self, wanted: PendingRequest, wait_s: float | None) -> Iterator[None]:
-        """Answer a request, or have loaded what is cold of it and let it wait."""
+        """Answer a request, or request loads of its cold cells and let it wait."""
         waits = False
         self._open[wanted] = None
         try:
@@ -257,14 +257,14 @@ class CellRequests:
     def _on_one_map(
         self, wanted: PendingRequest, do: Callable[[], Generator[None, None, Result]]
     ) -> Generator[None, None, Result]:
-        """Go through a request's cells, found again if the map has changed or more of it is known."""
+        """Run a step over a request's cells; find them again and repeat it if the map has changed."""
         while True:
             with contextlib.suppress(MapChanged):
                 yield from wanted.find_again()
                 return (yield from do())
 
     def _begin(self, wanted: PendingRequest, wait_s: float | None) -> Generator[None, None, bool]:
-        """Load what is cold of what was found; whether the request waits for that, or for more."""
+        """Load the cold cells of a request; return whether it waits for them, or for pages of the map."""
         now_s = self._now_s()
         may_wait = bool(wait_s) and self._waiting.has_room(wanted)
         yield from self._have_loaded(wanted, note=may_wait)
@@ -274,12 +274,12 @@ class CellRequests:
         wanted.began_s, wanted.deadline_s = now_s, now_s + (wait_s or 0.0)
         self._waiting.add(wanted)
         self._wait_for_pages(wanted)
-        if wanted.outdated or not wanted.waits:  # they came while the rest was gone through
+        if wanted.outdated or not wanted.waits:  # finished while the other cells were handled
             self._answer_in_turn(wanted)
         return True
 
     def _have_loaded(self, wanted: PendingRequest, *, note: bool) -> Iterator[None]:
-        """Request loads of what is cold; ``note`` which, so that the request waits for them."""
+        """Request loads of the cold cells; with ``note``, the request waits for them."""
         cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
         found.refused.clear()
         cold: list[tuple[int, str]] = []
@@ -303,27 +303,27 @@ class CellRequests:
         found.requested = True
 
     def _load(self, wanted: PendingRequest, cold: list[tuple[int, str]], *, note: bool) -> Iterator[None]:
-        """Request loads; ``note`` which, so that the request waits for them."""
+        """Request loads of the ``cold`` cells; with ``note``, the request waits for them."""
         warm, prefetcher, now_s = self._cache.warm, self._scheduler.prefetcher, self._now_s()
         for cells in batched(cold):
             yield from wanted.pause()
             for (index, layer), distance in zip(cells, wanted.distances_m(cells), strict=True):
                 key = self._cache.key(index, layer)
                 if key in wanted.found.refused or warm.get(index, layer) is not None:
-                    continue  # another client may have had it loaded meanwhile
+                    continue  # another client may have had it loaded in the meantime
                 prefetcher.note_cold(wanted.session, key)
                 if self._scheduler.want(index, layer, distance, now_s, wanted.session.asker) and note:
                     self._waiting.wait_for(wanted, key)
 
     def _need(self, wanted: PendingRequest) -> Iterator[None]:
-        """Keep all of what is asked for from being evicted until the answer is out."""
+        """Protect all requested cells from eviction until the answer has left."""
         for cells in batched(wanted.found.cells):
             yield from wanted.pause()
             for index, layer in cells:
                 self._waiting.need(wanted, self._cache.key(index, layer))
 
     def _wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Let a request wait for its pages, without those that are finished since it was found."""
+        """Let a request wait for its pages, except those that have finished since its cells were found."""
         found, pages = wanted.found, self._cache.pages
         if pages is not None and found.pages:
             come = {page for page in found.pages if pages.is_here(page)}
@@ -332,12 +332,12 @@ class CellRequests:
             self._waiting.wait_for_pages(wanted)
 
     def _answer_in_turn(self, wanted: PendingRequest) -> None:
-        """Answer a request that waits; what it asks for stays needed until then."""
+        """Queue the answer to a waiting request; its cells stay protected from eviction until then."""
         if self._waiting.take(wanted):
             self._due(wanted.session.connection, self._answer_now(wanted))
 
     def _answer_now(self, wanted: PendingRequest) -> Iterator[None]:
-        """Answer a request that waits, unless there is more to wait for."""
+        """Answer a waiting request, unless it has to wait for more."""
         if wanted not in self._waiting:  # its session has ended
             return
         wanted.pace.begin()
@@ -346,7 +346,7 @@ class CellRequests:
             waits = yield from self._on_one_map(wanted, lambda: self._look_again(wanted))
             if waits:
                 self._waiting.put_back(wanted)
-                if wanted.outdated:  # more has come while it was gone through
+                if wanted.outdated:  # pages arrived while its cells were handled
                     self._answer_in_turn(wanted)
         except ShmmapError as error:
             wanted.session.connection.refuse(wanted.request, error)
@@ -356,9 +356,10 @@ class CellRequests:
                 self._end(wanted)
 
     def _look_again(self, wanted: PendingRequest) -> Generator[None, None, bool]:
-        """Answer a request, unless there is more to wait for; then return True.
+        """Answer a request, or return True if it has to wait for more.
 
-        That is what was found again; or a cell whose load had ended and that is cold again, or may fit now.
+        It waits for cells that were found again, or for a cell whose load has ended and that is cold again or
+        may fit now.
         """
         may_wait = self._now_s() < wanted.deadline_s
         if not wanted.found.requested:
@@ -374,12 +375,12 @@ class CellRequests:
     # --- answers --------------------------------------------------------------------------------
 
     def _answer(self, wanted: PendingRequest, *, may_wait: bool) -> Generator[None, None, bool]:
-        """Send what there is of what is wanted; with ``may_wait`` return True if there is more to wait for.
+        """Send the cells that are in memory; with ``may_wait``, return True instead if more may arrive.
 
         Raises
         ------
         MapChanged, NoSession
-            See `PendingRequest.pause`; nothing was sent.
+            See `PendingRequest.pause`; nothing has been sent.
         """
         cache, warm, found, now_s = self._cache, self._cache.warm.layers, wanted.found, self._now_s()
         if wanted.area is not None and wanted.area.z is not None:
@@ -397,7 +398,7 @@ class CellRequests:
                 resident = warm[layer].get(index) if layer in warm else None
                 resident = resident or cache.find_warm(index, layer, now_s)
                 if resident is not None and not found.refused:
-                    resident.last_use_s = now_s  # the rest is noted when the answer is out
+                    resident.last_use_s = now_s  # the other bookkeeping follows when the answer has left
                     answer.residents.append(resident)
                     answer.handles.append(resident.handle)
                 elif resident is not None or not (may_wait and self._waits_for(wanted, index, layer, now_s)):
@@ -414,7 +415,7 @@ class CellRequests:
         return False
 
     def _waits_for(self, wanted: PendingRequest, index: int, layer: str, now_s: float) -> bool:
-        """Whether a cold cell is loaded, once more if its load had ended, and the request waits for it."""
+        """Whether a cold cell is being loaded, again if its load had ended, so that the request waits."""
         key, loads = self._cache.key(index, layer), self._scheduler.loads
         if key in wanted.outstanding:
             return True
@@ -428,7 +429,7 @@ class CellRequests:
     def _answer_cold(
         self, wanted: PendingRequest, index: int, layer: str, answer: _Answer, now_s: float
     ) -> None:
-        """Answer for one cell that is not simply warm."""
+        """Add a cell that is not warm to the answer: as resident, pending or failed."""
         cache, found, loads = self._cache, wanted.found, self._scheduler.loads
         key, catalogue = cache.key(index, layer), cache.catalogue
         wire_id = cache.wire_id(key.cell_id)
@@ -454,7 +455,7 @@ class CellRequests:
             answer.pending.append(PendingCell(wire_id, layer))
 
     def _failed(self, wanted: PendingRequest, failed: list[FailedCell]) -> Generator[None, None, PackedArray]:
-        """Encode what failed; name the holders of memory beside cells that there is no memory for."""
+        """Encode the failed cells; name the holders of memory beside cells that do not fit in memory."""
         packed, most = PackedArray(), tuple[Holder, ...]()
         if any(cell.holders is _UNNAMED for cell in failed):
             holders: list[Holder] = []
@@ -480,7 +481,7 @@ class CellRequests:
         found: Found,
         failed: PackedArray | None = None,
     ) -> None:
-        """Send a reply; the bookkeeping follows in `_hand_out`, when it is on its way."""
+        """Send a reply; `_hand_out` does the bookkeeping afterwards."""
         cache = self._cache
         map_version = cache.catalogue.map_version
         answer.encode()
@@ -491,7 +492,7 @@ class CellRequests:
         session.connection.reply(reply)
 
     def _hand_out(self, session: Session, answer: _Answer, pace: Pace) -> Iterator[None]:
-        """Note what a session was given."""
+        """Record the segments that a session was given."""
         self._statistics.add("handles_sent", len(answer.residents))
         is_large = len(answer.residents) > LARGE
         if is_large:
@@ -503,24 +504,24 @@ class CellRequests:
                 return
             self._cache.hand_out(residents, self._now_s())
             session.hold(residents)
-        if is_large:  # freeing what it took takes time, too
+        if is_large:  # freeing the lists takes time, too
             yield
 
     # --- what happens meanwhile -----------------------------------------------------------------
 
     def pages_finished(self, news: PageNews) -> None:
-        """Follow pages of the map that have come, or cannot be fetched at present."""
+        """Handle pages of the map that have arrived, or cannot be fetched at present."""
         for page in news.come:
             self._waiting.page_finished(page)
         for page in news.out_of_reach:
             self._waiting.page_finished(page, "offline")
 
     def map_changed(self) -> None:
-        """Follow another state of the map, with other pages."""
+        """Handle a new state of the map, whose pages differ."""
         self._waiting.map_changed()
 
     def uses(self, page: int) -> bool:
-        """Whether a request that is not answered yet has cells of a page, or an area in it; or may have."""
+        """Whether an unanswered request uses a page, or may use it: by its cells or by its area."""
         pages = self._cache.pages
         if pages is None or sum(len(wanted.found.cells) for wanted in self._open) > MAX_LOOKED_AT:
             return True
@@ -532,16 +533,16 @@ class CellRequests:
         )
 
     def next_deadline_s(self) -> float:
-        """Return when there is something to do: at once, or when a client's time is up; else infinity."""
+        """Return the time of the next work: now, or when a client's timeout expires; else infinity."""
         return self._waiting.next_deadline_s()
 
     def answer_finished(self) -> None:
-        """Answer requests whose last load or page has come; do some of what is left to do."""
+        """Answer requests whose last load or page has arrived; do some of the deferred work."""
         for wanted in self._waiting.tidy():
             self._answer_in_turn(wanted)
 
     def answer_overdue(self, now_s: float) -> None:
-        """Answer requests whose time is up, too."""
+        """Answer requests whose timeout has expired."""
         self.answer_finished()
         for wanted in self._waiting.overdue(now_s):
             self._answer_in_turn(wanted)
@@ -553,7 +554,7 @@ class CellRequests:
             self._end(wanted)
 
     def on_session_end(self, session: Session) -> None:
-        """Release what a session held, which has ended."""
+        """Release the segments of a session that has ended."""
 
         def steps() -> Iterator[None]:
             for resident in session.residents():
@@ -565,7 +566,7 @@ class CellRequests:
         self._waiting.do_later(steps())
 
     def answer_all(self) -> None:
-        """Answer all requests now (the daemon stops)."""
+        """Answer all requests now: the daemon stops."""
         for wanted in self._waiting:
             wanted.deadline_s = 0.0
             for _ in self._answer_now(wanted):
@@ -578,7 +579,7 @@ def _check_wait(wait_s: float | None) -> None:
 
 
 def _note_area(session: Session, area: Area, layers: tuple[str, ...]) -> None:
-    """Note the area that a session asks for: in the middle of it is where it is, unless it says."""
+    """Note the area that a session asks for; its centre is the client's position unless it sends one."""
     session.area, session.layers = area, layers
     if not session.says_where:
         session.intent = session.new_intent = messages.Intent(*area.center)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a client lacks, and what it should drop: the set arithmetic of a differential request.
+"""Set arithmetic of a differential request: the cells a client lacks, and those it should drop.
 
-Versions do the work: one names a layer of a cell *and* its state, so that a client that holds exactly the
-current versions of an area lacks nothing.  Nearly every request of a moving vehicle is answered with
-`warm_difference`, which is kept short; `difference` covers everything, in as many turns as it needs.
+A version identifies a layer of a cell *and* its state, so a client that holds exactly the current versions
+of an area lacks nothing.  Nearly every request of a moving vehicle is answered by `warm_difference`, which
+is kept short.  `difference` covers all cases, in as many turns as it needs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class WarmDifference:
 def warm_difference(
     cache: CellCache, message: Differential, found: NDArray[np.intp], layer: str
 ) -> WarmDifference | None:
-    """Return the difference if it takes versions only and every cell of the area is warm, else None.
+    """Return the difference if the request names versions only and all cells of the area are warm, else None.
 
     ``found`` are the catalogue indices of the area's cells, ascending.
     """
@@ -63,7 +63,7 @@ def warm_difference(
     removed_packed = b""
     gone = held - current
     if gone:
-        # an old version of a cell inside the area is replaced, not removed; another layer of one stays
+        # an old version of a cell inside the area is replaced, not removed; its other layers stay
         of_version, catalogue = index.of_version, cache.catalogue
         suspects = gone if len(index.layers) > 1 else gone & index.retired.keys()
         known = ((version, key) for version in suspects if (key := of_version.get(version)) is not None)
@@ -80,7 +80,7 @@ def warm_difference(
 def _removed_names(
     cache: CellCache, named: Sequence[HeldCell], gone: set[int], current: set[int], layer: str
 ) -> tuple[str, ...]:
-    """Held ids to drop, in the order given; one whose cell is in the area at another version stays."""
+    """Return held ids to drop, in the order given; a cell that the area has at another version stays."""
     removed, warm = dict[str, None](), cache.warm
     for cell_id in [cell.id for cell in named if cell.version in gone]:
         index = cache.index_of(cell_id)
@@ -93,9 +93,9 @@ def _removed_names(
 def difference(
     wanted: PendingRequest, message: Differential, indices: list[int], layers: tuple[str, ...]
 ) -> Generator[None, None, None]:
-    """Note as found what the client lacks of the area's cells ``indices``, whether in memory or not.
+    """Find which of the area's cells ``indices`` the client lacks, whether they are in memory or not.
 
-    Where these are not all, a cell that is not known may lie in the area.
+    If they are not all the cells of the area, a held cell that is not known may lie in it, and stays.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def difference(
 def _held_layers(
     wanted: PendingRequest, held: Sequence[HeldCell], inside: set[int], layers: tuple[str, ...]
 ) -> Generator[None, None, dict[int, set[str]]]:
-    """Return the layers that the client has, by cell; note as found its old ones, and what to drop."""
+    """Return the layers that the client holds, by cell; note its outdated layers, and what it should drop."""
     cache, found = wanted.cache, wanted.found
     version_of = cache.layers.version
     has: dict[int, set[str]] = {}
@@ -155,7 +155,7 @@ def _held_layers(
                 continue
             named = layers if cell.layers is None else canonical_layers(cell.layers)
             mine = [layer for layer in named if layer in layers]
-            if cell.version is not None:  # that of one of them; else it is an old one
+            if cell.version is not None:  # the current version of one of these layers, or an outdated one
                 current_of = [layer for layer in mine if cell.version == version_of(index, layer)]
                 if not current_of:
                     found.held_old.update(cache.key(index, layer) for layer in mine)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the bytes of a request to what answers it: decoded, authorised, routed or refused."""
+"""Dispatch of requests: each is decoded, authorised and routed to its handler, or refused."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ __all__ = ["Defects", "Dispatch"]
 
 MAX_DEFECTS: Final = 100
 WITHIN_S: Final = 10.0
-"""That many exceptions of one place in this time are fatal; one of them is logged."""
+"""`MAX_DEFECTS` exceptions from one line of code within this time are fatal; one of them is logged."""
 
 
 class Defects:
-    """Unexpected exceptions met while serving: counted and survived, unless one place keeps raising.
+    """Unexpected exceptions while serving: counted and survived, unless one line of code keeps raising.
 
     Parameters
     ----------
@@ -61,9 +61,9 @@ class Defects:
         self._logged_s: dict[tuple[str, int], float] = {}
 
     def record(self) -> bool:
-        """Record the exception that is being handled; True when its place raised too often to go on.
+        """Record the exception being handled; return True when its line has raised too often to continue.
 
-        Its traceback is logged, unless that of the same place was just now.
+        The traceback is logged, unless one of the same line was logged within `WITHIN_S`.
         """
         self._statistics.add("defects")
         *_, (frame, line) = traceback.walk_tb(sys.exc_info()[2])
@@ -78,12 +78,12 @@ class Defects:
 
 @dataclass(eq=False, slots=True)
 class Dispatch:
-    """Hands each request to what answers it; a defect met by one request does not end the others'.
+    """Hands each request to its handler; a defect in one request does not affect the others.
 
     Parameters
     ----------
     due
-        Given a connection and what answers it, to be done in its process's turns.
+        Queues the steps that answer a request, to run in the turns of the connection's process.
     """
 
     handshake: Handshake
@@ -98,7 +98,7 @@ class Dispatch:
     due: Callable[[Connection, Iterator[None]], None]
 
     def handle(self, item: WorkItem) -> Iterator[None]:
-        """Answer one request, or say why not; a step at a time where that takes long."""
+        """Answer or refuse one request, in several steps where that takes long."""
         data = item.body
         request = 0
         try:
@@ -116,7 +116,7 @@ class Dispatch:
             item.connection.refuse(request, InternalError("the daemon failed on this request"))
 
     def _route(self, connection: Connection, message: messages.Request, body: bytes) -> Iterator[None] | None:
-        """Do what is asked for; return what takes longer."""
+        """Handle a request; return the steps that remain if it takes several."""
         now_s = time.monotonic()
         if isinstance(message, messages.Hello):
             entered = self.handshake.enter(connection, message, now_s)

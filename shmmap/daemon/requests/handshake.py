@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clients come and go: a hello opens a session; a goodbye, or the end of the connection, ends it."""
+"""Start and end of sessions: a hello opens one; a goodbye, or the end of the connection, ends it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shmmap.statistics.writer import StatisticsWriter
 __all__ = ["Handshake"]
 
 LOOKED_AT: Final = 64
-"""Departed sessions that are looked at a beat."""
+"""Departed sessions checked per beat."""
 
 
 @dataclass(eq=False, slots=True)
@@ -34,9 +34,9 @@ class Handshake:
     Parameters
     ----------
     operators, on_live_session_end
-        Follow a session that has ended.
+        Notified when a session has ended.
     departures
-        Logs how many clients left, a line a minute.
+        Logs how many clients left, one line per minute.
     """
 
     sessions: Sessions
@@ -87,7 +87,7 @@ class Handshake:
         return session
 
     def hung_up(self, connection: Connection) -> None:
-        """Follow a connection that has ended; its session ends when the kernel says that it maps nothing."""
+        """Note that a connection has ended; its session ends once the kernel reports that it maps nothing."""
         if (session := self.sessions.by_slot(connection.slot)) is None:
             return
         session.disconnect()
@@ -99,10 +99,10 @@ class Handshake:
             self.leave(session)
 
     def look_after_departed(self) -> None:
-        """End those whose process is gone, and those that a survey begun since then found to map nothing."""
+        """End departed sessions whose process has exited, or that map nothing according to a later survey."""
         departed = self.sessions.departed
         for slot in list(itertools.islice(departed, LOOKED_AT)):
-            session = departed[slot] = departed.pop(slot)  # the others come first next time
+            session = departed[slot] = departed.pop(slot)  # rotate: the next call begins with others
             if session.peer.pid and not os.path.exists(f"/proc/{session.peer.pid}"):
                 self.leave(session)
         if not self._to_check and self.survey.usage is not self._seen:
@@ -113,12 +113,12 @@ class Handshake:
         del self._to_check[-LOOKED_AT:]
 
     def _leave_if_unused(self, session: Session, usage: Usage) -> None:
-        known = usage.by_slot or not session.peer.pid  # else it stays while its process is there
+        known = usage.by_slot or not session.peer.pid  # else the session stays while its process exists
         if known and session.slot in self.sessions.departed and session.slot not in usage.shares:
             self.leave(session)
 
     def leave(self, session: Session) -> None:
-        """End the session of a client that is gone or said goodbye: what it held may be free now."""
+        """End the session of a client that has exited or said goodbye: segments it held may be free now."""
         pid = session.peer.pid
         if session.held:
             log.debug("client left", pid=pid, name=session.client, held_bytes=session.held_bytes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much one request may ask for, and how much one session may keep for itself alone."""
+"""Limits on the size of one request, and on the memory that only one session holds."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ __all__ = [
 ]
 
 MAX_CELLS: Final = 20_000
-"""Cells, in all layers together, of one request."""
+"""Cells of one request, over all its layers."""
 MAX_QUEUED: Final = 20_000
-"""A process that waits for this many loads may add none; each takes 2 kB of the daemon's memory."""
+"""A process with this many queued loads may add none; each takes 2 kB of the daemon's memory."""
 MAX_HELD: Final = 100_000
 MAX_LAYERS_HELD: Final = 64
-"""Different layers named as held; reading what a layer is called takes some 40 us."""
+"""Distinct layers among the cells that a client says it holds; parsing a layer's name takes some 40 us."""
 MAX_LAYERS: Final = 16
 """Layers of one request."""
 
 
 def check_count(count: int) -> None:
-    """Refuse a request for more than `MAX_CELLS` cells, or layers of cells.
+    """Refuse a request for more than `MAX_CELLS` cells, counting each layer of a cell.
 
     Raises
     ------
     BadRequest
-        There are more.
+        The request has more.
     """
     if count > MAX_CELLS:
         raise BadRequest(
@@ -62,12 +62,12 @@ def check_count(count: int) -> None:
 
 
 def check_held(message: messages.Differential) -> None:
-    """Refuse a client that says it holds more than `MAX_HELD` cells, or layers of cells named one by one.
+    """Refuse a client that reports more than `MAX_HELD` held cells, counting each layer named one by one.
 
     Raises
     ------
     BadRequest
-        It says so, or names more than `MAX_LAYERS_HELD` different layers.
+        The client reports more, or names more than `MAX_LAYERS_HELD` distinct layers.
     """
     count = len(message.packed) // 8 + sum(
         1 if cell.layers is None else len(cell.layers) for cell in message.held
@@ -80,12 +80,12 @@ def check_held(message: messages.Differential) -> None:
 
 
 def check_queue(loads: Loads, wanted: PendingRequest, cold: Sequence[tuple[int, str]]) -> Iterator[None]:
-    """Refuse to queue more loads for a process that waits for very many; ``cold`` is what they are of.
+    """Refuse to queue loads of the ``cold`` cells for a process that already waits for too many.
 
     Raises
     ------
     Busy
-        It waits for `MAX_QUEUED` loads, and these are others.
+        The process waits for `MAX_QUEUED` loads, and not all the cold cells are among them.
     MapChanged, NoSession
         See `PendingRequest.pause`.
     """
@@ -99,12 +99,12 @@ def check_queue(loads: Loads, wanted: PendingRequest, cold: Sequence[tuple[int, 
 
 @lru_cache(maxsize=128)  # requests have few specs, and repeat them
 def layers_of(specs: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the layers that a request names, in canonical form, duplicates left out.
+    """Return the layers that a request names, in canonical form and without duplicates.
 
     Raises
     ------
     BadRequest
-        One makes no sense, or they are too many.
+        A layer's name is invalid, or there are too many layers.
     """
     if len(specs) > MAX_LAYERS:
         raise BadRequest(f"{len(specs)} layers in one request; {MAX_LAYERS} is the most")
@@ -113,17 +113,17 @@ def layers_of(specs: tuple[str, ...]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=128)
 def layers_named(specs: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the layers that an admitted request names, one for each spec, in canonical form."""
+    """Return the layers that an admitted request names, one per spec, in canonical form."""
     return tuple(map(canonical_layer, specs))
 
 
 def check_intent(intent: messages.Intent) -> None:
-    """Refuse an intent without an order by distance: it would mix up all clients' evictions and loads.
+    """Refuse an intent with a number that is not finite: it would corrupt the order of evictions and loads.
 
     Raises
     ------
     BadRequest
-        A number in it is not finite.
+        A number in the intent is not finite.
     """
     numbers = (intent.x, intent.y, intent.vx, intent.vy, intent.heading or 0.0, *chain(*intent.route))
     if not all(map(math.isfinite, numbers)):
@@ -132,12 +132,12 @@ def check_intent(intent: messages.Intent) -> None:
 
 @dataclass(eq=False, slots=True)
 class SessionQuota:
-    """Refuses what would exceed it, cell by cell.
+    """Quota of a session: refuses the cells that would exceed it, one by one.
 
     Parameters
     ----------
     nbytes
-        Most bytes one session may keep that no other session also holds.
+        Limit of the bytes that one session alone holds.
     clock
         The serving loop's clock, seconds.
     """
@@ -148,20 +148,20 @@ class SessionQuota:
 
     @property
     def message(self) -> str:
-        """Why a cell is refused."""
+        """Message that a refused cell carries."""
         return f"this client would keep more than its quota of {format_bytes(self.nbytes)} for itself alone"
 
     def has_room(self, session: Session, residents: Sequence[Resident]) -> bool:
-        """Whether the session may surely have these, too."""
+        """Whether these segments certainly fit in the session's quota."""
         return session.held_bytes + sum(resident.nbytes for resident in residents) <= self.nbytes
 
     def check(self, wanted: PendingRequest, sizes: Sequence[int]) -> Iterator[None]:
-        """Note as refused what is too much, farthest cells first.
+        """Mark the cells that exceed the quota as refused, farthest cells first.
 
         Parameters
         ----------
         sizes
-            Bytes of each cell that is wanted.
+            Bytes of each requested cell.
 
         Raises
         ------
@@ -172,7 +172,7 @@ class SessionQuota:
         if session.held_bytes + sum(sizes) <= self.nbytes:
             return
         too_much, added, keys = yield from self._excess(wanted, sizes)
-        if too_much:  # unless it has released something
+        if too_much:  # look whether the session has released something
             before_s = self.clock() - HAND_OUT_GRACE_S
             enough = lambda: session.exclusive_bytes + added <= self.nbytes  # noqa: E731
             for _ in survey.look_at(session, before_s, enough, keys):
@@ -187,7 +187,7 @@ class SessionQuota:
     def _excess(
         self, wanted: PendingRequest, sizes: Sequence[int]
     ) -> Generator[None, None, tuple[list[Key], int, set[Key]]]:
-        """Return what is too much, the bytes all would add to what no other session holds, and all keys."""
+        """Return the keys over quota, the bytes that all keys add to the exclusive memory, and all keys."""
         session, cells = wanted.session, wanted.found.cells
         counted: set[Key] = set()
         too_much: list[Key] = []
@@ -206,7 +206,7 @@ class SessionQuota:
                     continue
                 counted.add(key)
                 if self.cache.is_held(index, layer):
-                    continue  # a session keeps it anyway, perhaps this one
+                    continue  # a session holds it already, perhaps this one
                 added += sizes[position] - self.cache.replaced_bytes(session, key)
                 if session.exclusive_bytes + added > self.nbytes:
                     too_much.append(key)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new state of the map takes over: waiting requests, memory and loads follow it, and it is published."""
+"""Switch to a new state of the map: requests, memory and loads follow, and the change is published."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from shmmap.protocol import events
 __all__ = ["MapChange"]
 
 MAX_NAMED: Final = 64
-"""Changed cells with events of their own: a rewritten map has a million; `metadata` names them all."""
+"""Changed cells with an event each: a rewritten map has a million; `metadata` lists them all."""
 MAX_PROBLEMS: Final = 64
-"""Problems of the map in the log."""
+"""Map problems logged per reload."""
 
 
 @dataclass(eq=False, slots=True)
 class MapChange:
-    """Carries out what a reload found."""
+    """Applies the result of a reload."""
 
     reloader: Reloader
     cache: CellCache
@@ -39,13 +39,13 @@ class MapChange:
     paging: Paging
 
     def collect(self) -> None:
-        """Serve what a reload found, and answer those that asked for it."""
+        """Serve the result of a reload, and answer the operators that asked for it."""
         self.reloader.collect(self._apply, self._keep)
 
     def _apply(self, reread: Reread) -> Reread | None:
-        """Serve another state of the map from now on; None if it does not know enough yet."""
+        """Serve another state of the map from now on; return None if too little of it is known yet."""
         statistics, catalogue = self.cache.statistics, reread.catalogue
-        if catalogue.pages is not None:  # more of both is known by now; they are compared a page at a time
+        if catalogue.pages is not None:  # compare again: more of both states is known by now
             reread = Reread(catalogue, catalogue.changes_from(self.cache.catalogue))
         if not self.paging.is_ready(catalogue, self._try_again):
             return None
@@ -62,11 +62,11 @@ class MapChange:
         return reread
 
     def _try_again(self) -> None:
-        """Serve the state of the map that was held back, if enough is known of it now."""
+        """Serve the state of the map that was held back, if enough of it is known now."""
         self.reloader.apply_held(self._apply)
 
     def _publish(self, change: CatalogueChange) -> None:
-        """Log and publish what is new in the map."""
+        """Log and publish the changes of the map."""
         cache, catalogue = self.cache, self.cache.catalogue
         counts = {how: len(getattr(change, how)) for how in ("changed", "moved", "added", "removed")}
         named = [(how, cell) for how in counts for cell in change.ids(how, MAX_NAMED)][:MAX_NAMED]
@@ -81,7 +81,7 @@ class MapChange:
             self.event_log.publish(events.Changed, cache.wire_id(cell), version, how)
 
     def _keep(self, error: ShmmapError) -> None:
-        """Keep the old state of the map, which could not be read again."""
+        """Keep the old state of the map because reading the new one failed."""
         statistics, catalogue = self.cache.statistics, self.cache.catalogue
         statistics.add("reloads_failed")
         statistics.set("last_reload_failed", 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What any client may ask about the map: where it is, which cells there are, one of them, its users."""
+"""Queries of any client about the map: connection data, the list of cells, one cell, statistics."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ from shmmap.version import __version__
 __all__ = ["MapQueries"]
 
 PAGE_ROWS: Final = 500
-"""Longest metadata page: making one takes the serving loop about a millisecond."""
+"""Rows of a metadata page, at most: a full one takes the serving loop about a millisecond."""
 LOOKED_AT: Final = 20_000
-"""Cells that are tested for one page of an area's metadata, retired segments that are looked through."""
+"""Cells tested for one page of an area's metadata; retired segments examined for one cell."""
 METADATA_WAIT_S: Final = 0.25
-"""How long a request for the list waits for a page of the map; it is repeated until that has come."""
+"""How long a metadata request waits for a page of the map; clients repeat it until the page has arrived."""
 MAX_WAITING: Final = 1024
 ROW_BITS: Final = 32
 
 
 class _Waiting(NamedTuple):
-    """A request for the list that waits for a page of the map."""
+    """A metadata request that waits for a page of the map."""
 
     session: Session
     message: messages.Metadata
@@ -58,7 +58,7 @@ class _Waiting(NamedTuple):
 
 
 class _Changes(NamedTuple):
-    """What differs between two states of the map: catalogue indices, ascending, and ids of what left it."""
+    """Difference between two states of the map: catalogue indices, ascending, and ids of removed cells."""
 
     between: tuple[int, int]
     cells: NDArray[np.intp]
@@ -67,14 +67,14 @@ class _Changes(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class MapQueries:
-    """Answers from the catalogue and from what is in memory.
+    """Answers queries from the catalogue and the cache.
 
     Parameters
     ----------
     pins
         The cells that operators pinned.
     events_path
-        Where events are published; empty: nowhere.
+        Address at which events are published; empty if they are not.
     """
 
     config: DaemonConfig
@@ -94,7 +94,7 @@ class MapQueries:
         return self.cache.catalogue
 
     def welcome(self, session: Session, message: messages.Hello) -> messages.Welcome:
-        """Answer a new client's hello: where everything is."""
+        """Return the answer to a new client's hello: everything it needs to connect."""
         cache, catalogue, (major, minor) = self.cache, self._catalogue, messages.PROTOCOL_VERSION
         ledger = cache.ledger
         return messages.Welcome(
@@ -108,7 +108,7 @@ class MapQueries:
         )  # fmt: skip
 
     def answer(self, message: messages.Request) -> messages.Reply:
-        """Answer one request."""
+        """Return the answer to a query."""
         if isinstance(message, Recent):
             return self.event_log.page(message)
         if isinstance(message, messages.Show):
@@ -118,12 +118,12 @@ class MapQueries:
     # --- the list of cells ------------------------------------------------------------------------
 
     def metadata(self, session: Session, message: messages.Metadata, now_s: float) -> None:
-        """Answer with a page of the list; for a page of the map that is not here wait a moment.
+        """Answer with a page of the list of cells; wait briefly if a page of the map is missing.
 
         Raises
         ------
         Offline
-            That cannot be fetched at present.
+            The missing page of the map cannot be fetched at present.
         """
         page = self.page(message)
         if page is None and len(self._waiting) < MAX_WAITING:
@@ -132,18 +132,18 @@ class MapQueries:
             session.connection.reply(encode(page or self.page(message, empty=True)))
 
     def pages_finished(self, news: PageNews) -> None:
-        """Answer requests that waited for pages which have come, or cannot be fetched."""
+        """Answer requests that waited for pages which have arrived, or cannot be fetched."""
         if self._waiting and (news.come or news.out_of_reach):
             waiting, self._waiting = self._waiting, []
             for one in waiting:
                 self._answer_waiting(one, over=False)
 
     def next_deadline_s(self) -> float:
-        """When a request has waited long enough; infinity if none waits."""
+        """When the first waiting request times out; infinity if none waits."""
         return min((one.deadline_s for one in self._waiting), default=math.inf)
 
     def answer_overdue(self, now_s: float) -> None:
-        """Answer requests that have waited long enough: clients repeat them."""
+        """Answer requests that have timed out: clients repeat them."""
         waiting, self._waiting = self._waiting, []
         for one in waiting:
             if now_s < one.deadline_s:
@@ -166,12 +166,12 @@ class MapQueries:
             connection.reply(encode(page or self.page(one.message, empty=True)))
 
     def page(self, message: messages.Metadata, *, empty: bool = False) -> messages.MetadataPage | None:
-        """List a page; if a page of the map has to come first, return None, or one without rows if ``empty``.
+        """Return a metadata page; if a page of the map is missing, None, or a page without rows if ``empty``.
 
         Raises
         ------
         Offline
-            That cannot be fetched at present.
+            The missing page of the map cannot be fetched at present.
         """
         catalogue = self._catalogue
         removed: tuple[str, ...] = ()
@@ -198,7 +198,7 @@ class MapQueries:
     def _changed_rows(
         self, touched: NDArray[np.intp], area: Area | None, start: int, limit: int
     ) -> tuple[Sequence[int], int | None] | None:
-        """Cells that changed, from the ``start``-th on, and the next place; None: pages have to come."""
+        """Return changed cells from position ``start``, and the next position; None if pages are missing."""
         catalogue = self._catalogue
         if (pages := catalogue.pages) is not None:
             page_of = pages.of_cell
@@ -210,12 +210,12 @@ class MapQueries:
         return touched[start:end].tolist(), end if end < len(touched) else None
 
     def _have_come(self, pages: Pages, needed: Sequence[int]) -> bool:
-        """Whether these pages are here; else they are fetched.
+        """Whether these pages of the map are in memory; if not, fetch them.
 
         Raises
         ------
         Offline
-            One cannot be fetched at present.
+            A page cannot be fetched at present.
         """
         absent = [page for page in needed if not pages.is_here(page)]
         pages.want(needed, 0.0)
@@ -225,9 +225,9 @@ class MapQueries:
         return not absent
 
     def _rows(self, area: Area | None, start: int, limit: int) -> tuple[Sequence[int], int | None]:
-        """Cells from a catalogue index on, and where the next page begins.
+        """Return cells from a catalogue index on, and where the next page begins.
 
-        In a large area only some cells are looked at: a page may have few rows or none, and not be the last.
+        Only some cells of a large area are tested: a page may have few rows or none without being the last.
         """
         catalogue = self._catalogue
         count = len(catalogue)
@@ -248,9 +248,9 @@ class MapQueries:
     def _rows_of_pages(
         self, pages: Pages, area: Area | None, start: int, limit: int
     ) -> tuple[Sequence[int], int | None] | None:
-        """Cells of one page of the map, from a row on, and where the next ones begin; None: it has to come.
+        """Return cells of one page of the map from a row on, and the next position; None if it is missing.
 
-        A place in the list is its page's number, shifted by 32 bits, and its row there.
+        A position in the list is the page's number, shifted by 32 bits, plus the row in that page.
 
         Raises
         ------
@@ -275,7 +275,7 @@ class MapQueries:
         return indices.tolist(), listed[at + 1] << ROW_BITS if at + 1 < len(listed) else None
 
     def _changes_since(self, map_version: int) -> _Changes | None:
-        """Find what changed, and remember it for the pages that follow; None where that is not known."""
+        """Return the changes, cached for the following pages; None if they are not known."""
         between = map_version, self._catalogue.map_version
         if self._changes is None or self._changes.between != between:
             change = self.map_switch.changes_since(map_version)
@@ -283,7 +283,7 @@ class MapQueries:
                 return None
             touched = {i for cell in change[0] if (i := self.cache.index_of(cell)) is not None}
             if len(touched) < len(change[0]) and not self._catalogue.complete:
-                return None  # pages have gone that some of them were in
+                return None  # pages that listed some of them have been dropped
             removed = tuple(map(self.cache.wire_id, change[1]))
             self._changes = _Changes(between, np.array(sorted(touched), dtype=np.intp), removed)
         return self._changes
@@ -295,7 +295,7 @@ class MapQueries:
         return messages.MetadataRow(wire_id, catalogue.version(index), *catalogue.box(index), size, *heights)
 
     def stats(self, message: messages.Stats, usage: Usage) -> Generator[None, None, messages.StatsReply]:
-        """Answer a request for statistics with what a survey found, some sessions a turn."""
+        """Answer a request for statistics with the result of a survey, some sessions per turn."""
         statistics, pace, rows = self.cache.statistics, Pace(), list[messages.ClientRow]()
         for one in tuple(self.sessions):
             yield from pace.pause()
@@ -313,7 +313,7 @@ class MapQueries:
     def _show(self, message: messages.Show) -> messages.ShownCell:
         cache, catalogue, ledger, heights = self.cache, self._catalogue, self.cache.ledger, self.cache.heights
         index = cache.index_of(message.id)
-        # a cell that left the map while a process maps it still shows, with version 0
+        # a cell that left the map is still shown while a process maps it, with version 0
         ids = {message.id, cache.id_prefix + message.id} if index is None else {catalogue.id(index)}
         found = [resident for cell_id in sorted(ids) for resident in ledger.of_cell(cell_id)]
         retired = itertools.islice(ledger.retired.values(), LOOKED_AT)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map whose list of cells comes in pages: what those that have come are for, and which may be dropped."""
+"""Pages of the map's list of cells: pass on those that have arrived, and drop those that nothing needs."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from shmmap.daemon.turns import WatchedDescriptors
 __all__ = ["Paging"]
 
 KEPT_S: Final = 0.02
-"""Pause after a page that has to stay: each check takes about a millisecond."""
+"""Pause after a page that has to stay: one check takes about a millisecond."""
 MAX_RETIRED: Final = 20_000
-"""Retired segments that are looked through; of more, no page is given up."""
+"""Retired segments examined; if there are more, no page is dropped."""
 
 
 @dataclass(eq=False, slots=True)
 class Paging:
-    """Passes on which pages have come, or cannot be fetched, and drops those that nothing needs.
+    """Reports pages that have arrived, or cannot be fetched, and drops pages that nothing needs.
 
-    A page is needed while there is a segment of one of its cells, a load, a pin, a request that is not
-    answered yet, or a session whose area may have cells of it.  It is a background task of the serving loop.
+    A page is needed while one of its cells has a segment, a load or a pin, or while an unanswered request or
+    a session's area may have cells in it.  This class is a background task of the serving loop.
     """
 
     cache: CellCache
@@ -50,7 +50,7 @@ class Paging:
     _rests_until_s: float = -math.inf
 
     def follow(self) -> None:
-        """Follow the pages of the map that is served from now on."""
+        """Switch to the pages of the map that is served from now on."""
         self._stop_following_the_next()
         if self._fd >= 0:
             self.watched.unwatch(self._fd)
@@ -64,7 +64,7 @@ class Paging:
     def is_ready(self, new: CatalogueView, try_again: Callable[[], None]) -> bool:
         """Return whether a new state of the map has all pages that the served state has.
 
-        If not, fetch the missing pages, and call ``try_again`` when some have come.
+        Otherwise fetch the missing pages, and call ``try_again`` when some have arrived.
         """
         self._stop_following_the_next()
         pages, served = new.pages, self.cache.pages
@@ -87,12 +87,12 @@ class Paging:
         self._coming_fd = -1
 
     def collect(self) -> None:
-        """Begin what waited for pages that have come, or cannot be fetched."""
+        """Start the work that waited for pages which have arrived, or cannot be fetched."""
         pages = self.cache.pages
         if pages is None:
             return
         news = pages.collect()
-        if news.come and self._was_out_of_reach:  # what failed for lack of a page may work now
+        if news.come and self._was_out_of_reach:  # loads that failed for lack of a page may succeed now
             self.scheduler.loads.forget_failures()
         self._was_out_of_reach = bool(news.out_of_reach) or (self._was_out_of_reach and not news.come)
         if news.come:
@@ -108,7 +108,7 @@ class Paging:
 
     @property
     def next_s(self) -> float:
-        """When a page may have to go, or a request for the list has waited long enough."""
+        """When a page may have to be dropped, or a metadata request times out."""
         pages = self.cache.pages
         if pages is None:
             return math.inf
@@ -116,21 +116,21 @@ class Paging:
         return min(drop_s, self.queries.next_deadline_s())
 
     def run_step(self, now_s: float) -> None:
-        """Drop a page, if they are too many and nothing needs it."""
+        """Drop one page if there are too many and nothing needs it."""
         self.queries.answer_overdue(now_s)
         pages = self.cache.pages
         page = pages.spare() if pages is not None and now_s >= self._rests_until_s else None
         if pages is None or page is None:
             return
         if self.is_needed(page):
-            pages.want((page,), BACKGROUND)  # put it last: another one is looked at next
+            pages.want((page,), BACKGROUND)  # move it to the end: the next step checks another page
             self._rests_until_s = now_s + KEPT_S
         else:
             pages.drop(page)
             self.scheduler.prefetcher.restart()
 
     def is_needed(self, page: int) -> bool:
-        """Whether a page has to stay."""
+        """Whether a page has to stay in memory."""
         cache, ledger, catalogue, pages = (
             self.cache,
             self.cache.ledger,

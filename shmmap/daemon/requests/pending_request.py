@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests for cells that are not answered yet: what each asks for, what it waits for, and until when.
+"""Requests for cells that are not answered yet: what each asks for, waits for, and its deadline.
 
-A request may be for very many cells.  What goes through them ends its turn when the turn's time is used
+A request may name very many cells.  Work on them ends its turn when the turn's time is used up
 (`PendingRequest.pause`).
 """
 
@@ -28,44 +28,44 @@ from shmmap.geometry import Area, distance_to_boxes
 __all__ = ["LARGE", "MAX_OF_A_SESSION", "Finder", "Found", "MapChanged", "PendingRequest", "WaitingList"]
 
 MAX_OF_A_SESSION: Final = 64
-"""Requests of one session that may wait; further ones are answered at once, what is cold is pending."""
+"""Requests of one session that may wait; further ones are answered at once, with cold cells as pending."""
 MAX_REQUESTS: Final = 16_384
 MAX_CELLS_OF_A_PROCESS: Final = 20_000
 MAX_CELLS: Final = 200_000
-"""Cells of all requests that wait, a quarter of a kilobyte each; beyond, all are answered at once."""
+"""Cells of all waiting requests, 250 bytes each; beyond this number, requests are answered at once."""
 OVERDUE_PER_TURN: Final = 256
 LARGE: Final = 1024
-"""More cells than this make a request large: a step that handles all of them gets a turn of its own."""
+"""A request for more cells is large: a step that handles all of them at once gets its own turn."""
 
 Awaited = TypeVar("Awaited")
 
 
 class MapChanged(Exception):
-    """Catalogue indices mean other cells now."""
+    """The catalogue indices of a request have become invalid."""
 
 
 @dataclass(eq=False, slots=True)
 class Found:
-    """What a request asks for, in one state of the map.
+    """Cells found for a request in one state of the map.
 
     Attributes
     ----------
     cells
         Catalogue index and layer of each handle to send, in reply order.
     covered, reason
-        Whether all cells of what it asks about are known; why that is not to be waited for.
+        Whether all cells of the requested area are known; if not, why the request does not wait for the rest.
     pages
-        Pages of the map that may have more of what it asks about.
+        Pages of the map that may list more cells of the request.
     removed, removed_packed
-        What the client should drop, as the reply says it.
+        Cells that the client should drop, as the reply encodes them.
     unknown
-        Ids that the map does not have, with the layers asked for.
+        Ids that the map does not contain, with the requested layers.
     held_old
-        Layers of cells that the client holds in an older version.
+        Layers of cells that the client holds in an outdated version.
     refused
-        What would exceed the session's quota.
+        Cells that exceed the session's quota.
     requested
-        Whether loads of what is cold were requested.
+        Whether loads of the cold cells have been requested.
     """
 
     catalogue: CatalogueView | None = None
@@ -82,30 +82,30 @@ class Found:
 
 
 Finder: TypeAlias = Callable[["PendingRequest"], Iterator[None]]
-"""Finds what a request asks for in the map that is served now, and notes it in its `Found`."""
+"""Finds a request's cells in the map that is served now, and writes them to its `Found`."""
 
 
 @dataclass(eq=False, slots=True)
 class PendingRequest:
     """A request that is not answered yet.
 
-    What it asks for is found before it is answered, and found again when another state of the map is
-    served, or when a page has come that it waits for.
+    Its cells are found before it is answered, and found again when another state of the map is served, or
+    when a page that it waits for has arrived.
 
     Attributes
     ----------
     layers
-        What it asks for of each cell, as the reply says it.
+        Requested layers of each cell, as the reply names them.
     area
-        What it asks about; None for a request by ids.
+        Requested area; None for a request by ids.
     message_cells
-        Memory that its message takes, counted in cells.
+        Memory of the request's message, in cells.
     needed, outstanding
-        What is kept from being evicted for it, and the loads it waits for.
+        Cells protected from eviction for the request, and the loads it waits for.
     began_s, deadline_s
-        When it began to wait and until when; 0 for a request that does not wait.
+        When it began to wait, and its deadline; 0 for a request that does not wait.
     outdated
-        Whether there is more to find than was found.
+        Whether its cells have to be found again.
     """
 
     cache: CellCache
@@ -124,28 +124,28 @@ class PendingRequest:
     pace: Pace = field(default_factory=Pace)
 
     def find_again(self) -> Iterator[None]:
-        """Find what it asks for in the map that is served now, unless that is what was found.
+        """Find the request's cells in the map that is served now, unless they were found in that one.
 
         Raises
         ------
         MapChanged, NoSession
             See `pause`.
         BadRequest
-            It asks for too much.
+            The request names too many cells.
         """
         if self.outdated or self.found.catalogue is not self.cache.catalogue:
             self.found, self.outdated = Found(self.cache.catalogue), False
             yield from self.find(self)
 
     def pause(self, *, now: bool = False) -> Iterator[None]:
-        """End the turn, if it has used its time, or ``now``: before much that is done at once.
+        """End the turn if its time is used up, or with ``now`` in any case: before a long step.
 
         Raises
         ------
         MapChanged
-            Meanwhile another state of the map is served: what is asked for has to be found again.
+            Another state of the map is served now: the cells have to be found again.
         NoSession
-            Meanwhile the session has ended.
+            The session has ended.
         """
         if now or self.pace.is_over:
             yield
@@ -157,23 +157,23 @@ class PendingRequest:
 
     @property
     def is_large(self) -> bool:
-        """Whether what is done at once for all cells found is worth a turn of its own."""
+        """Whether a step over all its cells at once deserves a turn of its own."""
         return len(self.found.cells) > LARGE
 
     @property
     def weight(self) -> int:
-        """Memory that it takes, in cells."""
+        """Memory of the request, in cells."""
         return max(len(self.found.cells), self.message_cells)
 
     @property
     def waits(self) -> bool:
-        """Whether something it waits for has neither come nor failed."""
+        """Whether a load or page that it waits for has neither arrived nor failed."""
         return bool(self.outstanding or self.found.pages)
 
     def distances_m(self, cells: Iterable[tuple[int, str]]) -> list[float]:
-        """Return how far cells are from where the client says it is.
+        """Return the distances of cells from the position that the client sent.
 
-        Else from the middle of what it asks about; 0 for a request by ids.
+        Without one, from the centre of the requested area; 0 for a request by ids.
         """
         boxes = self.cache.catalogue.boxes_of(np.array([index for index, _ in cells], dtype=np.intp))
         intent = self.session.intent
@@ -188,22 +188,22 @@ class PendingRequest:
 
 
 class WaitingList:
-    """Requests that wait for loads or pages, what they need, and in which order their time ends.
+    """Requests that wait for loads or pages, the cells they need, and their deadlines in order.
 
-    Adding and removing one costs the same however many wait.  What follows from the end of a load, a request
-    or a session is done in `tidy`, a turn's worth at a time.
+    Adding or removing a request costs the same however many wait.  `tidy` does the work that follows from the
+    end of a load, a request or a session, in bounded steps.
 
     Parameters
     ----------
     ledger
-        Keeps from being evicted what is needed.
+        Protects needed cells from eviction.
     """
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
         self._of_load: dict[Key, dict[PendingRequest, None]] = {}
         self._of_page: dict[int, dict[PendingRequest, None]] = {}
-        self._of: dict[Session, dict[PendingRequest, int]] = {}  # with the number of cells it began with
+        self._of: dict[Session, dict[PendingRequest, int]] = {}  # with the weight counted for each, in cells
         self._taken: set[PendingRequest] = set()
         self._heap: list[tuple[float, int, PendingRequest]] = []
         self._cells: Counter[int] = Counter()
@@ -222,11 +222,11 @@ class WaitingList:
         return request in self._of.get(request.session, ())
 
     def of(self, session: Session) -> list[PendingRequest]:
-        """Return the requests of one session."""
+        """Return the waiting requests of one session."""
         return list(self._of.get(session, ()))
 
     def has_room(self, request: PendingRequest) -> bool:
-        """Whether this one may wait, too."""
+        """Whether a request may wait."""
         count, asker = request.weight, request.session.asker
         return (
             self._count < MAX_REQUESTS
@@ -236,14 +236,14 @@ class WaitingList:
         )
 
     def add(self, request: PendingRequest) -> None:
-        """Let a request wait until its ``deadline_s``, which does not change any more."""
+        """Let a request wait until its ``deadline_s``, which must not change afterwards."""
         self._of.setdefault(request.session, {})[request] = 0
         self._count += 1
         self.recount(request)
         self.put_back(request)
 
     def recount(self, request: PendingRequest) -> bool:
-        """Count the cells of a waiting request again; whether all may go on waiting."""
+        """Count the cells of a waiting request again; return whether the list is still within its limit."""
         asker, mine = request.session.asker, self._of[request.session]
         more = request.weight - mine[request]
         mine[request] += more
@@ -252,20 +252,20 @@ class WaitingList:
         return self._cells[asker] <= MAX_CELLS_OF_A_PROCESS and self._all_cells <= MAX_CELLS
 
     def take(self, request: PendingRequest) -> bool:
-        """Take a waiting request to be answered; False if it is taken already."""
+        """Take a waiting request to answer it; return False if it was taken before."""
         is_new = request in self and request not in self._taken
         if is_new:
             self._taken.add(request)
         return is_new
 
     def put_back(self, request: PendingRequest) -> None:
-        """Let a request that was taken go on waiting."""
+        """Let a request that was taken wait again."""
         self._number += 1
         self._taken.discard(request)
         heapq.heappush(self._heap, (request.deadline_s, self._number, request))
 
     def remove(self, request: PendingRequest) -> None:
-        """Let a request wait no longer."""
+        """Remove a request from the list."""
         session, asker = request.session, request.session.asker
         count = self._of[session].pop(request)
         if not self._of[session]:
@@ -281,7 +281,7 @@ class WaitingList:
             heapq.heapify(self._heap)
 
     def next_deadline_s(self) -> float:
-        """Return when there is something to do: at once, or when a request's time ends; else infinity."""
+        """Return the time of the next work: now, or the earliest deadline; else infinity."""
         return 0.0 if self._news or self._leftovers else self._first_deadline_s()
 
     def _first_deadline_s(self) -> float:
@@ -293,7 +293,7 @@ class WaitingList:
         return request in self and request not in self._taken
 
     def overdue(self, now_s: float) -> list[PendingRequest]:
-        """Return requests whose time has ended, a bounded number."""
+        """Return requests whose deadline has passed, a bounded number."""
         found: list[PendingRequest] = []
         while self._first_deadline_s() <= now_s and len(found) < OVERDUE_PER_TURN:
             found.append(heapq.heappop(self._heap)[2])
@@ -302,7 +302,7 @@ class WaitingList:
     # --- what they need and wait for ------------------------------------------------------------
 
     def need(self, wanted: PendingRequest, key: Key) -> None:
-        """Keep what is asked for from being evicted until the answer is out."""
+        """Protect a requested cell from eviction until the answer has left."""
         if key not in wanted.needed:
             wanted.needed[key] = None
             self._ledger.need(key)
@@ -313,14 +313,14 @@ class WaitingList:
         self._of_load.setdefault(key, {})[wanted] = None
 
     def wait_for_pages(self, wanted: PendingRequest) -> None:
-        """Let a request wait for its ``pages``."""
+        """Let a request wait for its missing ``pages``."""
         for page in wanted.found.pages:
             self._of_page.setdefault(page, {})[wanted] = None
 
     # --- what is done little by little ----------------------------------------------------------
 
     def load_finished(self, key: Key) -> None:
-        """Note that a load ended, in whichever way, for the requests that wait for it."""
+        """Note the end of a load, successful or not, for the requests that wait for it."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:
@@ -331,7 +331,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def page_finished(self, page: int, reason: str = "") -> None:
-        """Note for the requests that wait for a page that it has come, or why it cannot be fetched."""
+        """Note that a page has arrived, or why it cannot be fetched, for the requests that wait for it."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:
@@ -346,7 +346,7 @@ class WaitingList:
             self._news.append(note(waiters))
 
     def map_changed(self) -> None:
-        """Make requests that wait for pages find their cells again: the map has other pages now."""
+        """Have requests that wait for pages find their cells again: the map now has other pages."""
 
         def note(waiters: Iterable[PendingRequest]) -> Iterator[PendingRequest]:
             for waiter in waiters:
@@ -357,7 +357,7 @@ class WaitingList:
         self._news.extend(map(note, waiting.values()))
 
     def release(self, wanted: PendingRequest) -> None:
-        """Release what a request needed, which is over."""
+        """Release the cells that a finished request needed."""
 
         def steps() -> Iterator[None]:
             while wanted.needed:
@@ -374,27 +374,27 @@ class WaitingList:
             self.do_later(steps())
 
     def do_later(self, steps: Iterator[None]) -> None:
-        """Leave steps that no client waits for to `tidy`."""
+        """Queue steps that no client waits for; `tidy` runs them."""
         self._leftovers.append(steps)
 
     def tidy(self) -> Iterator[PendingRequest]:
-        """Do a turn's worth of what is left to do; yield requests that have nothing left to wait for."""
+        """Run one turn of deferred steps; yield requests that have nothing left to wait for."""
         for one in Walk(self._steps()).for_a_turn():
             if one is not None and (one.outdated or not one.waits) and one in self:
                 yield one
 
     def _steps(self) -> Iterator[PendingRequest | None]:
-        """Do what is left to do, waiting requests first; yield after each step."""
+        """Run the deferred steps, those of waiting requests first; yield after each step."""
         while queue := self._news or self._leftovers:
             step = next(queue[0], self)
-            if isinstance(step, WaitingList):  # there is none
+            if isinstance(step, WaitingList):  # no step is queued
                 queue.popleft()
             else:
                 yield step
 
 
 def _leave(waiting: dict[Awaited, dict[PendingRequest, None]], what: Awaited, wanted: PendingRequest) -> None:
-    """Let a request wait for something no longer."""
+    """Remove a request from those that wait for a load or page."""
     left = waiting.get(what, {})
     left.pop(wanted, None)
     if not left:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the statistics segment shows."""
+"""Content of the statistics segment."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon's pulse: a few times a second what it keeps is measured and written to the statistics.
+"""Periodic measurements: a few times a second, the daemon's state is written to the statistics.
 
-It beats from the serving loop itself, so that a daemon that hangs does not beat; a beat takes some turns.
-While cells come and go it beats more often, and lightly: only what has changed is written then.
+A beat runs in the serving loop itself, so that a daemon that hangs stops beating; it takes several turns.
+While cells are added and removed, beats are more frequent but partial: only changes are written.
 """
 
 from __future__ import annotations
@@ -45,27 +45,27 @@ __all__ = [
 BEAT_S: Final = 0.25
 CHANGE_BEAT_S: Final = 0.02
 EVENT_BEAT_S: Final = 1.0
-"""How often the last event's number is published, so that a missed event does not stay unnoticed."""
+"""Interval of publishing the last event's number, which reveals missed events."""
 ROWS_PER_BEAT: Final = 128
 ROWS_PER_TURN: Final = 16
-"""Rows of cells that are written at one beat, and in one of its turns: a tenth of a millisecond."""
+"""Rows of cells written per beat, and per turn of a beat: a tenth of a millisecond."""
 MAX_TURNS_OF_USED: Final = 4
 """Turns, at most, in which a beat updates the rows of cells that clients were given."""
 CLIENT_ROWS_PER_BEAT: Final = 64
-"""Rows of clients that are brought up to date at one beat: half a millisecond."""
+"""Rows of clients updated per beat: half a millisecond."""
 SAMPLE_S: Final = 1.0
-"""How often the counters of the last minutes are remembered."""
+"""Interval of sampling the counters for the last minutes."""
 
 
 class RecentCounts:
-    """The values of some counters, remembered once a second: how much they grew recently.
+    """Values of some counters, sampled once a second, to compute their recent growth.
 
     Parameters
     ----------
     names
-        Which counters.
+        Names of the counters.
     spans_s
-        Spans over which their growth is wanted, longest last.
+        Time spans over which growth is computed, longest last.
     """
 
     def __init__(self, names: Iterable[str], spans_s: Iterable[float]) -> None:
@@ -80,9 +80,9 @@ class RecentCounts:
             self._samples.append((now_s, tuple(values[name] for name in self._names)))
 
     def growth(self, values: Mapping[str, int], now_s: float) -> list[tuple[int, ...]]:
-        """Return for each span how much each counter grew over it, to a sample's precision.
+        """Return the growth of each counter per span, to a sample's precision.
 
-        If a span is longer than the memory of samples, return the growth since the first sample.
+        If a span is longer than the stored samples, the growth since the first sample is returned.
         """
         return [
             tuple(values[name] - old for name, old in zip(self._names, self._at(now_s - span), strict=True))
@@ -90,7 +90,7 @@ class RecentCounts:
         ]
 
     def _at(self, time_s: float) -> tuple[int, ...]:
-        """Return the newest sample that is not younger than ``time_s``, or the oldest one."""
+        """Return the newest sample that is at least as old as ``time_s``, or else the oldest one."""
         found = bisect_right(self._samples, time_s, key=lambda sample: sample[0])
         return self._samples[max(0, found - 1)][1]
 
@@ -102,7 +102,7 @@ class _Shown(NamedTuple):
 
 
 class SessionRows:
-    """Rows of sessions as operators see them; a bounded number is brought up to date at a time."""
+    """Rows of sessions for operators; a bounded number is updated at a time."""
 
     def __init__(self) -> None:
         self._shown: dict[Session, _Shown] = {}
@@ -111,7 +111,7 @@ class SessionRows:
     def of(self, sessions: Iterable[Session]) -> list[ClientRow]:
         """Return the rows of the first `MAX_CLIENTS` sessions.
 
-        Of those that changed, the oldest rows are replaced first; a new session has none until its turn.
+        Of the changed sessions, the oldest rows are replaced first; a new session has no row until its turn.
         """
         first = list(islice(sessions, MAX_CLIENTS))
         shown = {session: self._shown[session] for session in first if session in self._shown}
@@ -125,12 +125,12 @@ class SessionRows:
 
 
 def _state(session: Session) -> tuple[object, ...]:
-    """Return what differs whenever the session's row would differ."""
+    """Return a value that changes whenever the session's row would change."""
     return session.requests, session.connection, session.intent, len(session.held), session.held_bytes
 
 
 def client_row(session: Session) -> ClientRow:
-    """Return what operators see of a client."""
+    """Return the row of a client for operators."""
     intent, peer = session.intent, session.peer
     return ClientRow(
         session.slot,
@@ -158,14 +158,14 @@ def _window(area: Area) -> Window:
 
 @dataclass(eq=False, slots=True)
 class Sampler:
-    """The beats, a few times a second: measures, and writes the statistics.
+    """Periodic measurement, a few times a second, and writing of the statistics.
 
     Parameters
     ----------
     waiting
-        Whose length is the number of requests that wait for loads.
+        Collection of the requests that wait for loads; its length is measured.
     on_beat
-        Called after each whole beat.
+        Called after each complete beat.
     """
 
     cache: CellCache
@@ -187,16 +187,16 @@ class Sampler:
 
     @property
     def next_s(self) -> float:
-        """Return when the next beat or part of one is due: soon after cells came, went or changed."""
+        """Return when the next beat, or part of one, is due: soon if cells were added, removed or changed."""
         if self._beating is not None:
             return 0.0
         if self.statistics.outdated:
-            # a reader right after a change sees it, yet a stream of changes costs little
+            # a reader sees a change soon, yet a stream of changes costs little
             return min(self._next_s, self._last_s + CHANGE_BEAT_S)
         return self._next_s
 
     def run_step(self, now_s: float) -> None:
-        """Beat, or go on with it."""
+        """Begin a beat, or continue the current one."""
         if self._beating is None:
             whole = now_s >= self._whole_s
             if whole:
@@ -209,7 +209,7 @@ class Sampler:
             self._beating = beating
 
     def measure(self) -> None:
-        """Bring the gauges of memory, loads and the map up to date."""
+        """Update the gauges of memory, loads and the map."""
         self.cache.measure()
         set_value = self.statistics.set
         set_value("sessions", len(self.sessions))
@@ -219,7 +219,7 @@ class Sampler:
         set_value("events_published", self.event_log.last)
 
     def _look_around(self, now_s: float) -> None:
-        """Do what need not be done at each of many beats while cells load."""
+        """Do the work that is not needed in each of many beats while cells load."""
         values = self.statistics.values
         self._recent.look(values, now_s)
         for span, growth in zip(SPANS, self._recent.growth(values, now_s), strict=True):
@@ -232,9 +232,9 @@ class Sampler:
             self.event_log.beat()
 
     def _measure_prefetching(self, now_s: float) -> None:
-        """Show what limits prefetching, and the outages of the map's storage.
+        """Write what limits prefetching, and the outages of the map's storage.
 
-        An outage begins when the failed loads were started; its length is shown until the next one.
+        An outage counts from the start of its failed loads; its length is shown until the next outage.
         """
         prefetcher, statistics = self.scheduler.prefetcher, self.statistics
         health = prefetcher.health
@@ -253,10 +253,10 @@ class Sampler:
                 statistics.set("origin_out_since_unix_ns", 0)
 
     def _beat(self, now_s: float, *, whole: bool) -> Iterator[None]:
-        """Each part takes some tenths of a millisecond at most."""
+        """Run one beat; each step takes some tenths of a millisecond at most."""
         statistics = self.statistics
         if whole:
-            if self.survey.idle:  # else it has turns of its own
+            if self.survey.idle:  # else it is run as a background task
                 self.survey.step()
             yield
             self._look_around(now_s)
@@ -284,15 +284,15 @@ class Sampler:
 
 
 class VersionInService(Protocol):
-    """A published map, as its version is served."""
+    """A published map's origin, as the source of its version and counts."""
 
     @property
     def in_service(self) -> TakenVersion | None:
-        """The version that is served; None: it is not known yet."""
+        """The version that is served; None while it is not known."""
 
     @property
     def refused_version(self) -> int:
-        """Number of the version that is offered and was refused; 0: none."""
+        """Number of the offered version that was refused; 0: none."""
 
     @property
     def expires_s(self) -> float | None:
@@ -300,21 +300,21 @@ class VersionInService(Protocol):
 
     @property
     def signed_s(self) -> float:
-        """When the version was signed, Unix time; 0: it is not."""
+        """When the version was signed, Unix time; 0 if it is not signed."""
 
     @property
     def refusal(self) -> str:
-        """Why the offer is not taken, one of `REFUSALS`; empty if it is."""
+        """Why the offer is refused, one of `REFUSALS`; empty if it is accepted."""
 
     @property
     def counts(self) -> ObjectCounts:
-        """What was read of the index so far."""
+        """Counts of index reads so far."""
 
 
 class PublishedGauges:
-    """What the statistics show of a published map: its version, and what the daemon itself has read of it.
+    """Statistics of a published map: its version, and the daemon's own reads.
 
-    Loaders report what they read in the messages that end their loads.
+    Loaders report their reads in the messages that end their loads.
     """
 
     def __init__(self, statistics: StatisticsWriter) -> None:
@@ -322,7 +322,7 @@ class PublishedGauges:
         self._counts: ObjectCounts | None = None
 
     def look(self, origin: VersionInService) -> None:
-        """Show what is served, and what was read since the last time."""
+        """Write the served version, and the reads since the last call."""
         statistics, counts = self._statistics, origin.counts
         if counts != self._counts:
             statistics.add_objects_read(counts if self._counts is None else counts.since(self._counts))

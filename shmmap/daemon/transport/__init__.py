@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sockets, sessions and turns: from bytes to requests and back."""
+"""Sockets, sessions and turns: receiving requests and sending replies."""

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Connections of clients: accepting them, what comes on each, and which are ended when there are too many.
+"""Connections of clients: how they are accepted and read, and which are closed when there are too many.
 
-Nothing is ended while there are descriptors and memory enough.  Otherwise one process is chosen:
+No connection is closed while there are enough descriptors and memory.  Otherwise one process is chosen:
 
-- no descriptor to spare: the one with most connections, which keeps as many as an equal share;
-- too much memory: the one for which most is kept (half messages, waiting requests, unread replies); it
-  loses all its connections.
+- for lack of descriptors: the process with most connections, which keeps as many as an equal share;
+- for lack of memory: the process for which most is stored (incomplete messages, waiting requests, unread
+  replies); it loses all its connections.
 
-A process that lost a connection wrongly connects again; what it maps is not touched.
+A process that lost a connection wrongly reconnects; segments that it maps are not affected.
 """
 
 from __future__ import annotations
@@ -36,29 +36,29 @@ __all__ = ["MEMORY_ALLOWANCE_BYTES", "Connection", "Connections", "Listener", "P
 
 Socket: TypeAlias = socket.socket
 MAX_UNREAD_BYTES: Final = 16 << 20
-"""Of replies; a client that leaves more does not read them."""
+"""Limit of unread replies; a client that leaves more does not read them."""
 READ_BYTES: Final = 1 << 16
-"""Taken off a connection per turn of the loop."""
+"""Bytes read from a connection per turn of the loop."""
 FRAMES_PER_TURN: Final = 4
 MAX_WAITING: Final = 48
-"""Requests of a connection that are taken off it and wait; about, for some come at once."""
+"""Requests read from a connection that may wait; approximate, since several may arrive at once."""
 LIGHT_BYTES: Final = 1 << 12
-"""What is kept for every client, and does not count."""
+"""Memory that every client may use and that is not counted."""
 ACCEPTED_PER_TURN: Final = 16
 ENDED_PER_TURN: Final = 64
 MIN_RESERVE: Final = 48
-"""Descriptors kept for the daemon's own work: loaders, segments it looks at, the map."""
+"""Descriptors reserved for the daemon's own work: loaders, segments it checks, the map."""
 MIN_SHARE: Final = 8
-"""A process with no more connections than this is never the culprit."""
+"""A process with no more connections than this is never chosen."""
 MEMORY_ALLOWANCE_BYTES: Final = 32 << 20
-"""What may be kept for all clients together."""
+"""Memory limit for all clients together."""
 _TOO_MUCH: Final = "it made the daemon take too much memory"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Credentials of a connected process; pid 0 where it is not visible from here."""
+    """Credentials of a connected process; pid 0 if the process is not visible from this one's namespace."""
 
     uid: int = -1
     gid: int = -1
@@ -71,19 +71,19 @@ class Connection:
     Attributes
     ----------
     open : bool
-        Whether it is not closed yet.
+        Whether the connection is open.
     slot : int
-        That of the session on it; 0 before a hello.
+        Slot of the session on it; 0 before a hello.
     unsent_bytes : int
-        What the kernel does not take, because the client does not read.
+        Bytes that the kernel does not accept because the client does not read.
     waiting, waiting_bytes : int
-        Requests that wait to be served.
+        Number and bytes of requests that wait to be served.
     weight : int
-        All memory that is kept for it, bytes.
+        All memory used for it, bytes.
     """
 
     def __init__(self, connected: Socket, listener: Listener) -> None:
-        # according to the kernel
+        # as reported by the kernel
         credentials = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         pid, uid, gid = _CREDENTIALS.unpack(credentials)
         self.peer = Peer(uid, gid, pid)
@@ -104,7 +104,7 @@ class Connection:
         self._send(GREETING)
 
     def reply(self, body: bytes) -> None:
-        """Send a reply; a client that leaves too much unread loses the connection, and the replies."""
+        """Send a reply; a client that leaves too much unread loses the connection with the replies."""
         step("daemon.reply")
         self._send(framed(body))
         step("daemon.replied")
@@ -119,12 +119,12 @@ class Connection:
         self.reply(encode(ErrorReply(request, error.code, error.message, error.hint)))
 
     def offer(self, body: bytes, max_unread_bytes: int) -> None:
-        """Send a message, or drop it if more than that is unread already."""
+        """Send a message, or drop it if more than ``max_unread_bytes`` are unread already."""
         if self.unsent_bytes <= max_unread_bytes:
             self._send(framed(body))
 
     def cut(self, reason: str = "") -> None:
-        """Mark it for the loop to end, which may be busy with it now; logged if there is a reason."""
+        """Mark the connection to be closed by the loop, which may be using it; log the reason if given."""
         if not self._cut:
             self._cut = True
             self._incoming.forget()
@@ -136,7 +136,7 @@ class Connection:
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def end(self) -> None:
-        """Close it and notify its owner; only between two steps of the loop."""
+        """Close the connection and notify its owner; call only between two steps of the loop."""
         if self.open:
             self.close()
             self._listener.connections.weigh(-self.weight)
@@ -144,21 +144,21 @@ class Connection:
             self._listener.connections.remove(self)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the socket."""
         self._watched.unwatch(self.fd)
         self._socket.close()
         self.open = False
         self._forget_unsent()
 
     def deliver(self, seconds: float) -> None:
-        """Wait until what was sent is read, at most for this long."""
+        """Wait up to this many seconds until the client has read everything."""
         with contextlib.suppress(OSError):
             self._socket.settimeout(seconds)
             for data in self._unsent:
                 self._socket.sendall(data)
 
     def count_waiting(self, more: int, more_bytes: int) -> None:
-        """Count requests that wait; beyond a limit the kernel keeps the rest."""
+        """Count waiting requests; beyond a limit no more are read, and the kernel buffers the rest."""
         self.waiting += more
         self.waiting_bytes += more_bytes
         reading = self.waiting < MAX_WAITING if self._reading else self.waiting <= MAX_WAITING // 2
@@ -169,7 +169,7 @@ class Connection:
                 self._watched.call_again(self.fd)
 
     def reweigh(self) -> None:
-        """Update how much is kept for it, here and in the sum of all."""
+        """Update the memory used for it, here and in the sum over all connections."""
         weight = len(self._incoming) + self.unsent_bytes + self.waiting_bytes
         weight = weight if weight > LIGHT_BYTES else 0
         more, self.weight = weight - self.weight, weight
@@ -189,7 +189,7 @@ class Connection:
             except BlockingIOError:
                 pass
             except OSError:
-                return  # the other end is closed: the loop is about to find out
+                return  # the peer has closed: the loop will notice
             if taken == len(data):
                 return
         self._unsent.append(memoryview(data)[taken:])
@@ -198,14 +198,14 @@ class Connection:
         self.reweigh()
 
     def _flush(self) -> None:
-        """Send what was not taken at once."""
+        """Send the bytes that the kernel did not accept before."""
         while self._unsent:
             data = self._unsent[0]
             try:
                 taken = self._socket.send(data)
             except BlockingIOError:
                 return
-            except OSError:  # the other end is closed: the loop is about to find out
+            except OSError:  # the peer has closed: the loop will notice
                 self._forget_unsent()
                 break
             self.unsent_bytes -= taken
@@ -216,7 +216,7 @@ class Connection:
         self._watch()
 
     def _ready(self) -> None:
-        """Read, or send the rest; the descriptor is ready, or the other end is closed."""
+        """Read, or send pending bytes; the descriptor is ready, or the peer has closed."""
         if self._cut:
             self.end()
             return
@@ -245,7 +245,7 @@ class Connection:
             if self._incoming.more and self._reading:
                 self._watched.call_again(self.fd)
         except ProtocolMismatch:
-            self.end()  # not one of our clients
+            self.end()  # not a client of shmmap
         except BadRequest as error:
             self.cut(f"{error.message}: {_TOO_MUCH}")
 
@@ -260,9 +260,9 @@ class Connections:
     Attributes
     ----------
     nbytes : int
-        What is kept for them.
+        Memory used for all connections, bytes.
     short : bool
-        There is no descriptor to spare.
+        Whether the daemon is out of descriptors.
     """
 
     def __init__(self) -> None:
@@ -275,14 +275,14 @@ class Connections:
         return (one for mine in self._of.values() for one in mine)
 
     def add(self, connection: Connection) -> None:
-        """Add one that was accepted."""
+        """Add an accepted connection."""
         self._of[connection.peer.pid][connection] = None
-        # the kernel gives the lowest number that is free: all below are taken
+        # the kernel assigns the lowest free number: all below are in use
         limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         self.short = connection.fd >= limit - max(MIN_RESERVE, limit // 16)
 
     def remove(self, connection: Connection) -> None:
-        """Remove one that is closed."""
+        """Remove a closed connection."""
         mine = self._of[connection.peer.pid]
         del mine[connection]
         if not mine:
@@ -290,23 +290,23 @@ class Connections:
         self.try_again()
 
     def try_again(self) -> None:
-        """Let listeners that wait for room check whether there is some."""
+        """Let listeners that wait for room check again."""
         self.short = False
         waiting, self._waiting = self._waiting, []
         for go_on in waiting:
             go_on()
 
     def has_room(self, go_on: Callable[[], None]) -> bool:
-        """Return whether one more may be accepted; if not, ``go_on`` is called when a connection has ended.
+        """Whether another connection may be accepted; if not, ``go_on`` is called when one has ended.
 
-        Connections are taken from the process that has most, those without a session first.
+        Connections are taken from the process with most of them, those without a session first.
         """
         if not self.short:
             return True
         pid, mine = max(self._of.items(), key=lambda item: len(item[1]), default=(0, {}))
         share = max(MIN_SHARE, sum(map(len, self._of.values())) // (2 * len(self._of) or 1))
         if len(mine) <= share:
-            self._waiting.append(go_on)  # many processes with a few each: newcomers have to wait
+            self._waiting.append(go_on)  # many processes with few connections each: new ones wait
             return False
         count = min(len(mine) - share, ENDED_PER_TURN)
         _log_ended(pid, count, f"it had {len(mine)} connections")
@@ -315,7 +315,7 @@ class Connections:
         return True
 
     def weigh(self, more_bytes: int) -> None:
-        """Add to what is kept; too much costs the process that takes most its connections."""
+        """Add to the memory used; at the limit, the process that uses most loses its connections."""
         self.nbytes += more_bytes
         if more_bytes > 0 and self.nbytes > MEMORY_ALLOWANCE_BYTES:
             pid, mine = max(self._of.items(), key=lambda item: sum(one.weight for one in item[1]))
@@ -325,7 +325,7 @@ class Connections:
             ctypes.CDLL(None).malloc_trim(0)
 
     def deliver(self, seconds: float) -> None:
-        """Wait at most this long for clients to read what was sent to them, and close all connections."""
+        """Wait up to this many seconds for clients to read what was sent, and close all connections."""
         end_s = time.monotonic() + seconds
         for one in self:
             one.deliver(max(0.0, end_s - time.monotonic()))
@@ -334,18 +334,18 @@ class Connections:
 
 @dataclass(eq=False, slots=True)
 class Listener:
-    """A listening Unix socket and what its connections have in common.
+    """A listening Unix socket, and the common settings of its connections.
 
     Parameters
     ----------
     kind, peer_kind
-        Types of ZeroMQ socket here and at the clients.
+        ZeroMQ socket types of the daemon and of its clients.
     max_bytes
-        The longest message that a client may send.
+        Length limit of a message from a client.
     on_message
-        Called with a message's connection, its first frame, and whether it had more.
+        Called with a message's connection, its first frame, and whether it had more frames.
     on_disconnect
-        Called with a connection that is closed.
+        Called with a connection that was closed.
     """
 
     socket: Socket
@@ -359,7 +359,7 @@ class Listener:
     on_disconnect: Callable[[Connection], None]
 
     def move_to(self, other: Socket) -> None:
-        """Listen at another socket; connections stay, and those that wait are accepted."""
+        """Listen at another socket; connections stay, and pending ones are accepted."""
         for _ in range(0, socket.SOMAXCONN, ACCEPTED_PER_TURN):
             self._accept()
         self.watched.unwatch(self.socket.fileno())
@@ -380,7 +380,7 @@ class Listener:
                 connected, _address = self.socket.accept()
             except BlockingIOError:
                 return
-            except OSError:  # the machine has no descriptor left
+            except OSError:  # the system has no descriptor left
                 self.connections.short = True
                 return
             connected.setblocking(False)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests that have come, and which is served next: one of the process that used least of the loop's time.
+"""Received requests, and the choice of the next one: from the process that has used least of the loop's time.
 
-Start-time fair queueing (Goyal, Vin, Cheng, SIGCOMM 1996) with equal weights: every process has a
-clock that runs while its requests are served; the one furthest behind goes first.  A process that was idle
-starts at the time that the service has come to, so that idling saves nothing up.  Within a process its
-connections take turns.  What takes longer than one turn goes on in the next ones of its process, before
-anything else of it begins.  What is asked for beyond the limits here is refused, not stored.
+Start-time fair queueing (Goyal, Vin, Cheng, SIGCOMM 1996) with equal weights: every process has a clock that
+runs while its requests are served, and the process furthest behind is next.  A process that was idle starts
+at the current time of the service, so that idling saves nothing up.  Connections of one process take turns.
+Work that takes longer than one turn continues in the next turns of its process, before any other of its
+requests.  Requests beyond the limits below are refused, not stored.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ __all__ = ["MAX_PER_PROCESS", "MAX_PROCESS_BYTES", "FairQueue", "Inbox", "WorkIt
 Item = TypeVar("Item")
 
 MAX_PER_PROCESS: Final = 1024
-"""Requests that may wait; of one connection fewer are taken off it at a time."""
+"""Requests of one process that may wait; fewer are read from one connection at a time."""
 MAX_PROCESS_BYTES: Final = 8 << 20
-"""Bytes of one process's waiting requests; a single one may always wait."""
+"""Bytes of one process's waiting requests; a single request may always wait."""
 WORTH_AN_ANSWER_BYTES: Final = 1 << 16
-"""A longer request that is refused unread is dropped: finding its number takes too long."""
+"""A longer request that is refused unread is dropped without an answer: finding its number takes too long."""
 MAX_REMEMBERED: Final = 4096
-"""Processes whose clocks are remembered; those forgotten when idle lose a debt of milliseconds."""
+"""Processes whose clocks are remembered; an idle process that is forgotten loses a debt of milliseconds."""
 
 
 @dataclass(eq=False, slots=True)
 class _Line(Generic[Item]):
-    """One process's waiting requests by connection; ``clock_s`` is the time they have been given.
+    """One process's waiting requests by connection; ``clock_s`` is the loop time it has been given.
 
-    ``begun`` is the one that goes on in the next turn.
+    ``begun`` is the work that continues in its next turn.
     """
 
     clock_s: float
@@ -50,7 +50,7 @@ class _Line(Generic[Item]):
 
 
 class FairQueue(Generic[Item]):
-    """Requests that wait to be served; pure: the caller of `served` measures time."""
+    """Requests that wait to be served; the class measures no time: the caller of `served` does."""
 
     def __init__(self) -> None:
         self._lines: dict[Hashable, _Line[Item]] = {}
@@ -58,7 +58,7 @@ class FairQueue(Generic[Item]):
         self._clock_s = 0.0
         self._number = 0
         self._waiting = 0
-        self._taken: Hashable = None  # the process that is being served
+        self._taken: Hashable = None  # the process being served
 
     def __len__(self) -> int:
         return self._waiting
@@ -66,7 +66,7 @@ class FairQueue(Generic[Item]):
     def add(
         self, process: Hashable, connection: Hashable, item: Item, nbytes: int, *, always: bool = False
     ) -> bool:
-        """Queue something; False if too much of its process waits, unless ``always``."""
+        """Queue an item; return False if too many of its process wait, unless ``always``."""
         line = self._lines.get(process)
         if line is None:
             if len(self._lines) >= MAX_REMEMBERED:
@@ -85,9 +85,9 @@ class FairQueue(Generic[Item]):
         return True
 
     def take(self) -> tuple[Hashable, Item] | None:
-        """Take the request to serve now, and its process; None when nothing waits.
+        """Take the item to serve next, with its process; None if nothing waits.
 
-        Call `served` before the next one; meanwhile more may come.
+        Call `served` before the next `take`; items may be added in between.
         """
         if not self._ready:
             return None
@@ -102,13 +102,13 @@ class FairQueue(Generic[Item]):
         item, nbytes = items.popleft()
         del line.connections[connection]
         if items:
-            line.connections[connection] = items  # behind the others
+            line.connections[connection] = items  # behind the other connections
         line.count -= 1
         line.nbytes -= nbytes
         return process, item
 
     def served(self, process: Hashable, seconds: float, begun: Item | None = None) -> None:
-        """Charge the turn just taken to its process; ``begun`` goes on in the process's next one."""
+        """Charge the turn just taken to its process; ``begun`` continues in the process's next turn."""
         line, self._taken = self._lines[process], None
         line.clock_s += seconds
         if begun is not None:
@@ -131,16 +131,17 @@ class FairQueue(Generic[Item]):
 
 @dataclass(eq=False, slots=True)
 class WorkItem:
-    """What is served in a turn: a request as it came, or work that has begun or become due.
+    """Item served in a turn: a new request, or work that has begun or become due.
 
     Attributes
     ----------
     body, is_multipart
-        A request's first frame, and whether there were more.
+        A request's first frame, and whether it had more.
     work
-        Does the rest, a bounded step at a time; None before a request is dispatched, and after the last step.
+        Remaining work, in bounded steps; None before a request is dispatched, and after the last step.
     is_request
-        Whether it came on the connection, which counts what waits; else the daemon itself made it.
+        Whether the item came over the connection, which counts its waiting requests, or from the daemon
+        itself.
     """
 
     connection: Connection
@@ -152,16 +153,16 @@ class WorkItem:
 
     @property
     def process(self) -> Hashable:
-        """The process it is for; the connection where the kernel does not show the process."""
+        """The process it is for; the connection if the kernel does not report the process."""
         return self.connection.peer.pid or self.connection
 
     @property
     def is_new(self) -> bool:
-        """Whether it is a request that was not dispatched yet."""
+        """Whether it is a request that has not been dispatched yet."""
         return self.work is None and not self.is_done
 
     def run_step(self) -> None:
-        """Do the next step; done after the last one, and if the connection has ended."""
+        """Run the next step; the work is done after its last step, or if the connection has ended."""
         work, self.work, self.is_done = self.work, None, True
         if work is not None and self.connection.open:
             for _ in work:
@@ -170,7 +171,7 @@ class WorkItem:
 
 
 class Inbox:
-    """Requests received and not yet served, and work that is due."""
+    """Requests received and not served yet, and work that is due."""
 
     def __init__(self, statistics: StatisticsWriter) -> None:
         self._statistics = statistics
@@ -180,7 +181,7 @@ class Inbox:
         return len(self._queue)
 
     def receive(self, connection: Connection, body: bytes, is_multipart: bool) -> None:
-        """Queue a request, or refuse it where too many of its process wait."""
+        """Queue a request, or refuse it if too many of its process wait."""
         self._statistics.add("requests")
         self._statistics.add("bytes_received", len(body))
         item = WorkItem(connection, body, is_multipart)
@@ -191,16 +192,16 @@ class Inbox:
             connection.refuse(request_number(body), error)
 
     def add_work(self, connection: Connection, work: Iterator[None]) -> None:
-        """Queue ``work``, done a step a turn when this connection's process is served."""
+        """Queue ``work``; one step of it runs in each turn of this connection's process."""
         item = WorkItem(connection, work=work, is_request=False)
         self._queue.add(item.process, connection, item, 0, always=True)
 
     def take(self) -> WorkItem | None:
-        """Take what is to be served now; call `served` afterwards."""
+        """Take the next item to serve; call `served` afterwards."""
         return taken[1] if (taken := self._queue.take()) else None
 
     def served(self, item: WorkItem, seconds: float) -> None:
-        """Record that a step of what was taken is done; it is queued again unless that was the last one."""
+        """Record that a step of an item has run; queue the item again unless it was the last step."""
         if item.is_request and item.is_done:
             item.connection.count_waiting(-1, -len(item.body))
             item.connection.reweigh()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions of clients, and what each of them holds."""
+"""Sessions of clients, and the segments that each of them holds."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from shmmap.segment.pins import MAX_SLOT
 __all__ = ["MOVES_PER_STEP", "Session", "Sessions"]
 
 MOVES_PER_STEP: Final = 4
-"""Sessions whose paths are looked at at a time."""
+"""Sessions whose motion is updated per step."""
 
 
 @dataclass(eq=False, slots=True)
 class Session:
-    """One client.
+    """One client's session.
 
-    ``held`` is what it was handed or says it has, by version: bookkeeping for quotas and for
-    naming holders.  Safety never depends on it: the kernel knows what is in use.  ``exclusive_bytes`` are
-    those that no other session holds.  ``says_where`` is true for an ``intent`` (where the client is and is
-    going to be) that it stated, false for one that was guessed from ``area``, the last one it asked for, in
-    ``layers``.  ``motion`` is what is known of how it moves, ``new_intent`` what it does not know yet, and
-    ``places`` where it will be.  Requests and loads of the session count for ``asker``: its process, else the
-    session itself.
+    ``held`` contains the segments that it was given or reports to hold, by version.  This is bookkeeping for
+    quotas and for naming holders.  Safety never depends on it: the kernel knows which segments are in use.
+    ``exclusive_bytes`` counts segments that no other session holds.  ``says_where`` is true if the client
+    stated its ``intent`` (its position and route), false if that was guessed from ``area``, the area it last
+    requested, in ``layers``.  ``motion`` is its estimated motion, ``new_intent`` an intent not yet included
+    in it, and ``places`` its predicted positions.  Requests and loads of the session count for ``asker``: its
+    process, else the session itself.
     """
 
     slot: int
@@ -68,7 +68,7 @@ class Session:
         return self.connection.peer
 
     def connect(self, connection: Connection) -> None:
-        """Go on with the session on this connection."""
+        """Continue the session on this connection."""
         self.disconnect()
         self.connection, connection.slot = connection, self.slot
 
@@ -82,17 +82,17 @@ class Session:
 
     @property
     def is_connected(self) -> bool:
-        """Whether its connection is still the session's, closed or not."""
+        """Whether its connection still belongs to the session, closed or not."""
         return self.connection.slot == self.slot
 
     def state_intent(self, intent: Intent) -> None:
-        """Take what the client says of where it is and is going to be."""
+        """Take over the position and route that the client states."""
         self.intent = self.new_intent = intent
         self.says_where = True
         self.sessions.moved[self] = None
 
     def hold(self, residents: Iterable[Resident]) -> None:
-        """Count segments that it was handed."""
+        """Count segments that the session was given."""
         held = self.held
         for resident in residents:
             known = held.get(resident.version)
@@ -106,11 +106,11 @@ class Session:
             if self.slot not in resident.sessions:
                 self._share(resident, 1)
                 resident.sessions.add(self.slot)
-            elif len(resident.sessions) == 1:  # the session that had this slot before has it still
+            elif len(resident.sessions) == 1:  # the session that had this slot before still holds it
                 self.exclusive_bytes += resident.nbytes
 
     def _share(self, resident: Resident, one: int) -> None:
-        """Share out a segment that this session has from now on (1), or no longer has (-1)."""
+        """Count a segment that this session has acquired (1) or lost (-1) in its share."""
         others = resident.sessions
         if not others:
             self.exclusive_bytes += one * resident.nbytes
@@ -128,14 +128,14 @@ class Session:
             self._share(resident, -1)
 
     def drop(self, versions: Iterable[int]) -> list[Resident]:
-        """Remove versions, and return the segments that it had of them."""
+        """Remove versions; return the segments that the session had of them."""
         dropped = [resident for version in versions for resident in self.held.pop(version, ())]
         for resident in dropped:
             self._lose(resident)
         return dropped
 
     def drop_segment(self, resident: Resident) -> None:
-        """Remove one segment, if it has it."""
+        """Remove one segment if the session holds it."""
         known = self.held.get(resident.version, [])
         if resident in known:
             known.remove(resident)
@@ -144,18 +144,18 @@ class Session:
                 del self.held[resident.version]
 
     def residents(self) -> list[Resident]:
-        """Return everything that the session holds."""
+        """Return all segments that the session holds."""
         return [resident for known in self.held.values() for resident in known]
 
     def as_holder(self, nbytes: int, cells: int) -> Holder:
-        """Return this session as a line in a reply."""
+        """Return this session as a row of a reply."""
         return Holder(
             self.slot, self.peer.pid, self.peer.uid, self.client or self.command, nbytes, cells, self.command
         )
 
 
 def command_of(pid: int) -> str:
-    """Return the command name of a process, empty where it cannot be read."""
+    """Return the command name of a process; empty if it cannot be read."""
     if pid <= 0:
         return ""
     with contextlib.suppress(OSError):
@@ -164,21 +164,21 @@ def command_of(pid: int) -> str:
 
 
 class Sessions:
-    """All sessions of this epoch, by slot.
+    """All sessions of this run of the daemon, by slot.
 
-    Slots are random 62-bit numbers, so that one is never used again but by the client that had it: what
-    it maps is locked under its slot, also when a later run of the daemon looks for the holder.
+    Slots are random 62-bit numbers, so that a slot is only ever used by one client: the segments that it maps
+    are locked under its slot, even when a later run of the daemon looks for their holder.
 
     Attributes
     ----------
     slots : dict
         Sessions by slot.
     departed : dict
-        By slot, sessions whose connection has ended and whose process may still map what it was handed.
+        By slot, sessions whose connection has ended and whose process may still map segments it was given.
     moved : dict
-        Sessions that have moved, or asked for another area, since the last `follow_moves`.
+        Sessions that have moved, or requested another area, since the last `follow_moves`.
     places_version : int
-        Another one after each change of `places`.
+        Changes whenever `places` changes.
     """
 
     LIMIT = 4096
@@ -196,21 +196,21 @@ class Sessions:
         return iter(self.slots.values())
 
     def by_slot(self, slot: int) -> Session | None:
-        """Return the session whose lock byte is ``slot``."""
+        """Return the session whose lock byte is at offset ``slot``."""
         return self.slots.get(slot)
 
     def largest_holder(self) -> str:
-        """Name, process and bytes of the client that was handed most; empty where none was handed any."""
+        """Return name, process and bytes of the client that was given most; empty if none was given any."""
         most = max(self, key=lambda session: session.held_bytes, default=None)
         if most is None or not most.held_bytes:
             return ""
         return f"{most.client or most.command} (pid {most.peer.pid}): {format_bytes(most.held_bytes)}"
 
     def spare(self) -> Session | None:
-        """Return the session to end when there are too many; None when each process has just one.
+        """Return the session to end when there are too many; None if each process has just one.
 
-        It belongs to the process that has most (those that the kernel does not name are one).  Its next
-        request is answered ``no_session``, and it may open another.
+        It belongs to the process with most sessions (processes that the kernel does not report count as one).
+        Its next request is answered ``no_session``, and it may open another session.
         """
         sessions_of = Counter(session.peer.pid for session in self)
         owner, count = max(sessions_of.items(), key=lambda item: item[1], default=(0, 0))
@@ -220,9 +220,9 @@ class Sessions:
         return min(mine, key=lambda session: session.last_request_s, default=None)
 
     def open(self, connection: Connection, client: str, now_s: float, *, slot: int = 0) -> Session:
-        """Begin a session.
+        """Open a session.
 
-        ``slot`` is the one that the client had before, on another connection or in a previous run of the
+        ``slot`` is the slot that the client had before, on another connection or in a previous run of the
         daemon, and keeps; 0 for none.
         """
         if not 0 < slot <= MAX_SLOT or slot in self.slots:
@@ -242,21 +242,21 @@ class Sessions:
         return session
 
     def close(self, session: Session) -> None:
-        """End a session; what it held is for the caller to drop."""
+        """End a session; the caller drops the segments that it held."""
         session.disconnect()
         self._follow(session)
         self.slots.pop(session.slot, None)
         self.departed.pop(session.slot, None)
 
     def follow_moves(self) -> list[Session]:
-        """Bring motions and `places` of some sessions that moved up to date, and return these."""
+        """Update the motions and `places` of some sessions that moved; return these sessions."""
         some = list(islice(self.moved, MOVES_PER_STEP))
         for session in some:
             self._follow(session)
         return some
 
     def places(self) -> Places:
-        """Return where the clients are and are going to be, as of the last `follow_moves`."""
+        """Return present and predicted positions of the clients, as of the last `follow_moves`."""
         return merged_places(session.places for session in self if len(session.places))
 
     def _follow(self, session: Session) -> None:
@@ -264,7 +264,7 @@ class Sessions:
         intent, session.new_intent = session.new_intent, None
         if intent is not None:
             session.motion.update(intent, session.last_request_s)
-            if intent.route:  # of a route, as long as it may be, the motion keeps what it needs
+            if intent.route:  # the motion keeps what it needs of a route, which may be long
                 session.intent = msgspec.structs.replace(intent, route=())
         if session.intent is None:
             session.places = NOWHERE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A listening socket and its file: never another program's, and noticed when it is removed."""
+"""A listening socket and its file: never replaces another program's file, and detects its own removal."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 class SocketFile:
-    """Listens at a path, in place of a socket that a process of this user left there.
+    """Listens at a path, and replaces a socket file that an ended process of this user left there.
 
     Parameters
     ----------
     path
-        Of the socket.
+        Path of the socket.
     gid
         Group that may connect; -1: only this user.
     passed
-        A listening socket that the service manager passed: its file stays at the end.
+        A listening socket that the service manager passed; its file is not removed at the end.
 
     Attributes
     ----------
     socket
-        It listens.
+        The listening socket.
 
     Raises
     ------
     InstanceBusy
-        A process answers there.
+        A process listens there.
     CannotStart
-        One cannot listen there, or something else has the name.
+        The path cannot be used, or another kind of file has the name.
     """
 
     def __init__(self, path: str, gid: int, passed: socket.socket | None = None) -> None:
@@ -57,7 +57,7 @@ class SocketFile:
 
     @property
     def is_there(self) -> bool:
-        """Whether clients find this socket under its path."""
+        """Whether the path still leads clients to this socket."""
         try:
             found = os.lstat(self.path)
         except OSError:
@@ -65,7 +65,7 @@ class SocketFile:
         return self._status is not None and os.path.samestat(found, self._status)
 
     def remove(self) -> None:
-        """Remove the file; another program's of the same name stays."""
+        """Remove the file, unless it is another program's."""
         if self.is_there and not self._is_passed:
             with contextlib.suppress(OSError):
                 os.unlink(self.path)
@@ -76,18 +76,18 @@ class SocketFile:
 
 
 def refuse_taken(path: str) -> bool:
-    """Find out whether a socket may be made at ``path``; True if a stale one of this user is in its place.
+    """Check whether a socket may be created at ``path``; return True to replace a stale one of this user.
 
     Raises
     ------
     InstanceBusy
-        A process answers there; the message names it.
+        A process listens there; the message names it.
     CannotStart
-        Something else has the name, or another user's socket.
+        Another kind of file, or another user's socket, has the name.
     """
     try:
         status = os.lstat(path)
-    except OSError:  # nothing is there, or the place itself is wrong: `bind` says what
+    except OSError:  # nothing exists there, or the path is wrong: `bind` reports why
         return False
     if not stat.S_ISSOCK(status.st_mode):
         raise name_taken("the socket", path, None, otherwise=_OTHERWISE)
@@ -108,7 +108,7 @@ def _listen(path: str, gid: int) -> socket.socket:
             os.unlink(path)
     listening = socket.socket(socket.AF_UNIX)
     listening.setblocking(False)
-    # the file is made with the umask's mode; no client may connect before it is right
+    # the file gets the umask's mode; no client may connect before mode and group are right
     mask = os.umask(0o117 if gid >= 0 else 0o177)
     try:
         listening.bind(path)
@@ -124,7 +124,7 @@ def _listen(path: str, gid: int) -> socket.socket:
 
 
 def _answers(path: str) -> int | None:
-    """Return the process that has the socket at ``path`` open, 0 if it is not known; None for no process."""
+    """Return the process that has the socket at ``path`` open, 0 if it is not known; None if none has."""
     for kind in (socket.SOCK_STREAM, socket.SOCK_SEQPACKET, socket.SOCK_DGRAM):
         with socket.socket(socket.AF_UNIX, kind | socket.SOCK_NONBLOCK) as probe:
             try:
@@ -135,13 +135,13 @@ def _answers(path: str) -> int | None:
             except (ConnectionRefusedError, FileNotFoundError):
                 return None
             except OSError as error:
-                if error.errno != errno.EPROTOTYPE:  # else it is of another kind
+                if error.errno != errno.EPROTOTYPE:  # EPROTOTYPE: another type of socket
                     return _owner(path)
     return _owner(path)
 
 
 def _owner(path: str) -> int:
-    """Return the process that has an open socket with this path; 0 where the kernel does not show it."""
+    """Return the process that has an open socket with this path; 0 if the kernel does not show it."""
     inodes = set()
     with contextlib.suppress(OSError), open("/proc/net/unix", errors="surrogateescape") as table:
         for line in table:
@@ -156,7 +156,7 @@ def _owner(path: str) -> int:
 
 
 def _program(pid: int) -> str:
-    """Describe a process for a message: its id and its program."""
+    """Return a process's id and program for a message."""
     if not pid:
         return "a process that this user does not see"
     try:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bytes of a connection: ZMTP 3.0 with the NULL mechanism (rfc.zeromq.org/spec/23), the daemon's side.
+"""The daemon's side of ZMTP 3.0 with the NULL mechanism (rfc.zeromq.org/spec/23), as bytes of a connection.
 
-Clients use libzmq or any other ZeroMQ library.  The daemon does not: libzmq accepts connections in a thread
-of its own without bound, ends the process when descriptors run out, keeps all that is sent, and shows
-neither the process of a connection nor that it has ended.
+Clients use libzmq or any other ZeroMQ library.  The daemon does not: libzmq accepts connections without bound
+in a thread of its own, aborts the process when descriptors run out, stores everything that is sent, and
+reports neither the process of a connection nor its end.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from shmmap.errors import BadRequest, ProtocolMismatch
 __all__ = ["GREETING", "Incoming", "framed"]
 
 GREETING: Final = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
-"""Signature, version 3.0, mechanism, and 32 bytes that mean nothing to NULL."""
+"""Signature, version 3.0, mechanism, and 32 bytes that NULL ignores."""
 
 _MORE: Final = 1
 _LONG: Final = 2
@@ -24,28 +24,28 @@ _COMMAND: Final = 4
 
 
 def framed(body: bytes, flags: int = 0) -> bytes:
-    """Return one frame: a message, unless ``flags`` say otherwise."""
+    """Return one frame: a complete message, unless ``flags`` mark it otherwise."""
     if len(body) < 256:
         return bytes((flags, len(body))) + body
     return bytes((flags | _LONG,)) + len(body).to_bytes(8, "big") + body
 
 
 class Incoming:
-    """What has come on one connection and is not a whole message yet.
+    """Received bytes of one connection that do not form a complete message yet.
 
     Parameters
     ----------
     kind
         The daemon's socket type, ``ROUTER`` or ``XPUB``.
     peer
-        The only socket type that may be at the other end, ``DEALER`` or ``SUB``.
+        The only socket type accepted at the other end, ``DEALER`` or ``SUB``.
     max_bytes
-        The longest message, all its frames and their headers together.
+        Length limit of a message, with all its frames and their headers.
 
     Attributes
     ----------
     more : bool
-        Whether something that came was not looked at yet.
+        Whether some received bytes have not been examined yet.
     """
 
     def __init__(self, kind: bytes, peer: bytes, max_bytes: int) -> None:
@@ -53,8 +53,8 @@ class Incoming:
         self._peer = peer
         self._max_bytes = max_bytes
         self._buffer = bytearray()
-        self._next = 0  # where the next frame begins; before it are whole frames of a message
-        self._first: tuple[int, int] | None = None  # that message's first frame, from and to
+        self._next = 0  # start of the next frame; before it are complete frames of a message
+        self._first: tuple[int, int] | None = None  # first frame of that message, from and to
         self.more = False
         self._greeted = False
         self._ready = False
@@ -63,32 +63,32 @@ class Incoming:
         return len(self._buffer)
 
     def forget(self) -> None:
-        """Drop what has come."""
+        """Drop all received bytes."""
         self._buffer.clear()
         self.more = False
 
     def add(self, data: bytes) -> None:
-        """Take received bytes."""
+        """Append received bytes."""
         self._buffer += data
 
     def messages(self, max_frames: int, send: Callable[[bytes], None]) -> list[tuple[bytes, bool]]:
-        """Return messages that are whole now: of each its first frame, and whether there were more.
+        """Return complete messages, each as its first frame and whether there were more frames.
 
-        At most ``max_frames`` are looked at; ``more`` then says that others may be there.  ``send``
-        sends what the protocol itself requires.
+        At most ``max_frames`` frames are examined; ``more`` is True if others may follow.  ``send`` sends
+        replies that the protocol itself requires.
 
         Raises
         ------
         ProtocolMismatch
-            This is no ZMTP 3 with NULL, or the wrong type of socket.
+            The peer does not speak ZMTP 3 with NULL, or has the wrong type of socket.
         BadRequest
-            A message is longer than may be.
+            A message is too long.
         """
         self.more = False
         if not self._greeted and not self._greet(send):
             return []
         messages: list[tuple[bytes, bool]] = []
-        start = 0  # of the message under way
+        start = 0  # start of the current message
         for _ in range(max_frames):
             frame = self._frame(start)
             if frame is None:
@@ -130,7 +130,7 @@ class Incoming:
         return True
 
     def _frame(self, start: int) -> tuple[int, int, int] | None:
-        """Return flags, begin and end of the frame that comes next; None while it is not all there."""
+        """Return flags, begin and end of the next frame; None while it is incomplete."""
         buffer, at = self._buffer, self._next
         if len(buffer) < at + 2:
             return None

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where clients are, how they move, and when they will need which part of the map; without any I/O."""
+"""Positions and motion of clients, and when they need which part of the map; without any I/O."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How one client moves: its pose, its velocity, and where on the route that it sends it is."""
+"""Motion of one client: its pose, its velocity, and its position on the route that it sends."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from shmmap.protocol.messages import Intent
 __all__ = ["FARTHEST_M", "MAX_SPEED_MPS", "MAX_VERTICES", "Motion", "Route"]
 
 MAX_SPEED_MPS: Final = 70.0
-"""A pose that is farther away than this speed allows is a jump; no client is taken to be faster."""
+"""Speed limit of clients: a pose farther away than it allows is a jump."""
 LEARN_S: Final = 0.5
-"""Time between two poses, at least, from which a velocity is learnt."""
+"""Minimum time between the two poses from which a velocity is estimated."""
 SILENT_S: Final = 10.0
-"""A client that is silent for longer may have stood: farther away than one comes in this time is a jump."""
+"""Longest silence that counts as travel: a pose farther away than this time allows is a jump."""
 TURN_RAD: Final = 0.35
-"""A client that has turned by more since then has left the straight."""
+"""Change of heading that ends a straight."""
 TURNS_MPS: Final = 1.0
 FASTEST_S: Final = 60.0
-"""For about this long it is remembered how fast a client was: it will go on after a red light."""
+"""Time for which a client's high speed is remembered, roughly: it will go on after a red light."""
 FARTHEST_M: Final = 1e8
-"""Coordinates beyond this, in metres, count as this."""
+"""Limit of coordinates, metres; larger ones are clamped."""
 MAX_VERTICES: Final = 512
-"""Vertices kept of a longer route, most of them where it bends."""
+"""Vertices kept of a longer route, most of them in its bends."""
 OFF_ROUTE_M: Final = 100.0
-"""A client farther away than this from its route is not on it."""
+"""Distance from its route beyond which a client is not on it."""
 SLACK_M: Final = 10.0
-"""Of two stretches of a route that are about equally near (to this), the client is on the first."""
+"""Of two stretches of a route whose distances differ by less than this, the client is on the first."""
 BEHIND_M: Final = 20.0
-"""How far back on its route, at most, a client is looked for: it may be a street that is taken both ways."""
+"""Longest distance back on its route that a client is searched for: a street may be driven both ways."""
 
 
 class Route:
-    """A polyline ahead of a client.
+    """Polyline that a client will follow.
 
     Parameters
     ----------
@@ -49,9 +49,9 @@ class Route:
     Attributes
     ----------
     length_m : float
-        From its first vertex to its last, metres.
+        Length from its first vertex to its last, metres.
     last_heading : float
-        Where to it goes at its end, radians counter-clockwise from the map's x axis; 0 for a single vertex.
+        Heading at its end, radians counter-clockwise from the map's x axis; 0 for a single vertex.
     """
 
     def __init__(self, vertices: Sequence[tuple[float, float]]) -> None:
@@ -69,7 +69,7 @@ class Route:
         self._steps, self._lengths = steps, lengths
 
     def at(self, along_m: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        """Return positions along the route, (..., 2), metres, map frame; its ends for what is beyond them."""
+        """Return positions along the route, (..., 2), metres, map frame; clamped to its ends."""
         x = np.interp(along_m, self._along, self._at[:, 0])
         y = np.interp(along_m, self._along, self._at[:, 1])
         return np.stack([x, y], axis=-1)
@@ -80,8 +80,8 @@ class Route:
         Parameters
         ----------
         from_m
-            How far along it has come, if it was on this route: where a route passes a place twice, the
-            client is where it comes to next.
+            The client's last distance along this route, if any: where a route passes a place twice, the
+            client is at the pass that it reaches next.
         """
         here = np.array([x, y])
         if not len(self._steps):
@@ -103,7 +103,7 @@ class Route:
 
     @staticmethod
     def _first_near(away: NDArray[np.float64], along: NDArray[np.float64], nearest: float) -> float:
-        """Return the nearest place of the first stretch that is about as near as any."""
+        """Return the nearest point of the first stretch whose distance is about the minimum."""
         first = int(np.argmax(away <= nearest + SLACK_M))
         last = first
         while last + 1 < len(away) and away[last + 1] <= nearest + SLACK_M:
@@ -113,26 +113,26 @@ class Route:
 
 @dataclass(eq=False, slots=True)
 class Motion:
-    """Where a client is, how it moves and where to.
+    """Position, velocity and route of a client.
 
     Attributes
     ----------
     x, y
-        Metres, map frame.
+        Position, metres, map frame.
     at_s
-        When it was there.
+        Time of the position, seconds.
     vx, vy
-        Metres per second, map frame: as sent, else learnt from the poses; 0 if not known.
+        Velocity, metres per second, map frame: as sent, else estimated from poses; 0 if not known.
     fastest_mps
         Its greatest recent speed.
     route, along_m
-        The route that it sends, if it is on it, and how far along it is.
+        The route that it sends, if it is on it, and its distance along the route.
     travelled_m
-        How far it has come since its last jump.
+        Distance travelled since its last jump.
     straight_m
-        How far it has come without a turn.
+        Distance travelled without a turn.
     jumps
-        How often it was suddenly somewhere else.
+        Number of jumps of its position.
     """
 
     x: float = 0.0
@@ -158,7 +158,7 @@ class Motion:
         return math.hypot(self.vx, self.vy)
 
     def update(self, intent: Intent, now_s: float) -> None:
-        """Take what the client says of its pose, its velocity and its route."""
+        """Update from the pose, velocity and route that the client sends."""
         self._move(intent.x, intent.y, intent.vx, intent.vy, now_s)
         self._follow(intent.route)
 
@@ -183,7 +183,7 @@ class Motion:
         self.fastest_mps = max(self.speed_mps, self.fastest_mps * math.exp(-took_s / FASTEST_S))
 
     def _learn(self, now_s: float) -> None:
-        """Take the velocity from where the client was a while ago."""
+        """Estimate the velocity from an earlier position."""
         x, y, since_s = self._learnt
         took_s = now_s - since_s
         if took_s < LEARN_S:
@@ -192,7 +192,7 @@ class Motion:
         self.vx, self.vy = (self.x - x) / took_s, (self.y - y) / took_s
 
     def _turn(self) -> None:
-        """Find out whether it still goes straight ahead; poses of a client that hardly moves do not say."""
+        """Detect the end of a straight; poses of a client that hardly moves are ignored."""
         if self.speed_mps < TURNS_MPS:
             return
         heading_rad = math.atan2(self.vy, self.vx)
@@ -200,7 +200,7 @@ class Motion:
             self._straight_rad, self.straight_m = heading_rad, 0.0
 
     def _follow(self, vertices: tuple[tuple[float, float], ...]) -> None:
-        """Find the client on the route that it sends."""
+        """Find the client on its route."""
         before: float | None = self._come_m if self.route is not None else None
         sent = hash(vertices)
         if sent != self._vertices_hash:
@@ -213,12 +213,12 @@ class Motion:
 
 
 def _within(metres: float) -> float:
-    """Anything farther away than numbers stay exact counts at the edge of that."""
+    """Clamp a coordinate to the range in which numbers are exact enough."""
     return max(-FARTHEST_M, min(metres, FARTHEST_M))
 
 
 def _along(at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far along a polyline each of its vertices is, metres."""
+    """Return the distance of each vertex along a polyline, metres."""
     steps = np.diff(at, axis=0)
     return np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
 
@@ -226,8 +226,8 @@ def _along(at: NDArray[np.float64]) -> NDArray[np.float64]:
 def _significant(at: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return the vertices that best describe a polyline, at most `MAX_VERTICES`, its ends among them.
 
-    Chords stay about equally near to a curve if their ends are as dense as the square root of its
-    curvature; half of the vertices are spread so, the others evenly.
+    Chords stay about equally close to a curve if vertices are as dense as the square root of its curvature:
+    half of the vertices are placed so, the others evenly.
     """
     steps = np.diff(at, axis=0)
     heading = np.arctan2(steps[:, 1], steps[:, 0])

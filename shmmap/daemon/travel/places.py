@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a cell will be needed: by the client that comes to it first.
+"""Estimate of when a cell will be needed: by the client that reaches it first.
 
-Each client gives a few *places*: where it is, where it will be along its route, and the route's end, after
-which it may go anywhere.  From a place, cells within its reach are needed when the client is there; those
-beyond it later, the farther away the later.  `until_needed` takes the least over all places.
+Each client contributes a few *places*: its present position, its future positions along its route, and the
+route's end, from which it may go anywhere.  Cells within a place's reach are needed when the client arrives;
+cells beyond it are needed later, the farther away, the later.  `until_needed` takes the minimum over all
+places.
 
-A client without a route may go anywhere, rather ahead than back: its only place is where it is, and the time
-to a cell is multiplied by 1 for one straight ahead, 2 for one behind it.  One with a route needs what lies
-along it when it comes there; all else after the route's end, but for what is just beside it now.
+A client without a route may go anywhere, more likely ahead than back: its only place is its position, and the
+time to a cell is multiplied by 1 for a cell straight ahead up to 2 for a cell behind.  A client with a route
+needs the cells along it when it arrives there, and all others after the route's end, except those just beside
+it now.
 """
 
 from __future__ import annotations
@@ -24,26 +26,26 @@ from shmmap.daemon.travel.motion import Motion
 __all__ = ["MAX_PLACES", "NOWHERE", "Places", "merged_places", "places_of", "until_needed"]
 
 Places: TypeAlias = NDArray[np.float64]
-"""(P, 8): x, y, when the client is there (s), its reach (m), how far beyond that the place says anything (m),
-seconds per metre beyond its reach, and the unit vector of its heading, 0 if unknown."""
+"""(P, 8): x, y, arrival time of the client (s), its reach (m), how far beyond it the place is valid (m),
+seconds per metre beyond the reach, and the unit vector of its heading, 0 if unknown."""
 
 NOWHERE: Final = np.empty((0, 8))
 MAX_PLACES: Final = 256
-"""Scoring takes time for each: of more places, the first counts of those that are near each other."""
+"""Limit of places, since each adds scoring time; beyond it, places near each other become one."""
 MAX_MERGED: Final = 1024
-"""Merging takes time, too: a third of a millisecond.  Of more places, some are left out."""
+"""Limit of places to merge, which takes a third of a millisecond; beyond it, some are left out."""
 MAX_PER_CLIENT: Final = 128
-"""Places along a route; the longer it is, the farther apart are those that come late."""
+"""Places along a route; on a long route, the later ones are farther apart."""
 NEAREST_M: Final = 10.0
-"""Places along a route are at least this far apart, and an eighth of the client's reach."""
+"""Minimum distance of places along a route; it is also at least an eighth of the client's reach."""
 SLOWEST_MPS: Final = 3.0
-"""A client that stands still may drive off."""
+"""Assumed speed of a client that stands still: it may drive off."""
 STAY_M: Final = 10.0
-"""What is just beyond a client's reach stays, whatever its route says: it may turn round or leave it."""
+"""Margin around a client's reach that counts as needed whatever its route: it may turn or leave it."""
 PAIRS_PER_BLOCK: Final = 4096
-"""Pairs of a cell and a place that are scored together: their tables stay in the processor's cache."""
+"""Pairs of a cell and a place scored together: their tables fit in the processor's cache."""
 FIRST_SIDE_M: Final = 16.0
-"""Places in one square of this side count as one at first, where there are too many."""
+"""Side of the squares in which places are first merged, where there are too many."""
 
 
 def places_of(motion: Motion, reach_m: float) -> Places:
@@ -52,7 +54,7 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     Parameters
     ----------
     reach_m
-        How far around it it needs the map, metres.
+        Radius around the client within which it needs the map, metres.
     """
     speed = max(motion.speed_mps, SLOWEST_MPS)
     pace = 1.0 / speed
@@ -65,14 +67,14 @@ def places_of(motion: Motion, reach_m: float) -> Places:
     left_m = route.length_m - motion.along_m
     near_m = max(reach_m / 8.0, NEAREST_M)
     count = min(MAX_PER_CLIENT - 2, max(1, math.ceil(left_m / near_m)))
-    # the first ones ``near_m`` apart; if that needs too many, later ones farther
+    # the first places are ``near_m`` apart; if that needs too many, later ones are farther apart
     power = max(1.0, math.log(left_m / near_m) / math.log(count)) if count > 1 else 1.0
     ahead_m = left_m * (np.arange(1, count + 1) / count) ** power
     apart_m = np.diff(ahead_m, prepend=0.0)
     found = np.zeros((count + 2, 8))
     found[0] = [*here, STAY_M, pace, *heading]
     found[1:-1, :2] = route.at(motion.along_m + ahead_m)
-    # what comes into reach between two places is needed before the client is at the second
+    # a cell that comes into reach between two places is needed before the client is at the second
     found[1:-1, 2] = motion.at_s + (ahead_m - 0.5 * apart_m) / speed
     found[1:-1, 3] = reach_m
     found[1:-1, 4] = 0.5 * apart_m  # between two places the client is no farther from either
@@ -83,13 +85,13 @@ def places_of(motion: Motion, reach_m: float) -> Places:
 def merged_places(some: Iterable[Places]) -> Places:
     """Return the places of many clients as one table of at most `MAX_PLACES`.
 
-    Where there are more, the earliest of those in one square stands for all of them.
+    Where there are more, the earliest place in each square stands for all in it.
     """
     tables = list(some)
     if not tables:
         return NOWHERE
     thin = sum(map(len, tables)) // MAX_MERGED + 1
-    if thin > 1:  # of each its first place, its last and some between them
+    if thin > 1:  # keep each table's first and last place and some in between
         tables = [part for table in tables for part in (table[:-1:thin], table[-1:])]
     found = np.concatenate(tables)
     if len(found) > MAX_PLACES:
@@ -98,7 +100,7 @@ def merged_places(some: Iterable[Places]) -> Places:
     while len(found) > MAX_PLACES:
         squares = np.floor(np.clip(found[:, :2] / side, -(2.0**30), 2.0**30)).astype(np.int64)
         keys = squares[:, 0] << 32 | squares[:, 1] & 0xFFFFFFFF
-        keys = keys << 1 ^ np.isinf(found[:, 4])  # from a place that is open anything may be reached
+        keys = keys << 1 ^ np.isinf(found[:, 4])  # places from which anything may be reached stay separate
         _, first = np.unique(keys, return_index=True)
         found = found[np.sort(first)]
         side *= 2.0 if len(found) < 4 * MAX_PLACES else 4.0
@@ -106,14 +108,14 @@ def merged_places(some: Iterable[Places]) -> Places:
 
 
 def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> NDArray[np.float64]:
-    """Return in how many seconds each cell will be needed, (N,), 0 for now.
+    """Return the time until each cell will be needed, seconds, (N,); 0 for now.
 
     Parameters
     ----------
     boxes
         (N, 4) ``min_x, min_y, max_x, max_y``, metres, map frame.
     places
-        At least one of them open, or a cell may never be needed: infinity.
+        Places; without an open one, a cell may never be needed: infinity.
     """
     found = np.full(len(boxes), np.inf)
     heads = (places[:, 6] != 0.0) | (places[:, 7] != 0.0)
@@ -128,7 +130,7 @@ def until_needed(boxes: NDArray[np.float64], places: Places, now_s: float) -> ND
 def _until(
     boxes: NDArray[np.float64], places: Places, now_s: float, *, somewhere: bool
 ) -> NDArray[np.float64]:
-    """Return in how many seconds each cell will be needed; ``somewhere``: clients have a heading."""
+    """Return the time until each cell will be needed; ``somewhere``: clients have a heading."""
     x, y, at_s, reach, limit, pace, hx, hy = places.T[:, :, np.newaxis]
     dx = np.maximum(np.maximum(boxes[:, 0] - x, x - boxes[:, 2]), 0.0)
     dy = np.maximum(np.maximum(boxes[:, 1] - y, y - boxes[:, 3]), 0.0)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What only operators may ask."""
+"""Requests that only operators may send."""

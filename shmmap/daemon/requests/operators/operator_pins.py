@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells that an operator wants resident, asked for or not: they are loaded, and never make room.
+"""Cells that operators pin: they are loaded without a request, and never evicted.
 
-A pin is on a cell and a layer, not on a version: a cell that changes is loaded again, one that
-cannot be loaded is tried again.  Pins end with `unpin` or with the daemon.
+A pin applies to a cell and a layer, not to a version: a cell that changes is loaded again, and a load that
+fails is repeated.  Pins end with `unpin` or with the daemon.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from shmmap.quantities import format_bytes
 __all__ = ["OperatorPins", "cells_named"]
 
 LOOKS_PER_BEAT: Final = 64
-"""Pins looked at per beat: about a fifth of a millisecond."""
+"""Pins checked per beat: about a fifth of a millisecond."""
 MAX_PINS: Final = 20_000
 
 
 def cells_named(
     cache: CellCache, ids: Sequence[str]
 ) -> Generator[None, None, tuple[list[str], tuple[str, ...]]]:
-    """Return the whole ids of cells that an operator names, and those names that are no cell's.
+    """Return the full ids of the cells that an operator names, and the names that match no cell.
 
     Raises
     ------
     BadRequest
-        They are too many.
+        There are too many names.
     """
     check_count(len(ids))
     known: dict[str, None] = {}
@@ -60,8 +60,8 @@ def cells_named(
 class OperatorPins:
     """The pinned cells of one map.
 
-    A pin counts in the ledger as one more request that waits for the cell: that is what keeps it out
-    of the candidates for eviction.
+    A pin counts in the ledger as another request that waits for the cell, which excludes the cell from
+    eviction.
     """
 
     cache: CellCache
@@ -77,14 +77,14 @@ class OperatorPins:
         return tuple(sorted(key.layer for key in self._keys if key.cell_id == cell_id))
 
     def pin(self, message: messages.Pin, now_s: float) -> Generator[None, None, messages.Pinned]:
-        """Pin cells; without ids, say what is pinned.
+        """Pin cells; without ids, list the pinned cells.
 
         Raises
         ------
         OverBudget
-            All pins together would take more than the budget.
+            All pins together would exceed the budget.
         BadRequest
-            They are too many.
+            There are too many pins.
         """
         if not message.ids:
             return (yield from self._answer(message.request, list(self._keys), ()))
@@ -115,7 +115,7 @@ class OperatorPins:
         return (yield from self._answer(message.request, wanted, unknown))
 
     def unpin(self, message: messages.Unpin) -> Generator[None, None, messages.Pinned]:
-        """Unpin cells, all without ids; answer with what stays pinned."""
+        """Unpin cells, or all of them without ids; answer with the pins that remain."""
         cells, unknown = yield from cells_named(self.cache, message.ids or ())
         named, ledger = set(cells), self.cache.ledger
         for key in [key for key in self._keys if message.ids is None or key.cell_id in named]:
@@ -124,7 +124,7 @@ class OperatorPins:
         return (yield from self._answer(message.request, list(self._keys), unknown))
 
     def keep(self, now_s: float) -> None:
-        """Look at some pins: what is not in memory at its current version is loaded."""
+        """Check some pins, and load those that are not in memory at their current version."""
         for key in list(islice(self._keys, LOOKS_PER_BEAT)):
             self._keys.move_to_end(key)
             self._keep(key, now_s)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What operators alone may ask: read the map again, evict, pin, stop; and which users are operators.
+"""Requests of operators: read the map again, evict, pin, stop; and the check of who is an operator.
 
-Judged by what the kernel says of the peer (`Peer`), never of anything a client says.  Root and the
-daemon's own user always may; so may members of the configured administrators' group.
+The check uses the kernel's credentials of the peer (`Peer`), never a client's claim.  Root and the daemon's
+own user are always allowed, and so are members of the configured administrators' group.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from shmmap.protocol.codec import encode
 __all__ = ["OPERATOR_REQUESTS", "Authorization", "OperatorRequests"]
 
 MEMORY_S: Final = 10.0
-"""How long a user's groups are remembered: asking may mean asking a server far away."""
+"""How long a user's groups are cached: looking them up may involve a remote server."""
 
 
 class Authorization:
@@ -38,9 +38,9 @@ class Authorization:
     Parameters
     ----------
     group
-        Group (name or number) whose members may, besides root and the daemon's user; empty: no one else.
+        Group (name or number) whose members may, besides root and the daemon's user; empty: no group.
     setting
-        Where that is set.
+        Name of the setting that names the group.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Authorization:
     Raises
     ------
     ConfigError
-        There is no such group.
+        The group does not exist.
     """
 
     def __init__(self, group: str = "", setting: str = "admin_group") -> None:
@@ -67,12 +67,12 @@ class Authorization:
         return peer.gid == self.gid or self.gid in self._groups_of(peer.uid, now_s)
 
     def require(self, peer: Peer, now_s: float) -> None:
-        """Refuse a process that may not.
+        """Refuse a process that may not administer the daemon.
 
         Raises
         ------
         NotPermitted
-            It may not.
+            The process may not.
         """
         if not self.allow(peer, now_s):
             members = f", and members of group {self._name}" if self._name else ""
@@ -88,7 +88,7 @@ class Authorization:
             account = pwd.getpwuid(uid)
             groups = frozenset(os.getgrouplist(account.pw_name, account.pw_gid))
         except (KeyError, OSError):
-            groups = frozenset()  # a user this machine has no account of: only its own group counts
+            groups = frozenset()  # a user without an account on this machine: only its own group counts
         if len(self._groups) >= 1024:
             self._groups.clear()
         self._groups[uid] = (now_s + MEMORY_S, groups)
@@ -97,20 +97,20 @@ class Authorization:
 
 OPERATOR_REQUESTS: Final = (messages.Reload, messages.Evict, messages.Pin, messages.Unpin, messages.Shutdown)
 RELOAD_S: Final = 4.0
-"""How long a reload of a map that is elsewhere may take before its answer is that it cannot be reached."""
+"""How long a reload of a remote map may take before it is refused as unreachable."""
 FAREWELL_S: Final = 1.0
-"""How long a stop waits for the client that asked for it: its libzmq drops a reply that was not read when the
-connection ends (ZMQ_IMMEDIATE)."""
+"""How long a stop waits for the client that asked for it: that client's libzmq drops a reply that it has not
+read when the connection ends (ZMQ_IMMEDIATE)."""
 
 
 @dataclass(eq=False, slots=True)
 class OperatorRequests:
-    """Does what an operator asks; the permission was checked before.
+    """Carries out operators' requests; permission has been checked before.
 
     Attributes
     ----------
     stop_by_s
-        When the daemon stops; infinity if no operator asked for that.
+        When the daemon stops; infinity while no operator has asked for a stop.
     """
 
     cache: CellCache
@@ -121,7 +121,7 @@ class OperatorRequests:
     _reloading: dict[tuple[int, int], tuple[Session, float]] = field(default_factory=dict)
 
     def handle(self, session: Session, message: messages.Request, now_s: float) -> Iterator[None]:
-        """Carry out one request and answer it, a reload when it is over."""
+        """Carry out and answer one request; a reload is answered when it has finished."""
         if isinstance(message, messages.Reload):
             self._reload(session, message, now_s)
         elif isinstance(message, messages.Evict):
@@ -139,12 +139,12 @@ class OperatorRequests:
             self._asked_to_stop, self.stop_by_s = session, now_s + FAREWELL_S
 
     def on_session_end(self, session: Session) -> None:
-        """Stop now, if this is the session that the daemon stops for: it has read its answer."""
+        """Stop now if the ended session is the one that asked for the stop: it has read its answer."""
         if session is self._asked_to_stop:
             self.stop_by_s = -math.inf
 
     def answer_overdue(self, now_s: float) -> None:
-        """Refuse reloads that take too long; they go on."""
+        """Refuse reloads that take too long; the reloads themselves continue."""
         for asked, (session, until_s) in list(self._reloading.items()):
             if now_s >= until_s:
                 del self._reloading[asked]
@@ -154,7 +154,7 @@ class OperatorRequests:
     def _reload(self, session: Session, message: messages.Reload, now_s: float) -> None:
         asked = session.slot, message.request
         if asked in self._reloading:
-            return  # the client repeats what it has no answer to yet
+            return  # the client repeats a request without an answer
         until_s = math.inf if self.cache.pages is None else now_s + RELOAD_S
         self._reloading[asked] = session, until_s
 
@@ -188,7 +188,7 @@ class OperatorRequests:
         for resident in chosen:
             yield from pace.pause()
             if ledger.resident_named(resident.name) is not resident:
-                continue  # it was evicted meanwhile
+                continue  # evicted in the meantime
             if resident.key in self.pins:
                 kept += 1
             else:
