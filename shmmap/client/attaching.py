@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turn handles into cells: map each segment once per client, and unmap it in a thread where that is cheap.
+"""Turn handles into cells: map each segment once per client, and unmap it where that delays no thread.
 
 Whether this process sees the daemon's segments is checked with the statistics segment, which every daemon
 has.
@@ -145,7 +145,7 @@ class Attacher:
             self._ended.popleft()
         return self._unmapped
 
-    # --- unmapping memory whose last view is gone --- -----------------------------------------------
+    # --- unmapping memory whose last view is gone ----------------------------------------------------------
 
     def unmap_in(self, queue: SimpleQueue[Owned | None]) -> None:
         """From now on put unused memory into a queue, whose thread unmaps it, instead of unmapping here."""

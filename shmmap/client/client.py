@@ -417,7 +417,7 @@ class Client:
             Only what changed after this map version, if the daemon still knows it
             (`MapListing.since_known`).
         most
-            Stop after this many cells: the listing has the first pages only, with at least this many cells.
+            Stop once more than this many cells are listed: the listing then has only the first cells.
         """
         from shmmap.client.map_listing import list_cells  # most clients never list cells
 
