@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps a window current: a thread that asks, attaches and unmaps, or the call that moves the window.
+"""Keep a window current: in a thread that requests, attaches and unmaps, or in the call that sets the pose.
 
 Both send a request when the pose has moved (`shmmap.client.window.state.moved`), ``refresh_interval_s``
 seconds after the last request, and while cells are missing.
@@ -156,7 +156,7 @@ class WindowFollower:
         if self._elsewhere:
             return
         self.request_stop()
-        while not self._ended and _thread.get_ident() != self._thread:  # it may be where garbage ends
+        while not self._ended and _thread.get_ident() != self._thread:  # a finalizer may run in the thread
             with contextlib.suppress(Empty):
                 self._over.get(timeout=_OVER_S)
 
@@ -190,7 +190,7 @@ class WindowFollower:
             self._over.put(None)
 
     def _wait(self, until_s: float) -> bool:
-        """Unmap what arrives, until it is time to ask or there is a new pose; False at the end."""
+        """Unmap memory from the queue until a request is due or a new pose arrives; False at the end."""
         while True:
             remaining_s = until_s - time.monotonic()
             try:
@@ -238,7 +238,7 @@ class WindowFollower:
         return self._pause_s
 
     def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
-        self.state = state  # before the error: where there is none, the state is the one that came with it
+        self.state = state  # before the error: a reader without an error sees the matching state
         if error is None:
             self.stale_since = None
         elif self.stale_since is None:

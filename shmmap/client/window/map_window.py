@@ -253,7 +253,7 @@ class MapWindow:
 
     @property
     def complete(self) -> bool:
-        """Whether the window answers the last pose, and nothing in it is pending, failed or not known yet.
+        """Whether the window answers the last pose, and no cell is pending, failed or not listed yet.
 
         A pose is answered if it lies in the last requested area, less than ``update_distance`` from the pose
         of that request.  So this is False right after a jump, and as soon as the vehicle leaves the area of
