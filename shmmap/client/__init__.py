@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The client library: connect, ask for cells, follow a pose.
 
-What windows need is loaded when it is first used; a program that only asks does without.
+Modules that only windows need are imported at the first use of a window.
 
-The packages come first, before modules of ours nest: Python keeps its frames in chunks of 16 KiB, and
-where imports nest so deeply that a loop in them (numpy's has thousands of rounds) comes to lie on the
-border of two, it maps and unmaps memory in every round (30 ms).
+Third-party packages are imported first, before shmmap's own modules nest.  Python keeps its frames in chunks
+of 16 KiB.  Where imports nest so deeply that a loop in them (numpy's has thousands of rounds) runs at the
+border of two chunks, Python maps and unmaps memory in every round (30 ms).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments of programs, checked before anything is done with them; what makes no sense is a `BadRequest`.
+"""Checks of the arguments that programs pass; an invalid argument raises `BadRequest`.
 
-Numbers, names, heights, and where a vehicle is and goes: a pose in whatever numbers it comes, and a route of
-any length, become an `Intent` that can be sent.
+Covers numbers, names, heights, poses and routes.  A pose of any numeric type and a route of any length become
+an `Intent`, ready to send.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ __all__ = [
 ]
 
 MAX_ROUTE_PLACES: Final = 512
-"""The daemon keeps no more: of a longer route this many places are sent, equally far apart along it."""
+"""Most places of a route that the daemon keeps; a longer route is resampled to this many, equally spaced."""
 MAX_WAIT_S: Final = 60.0
-"""One request waits no longer: so a daemon that hangs is noticed, however long a program waits for cells."""
+"""Longest wait of one request: a daemon that hangs is noticed even while a program waits longer for cells."""
 FARTHEST_M: Final = 1e8
-"""Coordinates beyond this count as this, as in the daemon."""
+"""Coordinates beyond this limit are clamped to it, as in the daemon."""
 
 
 def number(what: str, value: float, *, unit: str = "seconds", positive: bool = False) -> float:
-    """Return a number that is not negative; infinity is one.
+    """Return a checked number: not negative, possibly infinite.
 
     Raises
     ------
     BadRequest
-        It is none.
+        The value is not such a number.
     """
     try:
         given = float(value)
@@ -61,7 +61,7 @@ def number(what: str, value: float, *, unit: str = "seconds", positive: bool = F
 
 
 def timeout_s(what: str, value: float) -> float:
-    """Return seconds that something may take: more than none, and no more than can be waited for."""
+    """Return a checked timeout in seconds: positive, at most the longest wait that Python supports."""
     given = number(what, value, positive=True)
     if given > TIMEOUT_MAX:
         raise BadRequest(f"{what} must be at most {TIMEOUT_MAX:.0f} seconds, not {value!r}")
@@ -69,12 +69,12 @@ def timeout_s(what: str, value: float) -> float:
 
 
 def checked_seconds(what: str, seconds: object) -> float:
-    """Return a time that can be waited for, 0 included.
+    """Return a checked wait in seconds; 0 is allowed.
 
     Raises
     ------
     BadRequest
-        It is no number, negative, or longer than can be waited for.
+        The value is no number, is negative, or is longer than Python can wait.
     """
     if not isinstance(seconds, numbers.Real) or not 0 <= float(seconds) <= TIMEOUT_MAX:  # nor NaN
         raise BadRequest(f"{what} must be a number of seconds, 0 or more, not {seconds!r}")
@@ -82,7 +82,7 @@ def checked_seconds(what: str, seconds: object) -> float:
 
 
 def names(what: str, given: str | Iterable[str]) -> tuple[str, ...]:
-    """Return ids or layers as a tuple; one alone counts as one."""
+    """Return ids or layers as a tuple; a single string becomes a tuple of one."""
     if isinstance(given, str):
         return (given,)
     try:
@@ -96,12 +96,12 @@ def names(what: str, given: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def request_waits(wait: float | None) -> Iterator[float | None]:
-    """Yield the seconds that each request for the same cells may wait: several where ``wait`` is long.
+    """Split a long wait for cells: yield the seconds that each successive request may wait.
 
     Raises
     ------
     BadRequest
-        It is no number of seconds, or negative.
+        ``wait`` is no number of seconds, or is negative.
     """
     left_s = None if wait is None else number("wait", wait)
     while left_s is not None and left_s > MAX_WAIT_S:
@@ -110,7 +110,7 @@ def request_waits(wait: float | None) -> Iterator[float | None]:
     yield left_s
 
 
-# --- where a vehicle is and goes ------------------------------------------------------------------
+# --- pose and route of a vehicle ------------------------------------------------------------------
 
 
 def pose_intent(
@@ -121,12 +121,12 @@ def pose_intent(
     heading: float | None,
     route: Sequence[tuple[float, float]] | NDArray[Any],
 ) -> Intent:
-    """Return a pose as it is sent, whatever kind of numbers it came in; see `shmmap.MapWindow.move_to`.
+    """Return a pose of any numeric type as an `Intent` to send; see `shmmap.MapWindow.move_to`.
 
     Raises
     ------
     BadRequest
-        A number is missing, is none, or is not finite.
+        A value is missing, is not a number, or is not finite.
     """
     try:
         path = np.array(route if isinstance(route, np.ndarray) else list(route), dtype=np.float64)
@@ -148,7 +148,7 @@ def given_intent(
     heading: float | None,
     route: Sequence[tuple[float, float]] | NDArray[Any],
 ) -> Intent | None:
-    """Return where a vehicle is and goes, as `shmmap.Client.area` takes it; None where no pose is given.
+    """Return the pose and route given to `shmmap.Client.area` as an `Intent`; None if no pose is given.
 
     Raises
     ------
@@ -179,8 +179,7 @@ def thinned(route: NDArray[np.float64]) -> NDArray[np.float64]:
     Returns
     -------
     NDArray
-        The route itself where it is no longer than that; else places equally far apart along it, its ends
-        among them.
+        The route itself if it has no more places; else equally spaced places along it, both ends included.
     """
     if len(route) <= MAX_ROUTE_PLACES:
         return route

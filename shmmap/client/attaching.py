@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Handles to cells: each segment is mapped once in a client, and unmapped where no thread is disturbed.
+"""Turn handles into cells: map each segment once per client, and unmap it where that delays no thread.
 
-What this process sees of the daemon's segments shows in the one that every daemon has, its statistics.
+Whether this process sees the daemon's segments is checked with the statistics segment, which every daemon
+has.
 
-Cells and views end wherever the last reference to them is dropped, in any thread and in the middle of
-anything.  What happens then is built in, appending to a deque or putting into a `queue.SimpleQueue`: it takes
-no lock, and no signal handler runs in it, whose exception Python would have to ignore.
+Cells and views end where their last reference is dropped: in any thread, at any moment.  At that point only
+built-in operations run: appending to a deque, or putting into a `queue.SimpleQueue`.  They take no lock, and
+no signal handler can run in them and raise an exception that Python would have to ignore.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ __all__ = ["Attacher", "check_visible", "owner_of_segments"]
 
 
 class _Attached(weakref.ref[Cell]):
-    """A cell as long as others have it, and what it is found by."""
+    """Weak reference to an attached cell, and the key under which it is found."""
 
     __slots__ = ("key",)
 
@@ -34,7 +35,7 @@ class _Attached(weakref.ref[Cell]):
 
 
 class _Mapped(weakref.ref[Owned]):
-    """Mapped memory, whose version is known also when it is mapped no more."""
+    """Weak reference to mapped memory, which keeps the version after the memory is unmapped."""
 
     __slots__ = ("before", "version")
 
@@ -49,7 +50,7 @@ class Attacher:
         self._cells: dict[tuple[int, str], _Attached] = {}
         self._dropped: deque[weakref.ref[Cell]] = deque()
         self._named_outside: set[str] = set()
-        self._mapped: dict[int, _Mapped] = {}  # the last one of each version, which knows the one before
+        self._mapped: dict[int, _Mapped] = {}  # newest mapping per version, linked to the previous one
         self._ended: deque[_Mapped] = deque()
         self._unmapped: list[int] = []
         self._sinks: list[SimpleQueue[Owned | None]] = []
@@ -57,16 +58,16 @@ class Attacher:
     def attach(
         self, handle: Handle, cell_id: str, segment: str, access: Access, *, populate: bool = False
     ) -> Cell:
-        """Return the cell of a handle; one that is attached already is shared.
+        """Return the cell of a handle; a cell that is already attached is shared.
 
         Parameters
         ----------
         handle, cell_id, segment
-            The handle, and what it names, whole.
+            The handle, and the full cell id and segment name that it abbreviates.
         access
-            Where the segments are, and whose.
+            Directory and owner of the segments.
         populate
-            Let the kernel map every page now.
+            Map every page now, not at first access.
 
         Raises
         ------
@@ -76,7 +77,7 @@ class Attacher:
         Warns
         -----
         ShmmapWarning
-            Points of the cell lie outside its box; once a cell.
+            Points of the cell lie outside its box; issued once per cell.
         """
         key = (handle.version, handle.layer)
         known = self._cells.get(key)
@@ -112,13 +113,13 @@ class Attacher:
 
     def _forget_dropped(self) -> None:
         while self._dropped:
-            gone = self._dropped[0]  # it stays until all is done: an exception may come anywhere
+            gone = self._dropped[0]  # removed only after the work: an exception may interrupt at any point
             if isinstance(gone, _Attached) and self._cells.get(gone.key) is gone:
                 del self._cells[gone.key]
             self._dropped.popleft()
 
     def _note(self, memory: Owned, version: int) -> None:
-        """Memory is mapped for a version; when and wherever it is unmapped, that is noted by itself."""
+        """Record that memory is mapped for a version; a weak reference records when it is unmapped."""
         mapped = _Mapped(memory, self._ended.append)
         mapped.version = version
         mapped.before = self._mapped.get(version)
@@ -126,13 +127,13 @@ class Attacher:
 
     @property
     def any_mapped(self) -> bool:
-        """Whether this client still has anything mapped, as of the last `unmapped`."""
+        """Whether this client still maps any memory, as of the last call of `unmapped`."""
         return bool(self._mapped)
 
     def unmapped(self) -> list[int]:
-        """Versions of which nothing is mapped any more; to be emptied when the daemon knows them."""
+        """Versions that this client no longer maps; the caller clears the list when the daemon has them."""
         while self._ended:
-            version = self._ended[0].version  # it stays until all is done: an exception may come anywhere
+            version = self._ended[0].version  # removed only afterwards: an exception may interrupt here
             known = left = self._mapped.get(version)
             while left is not None and left() is None:
                 left = left.before
@@ -144,14 +145,14 @@ class Attacher:
             self._ended.popleft()
         return self._unmapped
 
-    # --- where memory goes when its last view is gone -----------------------------------------------
+    # --- unmapping memory whose last view is gone ----------------------------------------------------------
 
     def unmap_in(self, queue: SimpleQueue[Owned | None]) -> None:
-        """Hand memory from now on to a queue, whose thread unmaps it, instead of unmapping it on the spot."""
+        """From now on put unused memory into a queue, whose thread unmaps it, instead of unmapping here."""
         self._sinks.append(queue)
 
     def stop_unmapping_in(self, queue: SimpleQueue[Owned | None]) -> None:
-        """End `unmap_in`: the queue's thread ended."""
+        """Undo `unmap_in`: the queue's thread has ended."""
         if queue in self._sinks:
             self._sinks.remove(queue)
         with contextlib.suppress(Empty):
@@ -159,7 +160,7 @@ class Attacher:
                 queue.get_nowait()
 
     def restart_in_child(self) -> None:
-        """After a fork: threads stayed in the parent, and so did the session of what is unmapped here."""
+        """Reset the state after a fork: unmapping threads and the session stay in the parent."""
         self._ended = deque()
         self._sinks.clear()
 
@@ -168,7 +169,7 @@ class Attacher:
 
 
 def owner_of_segments(shm_dir: str, segment_prefix: str) -> int | None:
-    """User whose segments they are, as this process sees it; None where it sees none."""
+    """Return the user id that owns the segments, as this process sees it; None if it sees no segment."""
     try:
         return os.lstat(_statistics_path(shm_dir, segment_prefix)).st_uid
     except OSError:
@@ -176,7 +177,7 @@ def owner_of_segments(shm_dir: str, segment_prefix: str) -> int | None:
 
 
 def check_visible(shm_dir: str, segment_prefix: str) -> None:
-    """Refuse a directory without the daemon's statistics: in a container it may be another one.
+    """Refuse a directory without the daemon's statistics segment: a container may have another one there.
 
     Raises
     ------
@@ -192,5 +193,5 @@ def check_visible(shm_dir: str, segment_prefix: str) -> None:
 
 
 def _statistics_path(shm_dir: str, segment_prefix: str) -> str:
-    """Path of the statistics segment of the daemon whose segments' names begin so."""
+    """Return the path of a daemon's statistics segment, from the prefix of its segments' names."""
     return f"{shm_dir}/{segment_prefix.lstrip('/')}statistics"

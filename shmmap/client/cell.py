@@ -22,10 +22,10 @@ __all__ = ["Access", "Cell"]
 
 
 class Access(NamedTuple):
-    """How this process gets at a daemon's segments.
+    """How this process reaches a daemon's segments.
 
-    ``shm_dir`` is their directory, ``slot`` the session whose use of them the daemon sees, ``owner`` the user
-    they must belong to, None where that is not known.
+    ``shm_dir`` is their directory.  ``slot`` identifies the session under which the daemon sees them in use.
+    ``owner`` is the user id that must own them, or None if it is not known.
     """
 
     shm_dir: str
@@ -34,25 +34,26 @@ class Access(NamedTuple):
 
 
 class Cell:
-    """One layer of one cell at one version, attached.
+    """An attached cell: one layer at one version.
 
     Every array is a read-only view of shared memory, zero-copy, and valid as long as it or any
     view of it lives: after the cell object is gone, after the client is closed, after the daemon
-    ended.  Its bytes never change; a changed map comes as a new cell.
+    ended.  Its bytes never change; a change of the map produces a new cell.
 
-    A pickled cell is its handle, and is attached where it is unpickled; what is gone by then is a
-    `StaleHandle` (``MULTIPROCESSING.md``).  `copy` makes a cell that does not depend on the daemon.
+    A pickled cell contains only its handle, and is attached when it is unpickled.  If the segment is gone by
+    then, that raises `StaleHandle` (``MULTIPROCESSING.md``).  `copy` makes a cell that does not depend on the
+    daemon.
 
     Attributes
     ----------
     id : str
         Absolute path of the source file, as in Autoware.
     name : str
-        The id without what the ids of all cells of the map begin with, as a rule the file's name
-        (``"120_40.pcd"``): for people to read, and good wherever an id is asked for.
+        The id without the common prefix of all ids of the map, usually the file's name (``"120_40.pcd"``).
+        It is meant for people, and is accepted wherever an id is.
     version : int
-        Names the bytes: a 64-bit hash of the id, the box and the source's state, and for computed layers of
-        how and from what they are computed.
+        Identifies the bytes: a 64-bit hash of the id, the box and the source's state.  For a computed layer
+        the hash also covers the computation and its inputs.
     layer : str
         ``"points"`` is the source itself.
     box : tuple of float
@@ -60,12 +61,12 @@ class Cell:
     points : int
         Rows of each column.
     stale : bool
-        At the last reply that named this version: its source has changed, but the successor could
-        not be loaded yet.
+        Whether the source had changed, but its new version was not loaded yet, at the last reply that named
+        this version.
     segment : str
         Name of the shared-memory object.
     offset, nbytes : int
-        Where in it the cell lies, header included.
+        Position and size of the cell in the segment, header included, bytes.
     """
 
     __slots__ = (
@@ -99,7 +100,7 @@ class Cell:
         self.offset = handle.offset
         self.nbytes = handle.bytes
         self._attached = attached
-        self._access = access  # None: memory of this process
+        self._access = access  # None: the arrays are private memory of this process
         self._views: dict[str, NDArray[Any]] = {}
 
     def __len__(self) -> int:
@@ -107,7 +108,7 @@ class Cell:
         return self.points
 
     def __bool__(self) -> bool:
-        """Return True: a cell without points is a cell, too."""
+        """Return True, also for a cell without points."""
         return True
 
     def __repr__(self) -> str:
@@ -116,25 +117,25 @@ class Cell:
     # --- copies, and other processes --------------------------------------------------------------
 
     def copy(self) -> Cell:
-        """Return the cell in memory of this process alone: it may be written, and pickles with its points.
+        """Return a copy in private memory, which may be written and is pickled with its points.
 
-        Such a cell has no `segment`, and keeps nothing in the daemon.
+        The copy has no `segment`, and does not keep the original in the daemon's memory.
 
         Raises
         ------
         LimitReached
-            There is not so much memory.
+            There is not enough memory.
         """
         return Cell(self.id, "", self.handle(), self._attached.copy(), None)
 
     def __copy__(self) -> Cell:
-        return self if self._access is not None else self.copy()  # what never changes need not be copied
+        return self if self._access is not None else self.copy()  # immutable: needs no copy
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Cell:
         return self.__copy__()
 
     def handle(self) -> Handle:
-        """Return the handle it was attached by, with its whole segment's name."""
+        """Return the handle by which the cell was attached, with the full name of its segment."""
         return Handle(
             self.name,
             self.version,
@@ -147,11 +148,11 @@ class Cell:
             self.stale,
         )
 
-    # --- what it is ---------------------------------------------------------------------------
+    # --- identity ---------------------------------------------------------------------------
 
     @property
     def version_hex(self) -> str:
-        """The version as 16 hex digits, as people and JSON read it."""
+        """The version as 16 hex digits, as in output for people and in JSON."""
         return f"{self.version:016x}"
 
     # --- columns --------------------------------------------------------------------------------
@@ -193,25 +194,25 @@ class Cell:
         return MappingProxyType({name: self[name] for name in self.column_names})
 
     def unit(self, column: str) -> str:
-        """SI unit of a column, empty where the source names none; errors are those of ``cell[column]``."""
+        """Return the SI unit of a column, empty if the source names none; raises as ``cell[column]``."""
         self[column]
         return next(row[5] for row in self._attached.columns if row[0] == column)
 
-    # --- what the header says -------------------------------------------------------------------
+    # --- fields of the header -------------------------------------------------------------------
 
     @property
     def header(self) -> SegmentHeader:
-        """All that the segment says about itself."""
+        """The segment's whole header."""
         return self._attached.header
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """What coordinates are relative to, metres, map frame; (0, 0, 0) for `points`."""
+        """Offset to add to coordinates, metres, map frame; (0, 0, 0) for `points`."""
         return self.header.origin
 
     @property
     def lattice(self) -> Lattice | None:
-        """The lattice that a computed layer's rows lie on; None where it has none."""
+        """The lattice on which a computed layer's rows lie; None if the layer has none."""
         return self.header.lattice
 
     @property
@@ -221,22 +222,22 @@ class Cell:
 
     @property
     def source_points(self) -> int:
-        """Points in the source, those that were dropped included."""
+        """Number of points in the source, dropped points included."""
         return self.header.source_points
 
     @property
     def dropped_points(self) -> int:
-        """Points left out because a coordinate is not finite."""
+        """Number of points left out because a coordinate is not finite."""
         return self.header.dropped_points
 
     @property
     def source(self) -> SourceStamp:
-        """Size (bytes), mtime and ctime (ns) of the source file; of another source what names its state."""
+        """Size (bytes), mtime and ctime (ns) of the source file; other sources: numbers of their state."""
         return self.header.source
 
     @property
     def source_digest(self) -> bytes:
-        """XXH3-128 of the source file, 16 bytes; of no file, what names its content."""
+        """XXH3-128 of the source file, 16 bytes; for other sources, bytes that identify their content."""
         return self.header.source_digest
 
     @property
@@ -252,21 +253,21 @@ class Cell:
         Raises
         ------
         SegmentCorrupt
-            Naming the first column whose bytes changed.
+            A column's bytes changed; the message names the first such column.
         """
         self._attached.verify()
 
-    # --- other libraries ------------------------------------------------------------------------
-    # None of them knows read-only memory: the memory that they are given may be written.  DLPack: numpy 2.1
-    # and later export ``cell.xyz`` read-only to consumers that ask for DLPack 1.0, as
+    # --- other libraries ------------------------------------------------------------------------ These
+    # libraries do not support read-only memory, so they receive memory that may be written.  DLPack: numpy
+    # 2.1 and later export ``cell.xyz`` read-only to consumers that ask for DLPack 1.0, as
     # ``np.from_dlpack(cell.xyz)`` does; older consumers get a BufferError, never a copy.
 
     def to_open3d(self) -> open3d.t.geometry.PointCloud:
-        """Return an Open3D tensor point cloud over the cell's memory, which may be written.
+        """Return an Open3D tensor point cloud over a private copy-on-write mapping of the cell.
 
-        ``xyz`` is its ``positions``; every other column is an attribute of its own name, (N, 1) or
-        (N, k).  Nothing is copied to be read.  What is written becomes memory of this process, 4 KiB at a
-        time, and shows in this result alone: the cell, other results and other processes keep their bytes.
+        ``xyz`` is its ``positions``; every other column is an attribute of its own name, (N, 1) or (N, k).
+        Reading copies nothing.  A write copies the page (4 KiB) into private memory and is visible in this
+        result alone: the cell, other results and other processes keep their bytes.
 
         Raises
         ------
@@ -284,10 +285,10 @@ class Cell:
         return cloud
 
     def to_torch(self) -> dict[str, torch.Tensor]:
-        """Return torch tensors by column name over the cell's memory, which may be written.
+        """Return torch tensors by column name over a private copy-on-write mapping of the cell.
 
-        As for `to_open3d`, what is written shows in this result alone.  (``torch.from_numpy(cell.xyz)`` would
-        be over the shared memory itself, where writing ends the process.)
+        As with `to_open3d`, a write is visible in this result alone.  (``torch.from_numpy(cell.xyz)`` would
+        use the shared memory itself, where a write kills the process.)
 
         Raises
         ------
@@ -300,7 +301,7 @@ class Cell:
         return {name: torch.from_numpy(view) for name, view in self._writable().items()}
 
     def _writable(self) -> Mapping[str, NDArray[Any]]:
-        """Return the columns over memory that may be written, which no other view or process sees."""
+        """Return the columns over a private copy-on-write mapping, which no other view or process sees."""
         segment = self._attached
         if self._access is not None:
             segment = attach_writable(segment, self.segment, offset=self.offset, shm_dir=self._access.shm_dir)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a client holds, as a request for cells says it, and what the request brings back."""
+"""Encode the cells that a client holds for a request, and hold the cells that the reply contains."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["CellSet", "Held", "HeldCells", "PendingLayer", "cell_error", "gather"]
 
 Held: TypeAlias = Cell | str | tuple[str, int | None] | tuple[str, int | None, tuple[str, ...]]
-"""An attached cell, or an id (which means its current version), id and version, or these and layers."""
+"""A held cell: an attached `Cell`, an id (its current version), (id, version), or (id, version, layers)."""
 
 
 class PendingLayer(NamedTuple):
@@ -46,17 +46,17 @@ class CellSet(Sequence[Cell]):
     epoch : int
         Which run of the daemon answered.
     map_version : int
-        Which state of the map.
+        State of the map that the reply describes.
     layers : tuple of str
-        The layers asked for, one for each, by the names that cells have them by.
+        The requested layers, in order, under the names that `Cell.layer` uses.
     covered : bool
-        Whether the daemon knows all that the map has of what was asked for.  Where it does not (a map that
-        comes in pages), more cells may be there, none of them is in `removed`, and one that is unknown may
-        exist: ask again.
+        Whether the daemon knows every cell of the map that the request covers.  If it does not (the list of a
+        remote map arrives in pages), more cells may exist, `removed` lists none of them, and an unknown id
+        may still turn out to exist: ask again.
     reason : str
-        Why what is missing is not being loaded: ``"offline"``, where the list of cells cannot be reached at
-        present; empty where it is being fetched, where all is covered, and from a daemon older than protocol
-        1.6.
+        Why missing cells are not being loaded: ``"offline"`` if the list of cells cannot be reached at
+        present.  Empty if the list is being fetched, if everything is covered, or if the daemon is older than
+        protocol 1.6.
     """
 
     __slots__ = (
@@ -102,11 +102,11 @@ class CellSet(Sequence[Cell]):
 
     @property
     def complete(self) -> bool:
-        """Whether nothing that was asked for is missing."""
+        """Whether no requested cell is missing."""
         return self.covered and not self.failed and not self.pending
 
     def raise_for_failures(self) -> CellSet:
-        """Return the set itself, or raise the first of `failed`."""
+        """Return this set, or raise the first error of `failed`."""
         if self.failed:
             raise self.failed[0]
         return self
@@ -118,7 +118,7 @@ class CellSet(Sequence[Cell]):
     def gather(self, column: str, other: str, /, *others: str) -> dict[str, NDArray[Any]]: ...
 
     def gather(self, column: str = "xyz", /, *others: str) -> NDArray[Any] | dict[str, NDArray[Any]]:
-        """Copy columns of all points of the cells, cell after cell; as `PointsAround.gather`.
+        """Copy columns of all points into arrays, cell after cell; like `PointsAround.gather`.
 
         ::
 
@@ -162,7 +162,7 @@ class CellSet(Sequence[Cell]):
 def gather(
     cells: Sequence[Cell], columns: Sequence[str], masks: Iterable[NDArray[np.bool_] | None]
 ) -> dict[str, NDArray[Any]]:
-    """Copy columns of cells into one array each, cell after cell; a mask says which rows, None all.
+    """Copy each column of the cells into one array, cell after cell; a mask selects rows, None selects all.
 
     Raises
     ------
@@ -194,7 +194,7 @@ _KINDS = _kinds(CellError)
 
 
 def cell_error(failure: FailedCell, cell_id: str) -> CellError:
-    """Return the error that a reply describes for one cell."""
+    """Return the exception for a cell that a reply reports as failed."""
     kind = _KINDS.get(failure.code, CellError)
     return kind(
         f"{cell_id} ({failure.layer}): {failure.message}",
@@ -208,8 +208,8 @@ def cell_error(failure: FailedCell, cell_id: str) -> CellError:
 class HeldCells:
     """Held cells in wire form.
 
-    An attached cell is sent as its version, 8 bytes (``packed``).  Other cells are sent by name.  All of
-    them are (``by_name``) if the daemon may have forgotten which cell a version belongs to.
+    An attached cell is sent as its version, 8 bytes (``packed``).  Other cells are sent by name.  With
+    ``by_name`` every cell is sent by name: the daemon may have forgotten which cell a version belongs to.
 
     Attributes
     ----------
@@ -244,10 +244,10 @@ class HeldCells:
         self.named = tuple(named)
 
     def removed(self, ids: Sequence[str], packed: bytes) -> tuple[str, ...]:
-        """Ids to drop, in the order they were given, from a reply's two lists.
+        """Return the ids to drop, in the order they were given, from a reply's two lists.
 
-        Of a cell that is held in several layers, all have to go: where the daemon does not know one
-        version any more, that layer comes again, and the others stay.
+        A cell held in several layers is dropped only if all its layers are.  If the daemon no longer knows
+        the version of one layer, it sends that layer again, and the other layers stay.
         """
         if not packed:
             return tuple(ids)

@@ -33,22 +33,25 @@ DEFAULT_WAIT_S: Final = 5.0
 CONNECT_S: Final = 60.0
 RELOAD_S: Final = 60.0
 RELOAD_CELL_S: Final = 60e-6
-"""How long reading a map's catalogue may take, in all and for each cell, beside what any request may."""
+"""Extra time for reading a map's catalogue: a fixed part, and a part per cell."""
 
 
 class MapOrigin(NamedTuple):
-    """How to come back from the map frame to the coordinates of the files that a map was divided from.
+    """Transform from the map frame back to the coordinates of the files that a map was divided from.
 
-    ``(point + (x, y, z)) / unit`` is the point in their coordinate system, in float64.
+    ``(point + (x, y, z)) / unit`` is the point in the files' coordinate system, in float64.
 
     Attributes
     ----------
     x, y, z : float
-        What `divide` subtracted from each point, metres; 0 where nothing was, or that is not known.
+        Offset that `divide` subtracted from each point, metres; 0 if none was subtracted, or if it is not
+        known.
     crs : str or None
-        Name of the coordinate system, with its EPSG code where the files say it; None where they do not.
+        Name of the coordinate system, with its EPSG code if the files contain it; None if they name no
+        system.
     unit_m : tuple of float
-        Metres of the system's unit, in the plane and in height; (1, 1) unless `divide` converted feet.
+        Length of the system's units in metres, horizontal and vertical; (1, 1) unless `divide` converted
+        feet.
     """
 
     x: float
@@ -61,14 +64,14 @@ class MapOrigin(NamedTuple):
 class Client:
     """A session with the daemon; get one from `connect`.
 
-    May be used from several threads: one request is on its way at a time, others wait for it.
+    Several threads may use a client: requests are sent one at a time, and other threads wait.
 
     After a fork the child gets a session of its own with its first request.  Cells attached before
     stay readable in it; until the child drops them or ends, the daemon counts them as in use by the
     parent.  The parent notices nothing.
 
-    Every request has a deadline, ``timeout`` beyond what it lets the daemon wait, and is repeated on
-    silence; a restarted daemon gets a new session without any error.
+    Every request has a deadline: ``timeout`` plus the time that the request lets the daemon wait.  It is
+    repeated on silence.  After a restart of the daemon the client begins a new session without any error.
     """
 
     def __init__(
@@ -109,7 +112,7 @@ class Client:
         """End the session; attached cells stay readable."""
         self._session.close()
 
-    # --- what the daemon said -------------------------------------------------------------------
+    # --- session and map ---------------------------------------------------------------------
 
     @property
     def timeout(self) -> float:
@@ -118,7 +121,7 @@ class Client:
 
     @property
     def welcome(self) -> Welcome:
-        """What the daemon said about itself and its map when the session began."""
+        """Description of the daemon and its map, as received when the session began."""
         return self._session.welcome
 
     @property
@@ -136,12 +139,12 @@ class Client:
 
     @property
     def epoch(self) -> int:
-        """Which run of the daemon the session is with."""
+        """Identifier of the daemon run that the session is with."""
         return self._session.welcome.epoch
 
     @property
     def map_version(self) -> int:
-        """Which state of the map the last answer was about."""
+        """State of the map that the last answer described."""
         return self._session.map_version
 
     @property
@@ -165,7 +168,7 @@ class Client:
 
     @property
     def session(self) -> Session:
-        """What its requests share; for windows."""
+        """State that all requests of this client share; for use by windows."""
         return self._session
 
     # --- cells ------------------------------------------------------------------------------------
@@ -198,34 +201,34 @@ class Client:
     ) -> CellSet:
         """Cells that touch an area, in id order.
 
-        A `ShmmapWarning` says what the answer lacks: cells that failed, cells that are still being loaded
-        after ``wait``, or any cell at all.
+        A `ShmmapWarning` reports an incomplete answer: cells failed, cells are still being loaded after
+        ``wait``, or there are no cells at all.
 
         Parameters
         ----------
         area
             `Circle`, `Box` or `AutowareSquare`; metres, map frame.
         layers
-            What to have of each cell.
+            Layers to return of each cell.
         wait
-            Seconds the daemon may take to load what is not in memory; 0 or None: take what is there, the
-            rest is `CellSet.pending`.  `math.inf`: until nothing is pending.
+            Seconds the daemon may take to load cells that are not in memory.  0 or None: return the cells in
+            memory, and list the others in `CellSet.pending`.  `math.inf`: until nothing is pending.
         pose, velocity, heading, route
-            Where this process is and goes, (x, y) in metres, map frame, and as in `MapWindow.move_to`: the
-            daemon fetches what it will ask for next, and keeps what is near.
+            Pose and motion of this process, (x, y) in metres, map frame, as in `MapWindow.move_to`.  The
+            daemon prefetches the cells that the process will need next, and keeps nearby cells.
         strict
-            True: raise an error instead of a warning.  None: neither, the program looks at `CellSet.failed`
-            and `CellSet.pending`.
+            True: raise an error instead of a warning.  None: do neither, the program checks `CellSet.failed`
+            and `CellSet.pending` itself.
 
         Raises
         ------
         CellError
-            With ``strict``: that of the first cell that failed; `LoadTimeout` of one that is still being
-            loaded; `UnknownCell` where the map has none.
+            With ``strict``: the error of the first cell that failed, `LoadTimeout` for a cell that is still
+            being loaded, or `UnknownCell` if the area has no cells.
         NoAnswer
             No reply before the deadline.
         BadRequest
-            The area or a layer makes no sense.
+            The area or a layer is invalid.
         SegmentError
             This user may not read the segments, or the process has no room for more mappings.
         """
@@ -252,23 +255,23 @@ class Client:
     ) -> PointsAround:
         """Points within ``radius`` metres of a place, as views of the cells they lie in; nothing is copied.
 
-        `around` answers with whole cells, which reach beyond the circle; `PointsAround.gather`, ``mask`` and
-        ``count`` take the points within it.  `PointsAround.covered` says whether these are all that the map
-        has there.
+        `around` returns whole cells, which reach beyond the circle; `PointsAround.gather`, ``mask`` and
+        ``count`` select the points within it.  `PointsAround.covered` is True if these are all points that
+        the map has there.
 
         Parameters
         ----------
         x, y, radius
             Metres, map frame.
         layer
-            What to have of each cell.
+            Layers to return of each cell.
         z
-            Only cells that reach into these heights, (lowest, highest), metres; their points are not sorted
-            out by height.
+            Only cells that reach into these heights, (lowest, highest), metres; points are not filtered by
+            height.
 
         Other parameters and errors are those of `area`.
         """
-        from shmmap.client.points_around import points_around  # windows need it, and few others
+        from shmmap.client.points_around import points_around  # only windows and few programs need it
 
         found = self.area(geometry.Circle(x, y, radius, z), layer, wait=wait, strict=strict)
         boxes = np.array([cell.box for cell in found]).reshape(-1, 4)
@@ -292,21 +295,21 @@ class Client:
     ) -> CellSet:
         """Cells that touch an area, minus those that are held at their current version.
 
-        Drop what `CellSet.removed` lists before adding the cells; a cell whose version changed comes
-        again without being removed.
+        Drop the cells that `CellSet.removed` lists before adding the new ones.  A cell whose version changed
+        is returned, but not listed as removed.
 
         Parameters
         ----------
         held
-            Cells of earlier answers; or ids: alone (meaning the current version), with a version,
-            ``(id, version)``, or with the layers that have it, too, ``(id, version, layers)``.
+            Cells of earlier answers; or ids, alone (meaning the current version), with a version ``(id,
+            version)``, or also with the layers that have this version ``(id, version, layers)``.
         by_name
             Send held cells by name and version, not by version alone: for the first request to a
             restarted daemon, which cannot know what the versions of a previous run belonged to.
         populate
             Let the kernel map every page while attaching instead of at first touch.
         timeout
-            Seconds the reply may take beyond ``wait``; None: those of the client.
+            Seconds the reply may take beyond ``wait``; None: the client's own timeout.
 
         Other parameters and errors are those of `area`.
         """
@@ -358,7 +361,7 @@ class Client:
         *,
         new: bool = True,
     ) -> CellSet:
-        """Return an answer; what it lacks is said, or raised.  Where not all are ``new``, it may be empty."""
+        """Return an answer; warn or raise if it is incomplete.  If not all is ``new``, it may be empty."""
         if not found.complete or (new and not any(cell.points for cell in found.cells)):
             from shmmap.lacking import judge
 
@@ -366,35 +369,35 @@ class Client:
         return found
 
     def release(self) -> int:
-        """Report now what this process has dropped since the last request; returns how many versions.
+        """Report the versions that this process dropped since the last request; return how many.
 
-        Every request reports it, too; this is for programs that drop cells and then ask for nothing.
+        Every request reports them, too; this is for programs that drop cells and then send no request.
         """
         return self._session.report_unmapped()
 
     # --- live maps ------------------------------------------------------------------------------
 
     def live(self, name: str, *, frame_id: str = "") -> LiveMap:
-        """Use a live map: one that others write while it is read.
+        """Return a live map, which other programs may write while it is read.
 
         Parameters
         ----------
         name
-            What the daemon calls it.
+            Name of the map in the daemon.
         frame_id
-            Frame in which this program works; empty: whatever the map's is.
+            Frame in which this program works; empty: the map's own frame.
 
         Raises
         ------
         BadRequest
-            There is no such map, or it is in another frame.
+            There is no such map, or it has another frame.
         """
-        from shmmap.client.live.live_map import LiveMap  # most clients never do
+        from shmmap.client.live.live_map import LiveMap  # most clients use no live map
 
         return LiveMap(self._session, name, frame_id)
 
     def live_maps(self) -> tuple[LiveMapRow, ...]:
-        """Which live maps the daemon keeps, and how they are."""
+        """Return the live maps that the daemon keeps, with their state."""
         from shmmap.protocol.live import LiveList, LiveListed
 
         return until_served(lambda: self._session.ask(LiveList, LiveListed).maps, self.timeout)
@@ -404,7 +407,7 @@ class Client:
     def metadata(
         self, area: geometry.Area | None = None, *, since: int | None = None, most: int | None = None
     ) -> MapListing:
-        """List the map's cells, loaded or not.  A hundred thousand take half a second.
+        """List the map's cells, loaded or not.  A hundred thousand cells take half a second.
 
         Parameters
         ----------
@@ -414,9 +417,9 @@ class Client:
             Only what changed after this map version, if the daemon still knows it
             (`MapListing.since_known`).
         most
-            If the map has more, some of them are enough: the first ones, more than this many.
+            Stop once more than this many cells are listed: the listing then has only the first cells.
         """
-        from shmmap.client.map_listing import list_cells  # most clients never ask
+        from shmmap.client.map_listing import list_cells  # most clients never list cells
 
         return list_cells(self._session, area, since, most=most)
 
@@ -439,8 +442,8 @@ class Client:
     def reload(self) -> messages.Reloaded:
         """Make the daemon read the map's directory again.
 
-        That may take a minute more than other requests, and another one for every million cells: all files
-        are looked at.
+        That may take a minute longer than other requests, plus a minute per million cells: the daemon checks
+        all files.
 
         Raises
         ------
@@ -488,7 +491,7 @@ class Client:
         return self._session.ask(lambda n: messages.Unpin(n, wanted), messages.Pinned)
 
     def shutdown(self) -> None:
-        """End the daemon, as SIGTERM would; what is mapped stays readable.
+        """End the daemon, as SIGTERM would; mapped cells stay readable.
 
         Raises
         ------
@@ -499,7 +502,7 @@ class Client:
 
 
 def _waited(wait: float | None, ask: Callable[[float | None], CellSet]) -> CellSet:
-    """Repeat a request while cells are pending and ``wait`` is not over; returns the last answer."""
+    """Repeat a request while cells are pending and ``wait`` is not over; return the last answer."""
     found = CellSet()
     for wait_s in request_waits(wait):
         found = ask(wait_s)
@@ -529,13 +532,13 @@ def connect(
     instance
         Name of the daemon's instance, instead of an endpoint or ``SHMMAP_INSTANCE``.
     timeout
-        Seconds a reply may take; what a request lets the daemon wait comes on top.
+        Seconds a reply may take, in addition to the time that the request lets the daemon wait.
     connect_timeout
-        Seconds until the daemon must have said welcome, where there is one; where nothing listens, that is
-        an error at once.  Long, since programs wait for processors when a machine starts many at once.
+        Seconds until the daemon must have sent its `Welcome`.  If nothing listens, the error is immediate.
+        The default is long, since programs wait for processors when a machine starts many at once.
     name
-        How this program appears in ``shmmap clients``, at most 64 characters; empty: by the name of its
-        script, or of the module it was started as (``python -m``).
+        Name of this program in ``shmmap clients``, at most 64 characters.  Empty: the name of its script, or
+        of the module it was started as (``python -m``).
     shm_dir
         Directory of the segments as this process sees it (default: ``SHMMAP_SHM_DIR``, else as the daemon
         says); for containers that have it mounted elsewhere.
@@ -545,11 +548,11 @@ def connect(
     NoSocket, SocketPermission, StaleSocket, NoAnswer
         Why no daemon can be reached; all of them are `DaemonUnreachable`.
     ProtocolMismatch
-        What listens is no shmmap daemon, or one of another major version.
+        The process that listens is no shmmap daemon, or a daemon of another major version.
     LimitReached
         This process may not have the descriptors or threads that are needed.
     BadRequest
-        The endpoint cannot be a socket path, or another argument makes no sense.
+        The endpoint cannot be a socket path, or another argument is invalid.
     """
     return Client(
         candidates(endpoint, instance=instance),

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One session with the daemon: requests, deadlines, resending, and coming back after a restart.
+"""One session with the daemon: requests, deadlines, resending, and reconnecting after a restart.
 
-A request travels on a DEALER socket, which reconnects by itself.  What was in flight when a daemon
-was killed is lost; so a request is sent again, with the same id, as soon as the connection is back,
-and now and then during silence.  Every request may be repeated; replies to requests that are no longer
-waited for are dropped.
+A request travels on a DEALER socket, which reconnects by itself.  Messages in flight are lost when a daemon
+is killed.  So a request is sent again, with the same id, as soon as the connection is back, and at intervals
+during silence.  Every request may be repeated; replies that no caller waits for any more are dropped.
 """
 
 from __future__ import annotations
@@ -40,14 +39,14 @@ __all__ = ["SERVED_PAUSE_S", "Connection", "closed", "program_name", "until_serv
 
 R = TypeVar("R")
 
-_SLICE_MS: Final = 100  # how often silence is looked at: did the connection break?
+_SLICE_MS: Final = 100  # interval at which silence is checked for a broken connection
 _RESEND_S: Final = 1.0  # first repetition on silence; the interval then doubles
 _RECONNECT_MS: Final = 20
 _RECONNECT_MAX_MS: Final = 500
 _QUEUE: Final = 64  # messages that may wait for a slow daemon
 _OPTIONS: Final = (
     (zmq.LINGER, 0),
-    (zmq.IMMEDIATE, 1),  # nothing queues up for a daemon that is away
+    (zmq.IMMEDIATE, 1),  # nothing queues up for an absent daemon
     (zmq.SNDHWM, _QUEUE),
     (zmq.RCVTIMEO, _SLICE_MS),
     (zmq.RECONNECT_IVL, _RECONNECT_MS),
@@ -57,7 +56,7 @@ _SILENT_HINT: Final = "the daemon is stopped, hung, overloaded or gone: see `shm
 _UPDATE_HINT: Final = "update the older of client and daemon"
 _MAX_NAME: Final = 64  # characters of a program's name that the daemon keeps
 SERVED_PAUSE_S: Final = 0.05
-"""Between two tries to reach a live map: nothing reports that its process is there again."""
+"""Pause between two tries to reach a live map: no event reports that its process is running again."""
 
 
 class Connection:
@@ -68,23 +67,23 @@ class Connection:
     paths
         Socket paths to try, in order.
     name
-        How this client appears in the daemon's lists; empty: by the name of its program.
+        Name of this client in the daemon's lists; empty: the name of its program.
     timeout_s
-        Until `Welcome` must be here.
+        Seconds until `Welcome` must have arrived.
     waiting
-        Queues that get a None when the connection breaks; may change at any time.
+        Queues that receive None when the connection breaks; may change at any time.
 
     Attributes
     ----------
     welcome : Welcome
         What the daemon said about itself when the session began.
     path : str
-        Where it listens.
+        Path at which the daemon listens.
 
     Raises
     ------
     DaemonUnreachable, ProtocolMismatch
-        As `shmmap.client.discovery.find_socket`, and when no `Welcome` comes in time.
+        As `shmmap.client.discovery.find_socket`, and when no `Welcome` arrives in time.
     LimitReached
         This process may not have the descriptors or threads that a connection needs.
     """
@@ -103,18 +102,18 @@ class Connection:
         self._name = name or program_name()
         self._next_request = int.from_bytes(os.urandom(6), "little")
         self._hung_up = False
-        self._slot = 0  # kept over restarts of the daemon: what is mapped is locked under it
+        self._slot = 0  # kept over restarts of the daemon: mapped segments are locked under it
         self._greeting = True
         stop_orphans()
         self._watch = ConnectionWatch(self, f"ipc://{self.path}", _OPTIONS, waiting)
-        # also without a call of close(); not at the end of the program, where threads may be using it
+        # runs also without close(); not at interpreter exit, where threads may still use the socket
         self._finalizer = weakref.finalize(self, self._watch.stop)
         self._finalizer.atexit = False
         self._socket = self._watch.socket
         self._greet(deadline_s)
 
     def close(self) -> None:
-        """End the connection; messages just sent get a short moment to leave."""
+        """End the connection; messages just sent get a short time to be delivered."""
         self._watch.stop()
         self._finalizer.detach()
         stop_orphans()
@@ -130,11 +129,11 @@ class Connection:
         return self._next_request
 
     def send(self, message: Request) -> None:
-        """Send a message whose reply is not waited for; lost if the daemon is away."""
+        """Send a message without waiting for a reply; it is lost if the daemon is absent."""
         self._send(encode_request(message))
 
     def ask(self, message: Request, kind: type[R], *, timeout_s: float, quiet_s: float = 0.0) -> R:
-        """Send a request and return its reply; begins a new session where the daemon lost it.
+        """Send a request and return its reply; begin a new session if the daemon lost this one.
 
         Parameters
         ----------
@@ -148,7 +147,7 @@ class Connection:
         Raises
         ------
         BadRequest
-            The request is larger than the daemon takes: nothing was sent.
+            The request is larger than the daemon accepts; nothing was sent.
         NoAnswer
             No reply before the deadline.
         ShmmapError
@@ -177,7 +176,7 @@ class Connection:
             self._greet(deadline_s)
 
     def _greet(self, deadline_s: float) -> None:
-        """Begin a session; one whose beginning is interrupted may be incomplete, and is begun again."""
+        """Begin a session; after an interruption it may be incomplete, and is begun again."""
         started_s = time.monotonic()
         self._greeting = True
         hello = Hello(self.new_request(), *PROTOCOL_VERSION, self._name, self._slot)
@@ -212,7 +211,7 @@ class Connection:
         return NoAnswer(f"{self.path}: {what}", hint=_SILENT_HINT)
 
     def _exchange(self, request: int, data: bytes, deadline_s: float, quiet_s: float) -> Reply | None:
-        """Send until something comes back under this request id; None at the deadline."""
+        """Send, and resend, until a reply with this request id arrives; return None at the deadline."""
         sent = False
         watch = self._watch
         handshakes = watch.handshakes
@@ -259,7 +258,8 @@ class Connection:
     def _check_peer(self) -> None:
         hung_up = self._hung_up
         self._hung_up = self._watch.hung_up
-        # libzmq tries again where a connection broke, but not where sockets' patterns do not fit (SUB, say)
+        # libzmq retries after a broken connection, but not if the socket types are incompatible (SUB, for
+        # example)
         if self._watch.foreign or (hung_up and self._hung_up):
             raise self._no_daemon()
 
@@ -275,10 +275,10 @@ def _slice_ms(deadline_s: float) -> int:
 
 
 def program_name() -> str:
-    """Return what a program is called that gives no name itself, at most 64 characters.
+    """Return the default name of this program, at most 64 characters.
 
-    That is the script's file name, or the module's name after ``python -m``; empty where there is neither.  A
-    module that is the ``__main__`` of a package goes by the package's name.
+    It is the script's file name, or the module's name after ``python -m``; empty if there is neither.  For
+    the ``__main__`` module of a package it is the package's name.
     """
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     if spec is not None and spec.name != "__main__":  # python -m package.module
@@ -291,9 +291,9 @@ def program_name() -> str:
 
 
 def closed(what: str, hint: str) -> BaseException:
-    """Return the error of a request to what is closed.
+    """Return the exception for a request on a closed object.
 
-    While the interpreter ends, that ends the asking thread silently: nothing waits for it.
+    While the interpreter ends, the exception ends the requesting thread silently: nothing waits for it.
     """
     main = threading.main_thread()
     if not main.is_alive() and threading.get_ident() != main.ident:
@@ -302,18 +302,18 @@ def closed(what: str, hint: str) -> BaseException:
 
 
 def until_served(ask: Callable[[], R], timeout_s: float) -> R:
-    """Ask about a live map until the process that keeps it answers: it may be restarting.
+    """Repeat a request about a live map until its process, which may be restarting, answers.
 
     Raises
     ------
     LiveInterrupted
-        It did not within ``timeout_s`` seconds.
+        The process did not answer within ``timeout_s`` seconds.
     """
     end_s = time.monotonic() + timeout_s
     while True:
         try:
             return ask()
-        except LiveInterrupted:  # noqa: PERF203  that is what it is for
+        except LiveInterrupted:  # noqa: PERF203  retrying is the purpose
             if time.monotonic() >= end_s:
                 raise
             time.sleep(SERVED_PAUSE_S)

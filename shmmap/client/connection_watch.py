@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A connection's socket, and the thread that makes it, watches its connection, and closes it.
+"""A connection's socket, and the thread that creates, watches and closes it.
 
-The thread is where libzmq's parts belong because signal handlers run in the main thread alone: no handler's
-exception can leave a part behind that nothing refers to.  For the same reason it is started by one function
-that is built in, and is waited for in queues.  The thread lets no signal interrupt it: the kernel may give
-one to any thread, and a context whose end it interrupts stays, with a thread and five descriptors.
+libzmq's objects live in this thread because signal handlers run in the main thread alone: no handler's
+exception can leave an unreferenced object behind.  For the same reason a single built-in function starts the
+thread, and others wait for it through queues.  The thread blocks signals: the kernel may deliver a signal to
+any thread, and a context whose termination is interrupted stays, with a thread and five descriptors.
 
-Where the interpreter ends nothing is closed: another thread may be using the socket, and libzmq ends the
-process when one is closed under its user.  Python stops such threads, and the kernel closes what is open.
+When the interpreter ends, nothing is closed: another thread may be using the socket, and libzmq aborts the
+process if a socket is closed while in use.  Python stops such threads, and the kernel closes the descriptors.
 
-A thread may also outlive its owner, which did not stop it because an exception came when it ended: Python
-ends objects by functions written in Python, at whose first step a signal handler's exception may come.  The
-next connection stops such threads (`stop_orphans`).
+A thread may also outlive its owner.  Finalizers are Python functions, and a signal handler's exception may
+interrupt one before it has stopped the thread.  The next connection stops such threads (`stop_orphans`).
 """
 
 from __future__ import annotations
@@ -56,33 +55,33 @@ _EVENTS: Final = (
     | zmq.EVENT_MONITOR_STOPPED
 )
 _OURS: Final = frozenset({_signal.SIGBUS, _signal.SIGFPE, _signal.SIGILL, _signal.SIGSEGV})
-"""Signals that a thread brings upon itself; they are not to be put off."""
-_LAST_WORDS_MS: Final = 100  # closing may take this long to deliver a last message
+"""Signals that a thread's own faults cause; they must not be blocked."""
+_LAST_WORDS_MS: Final = 100  # time for a last message to be delivered on closing
 CONNECTION: Final = "a connection to the daemon"
 FILES: Final = 10
-"""Descriptors that libzmq needs (context, socket, monitor, connection), and one to map segments by."""
+"""Descriptors that libzmq needs (context, socket, monitor, connection), plus one for mapping segments."""
 THREADS: Final = 2
-"""Threads of libzmq for a context, beside the one that makes it."""
-_OVER_S: Final = 0.5  # a wait for the end looks again after this long, should another have waited, too
+"""Threads that libzmq starts for a context, besides the thread that creates it."""
+_OVER_S: Final = 0.5  # interval at which a wait for the end checks again, should another thread wait, too
 
 
 class Running(Protocol):
-    """What runs in a thread on behalf of an owner."""
+    """Work that runs in a thread on behalf of an owner."""
 
     @property
     def owner(self) -> weakref.ref[object]:
-        """The object that stops it."""
+        """The object that is responsible for stopping the thread."""
 
     def request_stop(self) -> None:
-        """Ask it to end, soon."""
+        """Ask the thread to end soon."""
 
 
 running: Final[set[Running]] = set()
-"""What runs in threads at present; each thread adds and removes its own."""
+"""Work that runs in threads at present; each thread adds and removes its own entry."""
 
 
 def enter(one: Running) -> None:
-    """Begin what runs in this thread; its owner may be gone already, and no connection may come later."""
+    """Register the work of this thread; stop it at once if its owner is already gone."""
     running.add(one)
     if one.owner() is None:
         one.request_stop()
@@ -96,49 +95,49 @@ def stop_orphans() -> None:
 
 
 def start_thread(run: Callable[..., object], *arguments: object) -> None:
-    """Start a thread by one function that is built in: no signal handler runs in the middle.
+    """Start a thread by a single built-in function: no signal handler can run in the middle.
 
     Raises
     ------
     LimitReached
         This process may have no more threads.
     SystemExit
-        The interpreter is ending, and starts none: the thread that asks ends, too, and quietly.
+        The interpreter is ending and starts no threads; the calling thread ends silently.
     """
     try:
         _thread.start_new_thread(run, arguments)
     except RuntimeError as error:
-        if "shutdown" in str(error):  # as Python calls it since 3.12
+        if "shutdown" in str(error):  # part of the message since Python 3.12
             raise SystemExit from None
         raise no_threads_left("no thread can be started: ") from None
 
 
 class ConnectionWatch:
-    """One socket, made and ended by a thread, and what libzmq said of its connection.
+    """One socket, created and closed by a thread, and the state of its connection as libzmq reports it.
 
     Parameters
     ----------
     owner
-        Uses the socket, and stops the thread.
+        The object that uses the socket and stops the thread.
     endpoint
-        What the socket connects to.
+        Endpoint to which the socket connects.
     options
-        Of the socket.
+        Options of the socket.
     waiting
-        Gets a None in each of these queues when the connection breaks; may change at any time.
+        Queues that receive None when the connection breaks; may change at any time.
     kind
-        Of socket.
+        Type of socket.
 
     Attributes
     ----------
     handshakes : int
-        How often the connection was made.
+        Number of times the connection was established.
     lost_since : float or None
-        `time.monotonic` of when it broke; None while it stands, and before it was first made.
+        `time.monotonic` when the connection broke; None while it stands, and before it was first established.
     hung_up : bool
-        The other side hung up before any handshake, and libzmq did not try again yet.
+        The peer closed the connection before any handshake, and libzmq has not retried yet.
     foreign : bool
-        What listens there speaks something else.
+        The peer does not speak the expected protocol.
 
     Raises
     ------
@@ -176,8 +175,8 @@ class ConnectionWatch:
 
     @property
     def socket(self) -> zmq.Socket[bytes]:
-        """For one thread at a time to send and receive."""
-        assert self._socket is not None  # noqa: S101  there is one where the constructor has returned
+        """Socket to send and receive with, for one thread at a time."""
+        assert self._socket is not None  # noqa: S101  set before the constructor returns
         return self._socket
 
     def wait_until_connected(self, timeout_s: float) -> None:
@@ -187,7 +186,7 @@ class ConnectionWatch:
                 self._connected.get(timeout=max(timeout_s, 0.0))
 
     def stop(self) -> None:
-        """Make the thread close the socket and end, and wait for it, unless this is that thread itself."""
+        """Make the thread close the socket and end; wait for that, unless called in that thread."""
         self.request_stop()
         while not self._elsewhere and _thread.get_ident() != self._thread and not self._ended:
             with contextlib.suppress(Empty):
@@ -200,13 +199,13 @@ class ConnectionWatch:
 
     def request_stop(self) -> None:
         """Make the thread close the socket and end."""
-        self._stopping = True  # where there is no socket yet, the thread looks at this when it has made it
+        self._stopping = True  # if there is no socket yet, the thread checks this after creating it
         while self._socket is not None and not self._ended and not self._elsewhere:
             try:
                 self._socket.disable_monitor()
             except zmq.error.InterruptedSystemCall:
                 continue
-            except zmq.ZMQError:  # the thread is at its end already
+            except zmq.ZMQError:  # the thread is already ending
                 return
             return
 
@@ -218,7 +217,7 @@ class ConnectionWatch:
                 ends.callback(running.discard, self)
                 enter(self)
                 check_threads(THREADS, CONNECTION)
-                # a context of our own: no other library's sockets can hold up its end
+                # a separate context: no other library's sockets can delay its termination
                 context = zmq.Context()
                 ends.callback(context.term)
                 socket = context.socket(kind)
@@ -232,9 +231,9 @@ class ConnectionWatch:
                 self._made.put(None)
                 if not self._stopping:
                     self._listen(monitor)
-        except zmq.ZMQError as error:  # the last descriptors went to others since they were counted
+        except zmq.ZMQError as error:  # other threads took the last descriptors since they were counted
             self._made.put(LimitReached(f"no connection to the daemon: {error.strerror or error}"))
-        except BaseException as error:  # noqa: BLE001  it is raised where the socket is waited for
+        except BaseException as error:  # noqa: BLE001  raised again by the thread that waits for the socket
             self._made.put(error)
         finally:
             self._ended = True

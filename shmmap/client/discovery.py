@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding the daemon, and saying exactly why it cannot be reached."""
+"""Find the daemon, or report exactly why it cannot be reached."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def candidates(
     *,
     instance: str | None = None,
 ) -> list[str]:
-    """Socket paths to try, in order: the one named, else those of the instance.
+    """Return the socket paths to try, in order: the given path, else those of the instance.
 
     Parameters
     ----------
     endpoint
         A socket path or an ``ipc://`` URL; a string without slash and point is an instance's name.
-        ``SHMMAP_ENDPOINT`` stands in for None.
+        None means ``SHMMAP_ENDPOINT``.
     environ
         Without an endpoint, ``SHMMAP_INSTANCE`` names the instance, ``SHMMAP_RUNTIME_DIR`` its directory.
     instance
@@ -97,8 +97,8 @@ def _checked(instance: str) -> str:
 def find_socket(paths: Sequence[str], deadline_s: float) -> str:
     """Return the first path at which a ZeroMQ peer answers.
 
-    A path that nothing listens at is passed over at once.  A daemon that is there but silent ends the
-    search: the next one might serve another map.
+    A path at which nothing listens is skipped at once.  A daemon that accepts but stays silent ends the
+    search: the next path might be that of another map.
 
     Parameters
     ----------
@@ -128,9 +128,9 @@ def find_socket(paths: Sequence[str], deadline_s: float) -> str:
 
 
 def check_socket(path: str, deadline_s: float) -> None:
-    """Connect to a socket once, to distinguish how that can fail.
+    """Connect to a socket once, to find out why a connection fails.
 
-    ZeroMQ itself connects in the background and never says why it does not succeed.
+    ZeroMQ itself connects in the background and never reports why it fails.
 
     Raises
     ------
@@ -139,11 +139,11 @@ def check_socket(path: str, deadline_s: float) -> None:
     SocketPermission
         This user may not connect.
     StaleSocket
-        Nothing listens any more, or what did ended before it answered.
+        No process listens any more, or the process ended before it answered.
     NoAnswer
-        Something listens, but sent nothing before the deadline.
+        A process listens, but sent nothing before the deadline.
     ProtocolMismatch
-        What listens does not speak ZeroMQ.
+        The process that listens does not speak ZeroMQ.
     """
     import socket  # with selectors, 4 ms: not at import
 
@@ -154,7 +154,7 @@ def check_socket(path: str, deadline_s: float) -> None:
             try:
                 probe.connect(path)
                 break
-            except BlockingIOError:  # its queue of connections is full; the kernel reports no more
+            except BlockingIOError:  # its backlog is full; the kernel reports nothing more
                 if time.monotonic() >= deadline_s:
                     raise _no_answer(path) from None
                 time.sleep(_FULL_S)
@@ -171,7 +171,7 @@ def check_socket(path: str, deadline_s: float) -> None:
             except ConnectionError:
                 part = b""
             received += part
-            if not received:  # a connection that had waited, for a daemon that ended or never started
+            if not received:  # the connection waited in the backlog of a daemon that ended or never started
                 raise StaleSocket(
                     f"{path}: a daemon that ended closed the connection without an answer",
                     hint="see its log, or `systemctl status shmmapd`: did it fail to start?",
@@ -184,10 +184,10 @@ def check_socket(path: str, deadline_s: float) -> None:
 
 
 def is_served(path: str) -> bool:
-    """Whether a daemon runs that has the request socket ``path``, without connecting to that.
+    """Return whether a daemon serves the request socket ``path``, without connecting to that socket.
 
-    A service manager may listen there for a daemon that does not run, and would start it; the socket of
-    events is made by daemons alone.
+    A service manager may listen at ``path`` for a daemon that does not run, and would start it on a
+    connection. So the events socket is checked instead, which only daemons create.
     """
     import socket
 
@@ -195,7 +195,7 @@ def is_served(path: str) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
         try:
             probe.connect(events)
-        except BlockingIOError:  # it has not got round to accepting
+        except BlockingIOError:  # it listens, but has not accepted yet
             return True
         except OSError:
             return False

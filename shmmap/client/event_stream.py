@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Following what happens in the daemon, without missing anything unnoticed.
+"""Follow the daemon's events; lost events are reported.
 
-Events arrive on a SUB socket, numbered.  Whatever is missing between two of them is asked for on the
-request socket, where the daemon remembers the last few thousand; what it does not remember any more
-is reported as `MissedEvents`.
+Numbered events arrive on a SUB socket.  Events missing between two numbers are requested on the request
+socket: the daemon remembers the last few thousand.  Events that it no longer remembers are reported as
+`MissedEvents`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from shmmap.protocol.events import UNNUMBERED, Beat, Event, EventPage, Recent, d
 __all__ = ["EventStream", "MissedEvents"]
 
 _TIMEOUT_S: Final = 5.0
-_SLICE_MS: Final = 100  # how often a wait looks whether another thread has closed the stream
+_SLICE_MS: Final = 100  # interval at which a wait checks whether another thread has closed the stream
 _QUEUE: Final = 4096  # events kept while the program does something else; the daemon remembers as many
 _RECONNECT_MS: Final = 20
 _RECONNECT_MAX_MS: Final = 500
@@ -48,9 +48,9 @@ _OPTIONS: Final = (
 
 
 class MissedEvents(msgspec.Struct, frozen=True):
-    """Events that are lost: numbers ``first`` to ``last`` of ``epoch``.
+    """Lost events: numbers ``first`` to ``last`` of ``epoch``.
 
-    What they reported has to be found out by asking for cells or metadata again.
+    To learn the current state, request the cells or metadata again.
     """
 
     epoch: int
@@ -62,7 +62,7 @@ Happening: TypeAlias = Event | MissedEvents
 
 
 class EventStream:
-    """What happens in the daemon, in order; for one thread, but any may close it.
+    """The daemon's events, in order.  One thread may iterate; any thread may close the stream.
 
     Iterating waits without bound; `next` has a timeout.  When the daemon is restarted the stream
     continues with the new epoch's events from the first one.
@@ -70,23 +70,23 @@ class EventStream:
     Parameters
     ----------
     endpoint
-        Request socket of the daemon, a path or an ``ipc://`` URL, or an instance's name; None looks in the
-        usual places.
+        Request socket of the daemon, a path or an ``ipc://`` URL, or an instance's name; None means the usual
+        places.
     instance
         Name of the daemon's instance, instead of an endpoint.
     since
-        Begin with what happened in the last ``since`` seconds, as far as the daemon remembers; None: now.
+        Begin with the events of the last ``since`` seconds, as far as the daemon remembers them; None: now.
     name
-        How this client appears in the daemon's lists.
+        Name of this client in the daemon's lists.
     timeout
-        Seconds that a question to the daemon may take.
+        Seconds that a request to the daemon may take.
 
     Attributes
     ----------
     epoch : int
-        The daemon's present run.
+        Identifier of the current daemon run.
     last_message_s : float
-        When a message last came from the daemon, `time.monotonic`; it sends one every second.
+        `time.monotonic` of the daemon's last message; it sends one every second.
 
     Raises
     ------
@@ -113,7 +113,7 @@ class EventStream:
         except BaseException:
             self._connection.close()
             raise
-        # also without a call of close(); not at the end of the program, where a thread may be using it
+        # runs also without close(); not at interpreter exit, where a thread may still use the socket
         self._finalizer = weakref.finalize(self, self._watch.stop)
         self._finalizer.atexit = False
         self._socket = self._watch.socket
@@ -159,7 +159,7 @@ class EventStream:
     def next(self, timeout: float | None = None) -> Happening | None:
         """Return the next event, or `MissedEvents`; None when nothing happened within ``timeout`` seconds.
 
-        None waits without bound, 0 takes what is there.
+        A timeout of None waits without bound; 0 returns only an event that has arrived.
         """
         deadline_s = None if timeout is None else time.monotonic() + number("timeout", timeout)
         while not self._ready:
@@ -175,7 +175,7 @@ class EventStream:
 
     @property
     def path(self) -> str:
-        """Where the daemon takes requests."""
+        """Path of the daemon's request socket."""
         return self._connection.path
 
     # --- numbers ----------------------------------------------------------------------------------
@@ -185,13 +185,13 @@ class EventStream:
         self.epoch, self._expected, self._highest = page.epoch, page.next, 0
         if since is not None:
             since_ns = int(max(time.time() - since, 0.0) * 1e9)
-            while not self._catch_up(after=0, since_ns=since_ns):  # it was restarted just now
+            while not self._catch_up(after=0, since_ns=since_ns):  # the daemon was restarted in between
                 self.epoch = self._ask(Recent(0, limit=0)).epoch
 
     def _take(self, data: bytes) -> None:
         self.last_message_s = time.monotonic()
         event = decode_event(data)
-        if event is None:  # a kind that this version does not know: its number counts
+        if event is None:  # an event type that this version does not know: only its number counts
             head = msgspec.msgpack.decode(data)
             number, epoch = int(head[1]), int(head[2])
         else:
@@ -217,16 +217,16 @@ class EventStream:
             self._expected = last + 1
 
     def _try_to_catch_up(self) -> bool:
-        """Fetch what is missing, False if it is of a previous run of the daemon.
+        """Fetch the missing events; return False if they are of a previous run of the daemon.
 
-        A daemon that does not answer now has more to say when it is back.
+        If the daemon does not answer, a later call fetches them.
         """
         with contextlib.suppress(NoAnswer):
             return self._catch_up(after=self._expected - 1)
         return True
 
     def _catch_up(self, *, after: int, since_ns: int = 0) -> bool:
-        """Fetch what the daemon remembers after this number; False if it is another epoch's."""
+        """Fetch the events after this number; return False if the daemon has another epoch."""
         while True:
             page = self._ask(Recent(0, after=after, since_unix_ns=since_ns))
             if page.epoch != self.epoch:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells that go from one process to another: what travels is the handle, and the other side attaches it.
+"""Pass cells between processes: pickle transfers the handle, and the receiver attaches it.
 
-So a pool of processes, a DataLoader, dask or ray send a few hundred bytes for a cell of megabytes.  Nothing
-but a mapping keeps a segment: until the other side has attached it, the sender has to keep its cell.
+So a process pool, a DataLoader, dask or ray send a few hundred bytes for a cell of megabytes.  Only a mapping
+keeps a segment in memory: the sender has to keep its cell until the receiver has attached it.
 
-What cannot be attached is a `StaleHandle`.  It is raised where it is unpickled, except by `multiprocessing`,
-whose pools and queues wait without end for a message that did not unpickle.  There the cell comes without its
-data, and raises the error when it is first used.
+A cell that cannot be attached raises `StaleHandle` when it is unpickled.  `multiprocessing` is an exception:
+its pools and queues would wait without bound for a message that failed to unpickle.  There the cell arrives
+without its data, and raises the error at its first use.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ _COPY_HINT: Final = (
 _PLUMBING: Final = frozenset(
     f"multiprocessing.{name}" for name in ("connection", "forkserver", "queues", "reduction", "spawn")
 )
-"""Modules that unpickle in a thread, and leave their caller waiting for what could not be."""
+"""Modules that unpickle in a thread, and leave their caller waiting if that fails."""
 
 
 class _Gone:
-    """Stands for the data of a cell that could not be attached."""
+    """Placeholder for the data of a cell that could not be attached."""
 
     def __init__(self, error: ShmmapError) -> None:
         self._error = error
@@ -56,7 +56,7 @@ class _Gone:
 
 @cache
 def _boot() -> str:
-    """Name this run of this machine, which containers share; empty where the kernel does not report it."""
+    """Return the kernel's boot id, which containers share; empty if the kernel does not report it."""
     try:
         with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:
             return file.read().strip()
@@ -65,7 +65,7 @@ def _boot() -> str:
 
 
 def hand_over(cell: Cell) -> tuple[Callable[..., Cell], tuple[Any, ...]]:
-    """Return what pickle makes a cell of: a function, and what it is called with."""
+    """Return the function and arguments with which pickle restores a cell."""
     attached, access = cell._attached, cell._access
     if access is None:  # a copy
         return _private, (cell.id, cell.handle(), attached.columns, attached.raw)
@@ -122,7 +122,7 @@ def _attached(access: Access, epoch: int, cell_id: str, handle: Handle, named: s
 
 
 def _loses_errors(frame: FrameType | None) -> bool:
-    """Whether it is `multiprocessing` itself that unpickles, and no program that it runs."""
+    """Return whether `multiprocessing` itself is unpickling, and not the program that it runs."""
     while frame is not None:
         module: str = frame.f_globals.get("__name__", "")
         if module.startswith("multiprocessing."):

@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 __all__ = ["CellInfo", "MapListing", "list_cells"]
 
-_ROUNDS: Final = 5  # how often a listing is begun again because the map changed meanwhile
+_ROUNDS: Final = 5  # how often a listing is restarted because the map changed meanwhile
 _PAGE_ROWS: Final = 10_000
 
 
 class CellInfo(NamedTuple):
     """One cell of the map; loaded or not.
 
-    ``box`` is (min_x, min_y, max_x, max_y), metres, map frame; ``z_bounds`` is None until the cell
-    was first loaded; ``source_bytes`` is the size of its file, ``version`` that of its ``points``.
+    ``box`` is (min_x, min_y, max_x, max_y), metres, map frame; ``z_bounds`` is None until the cell is first
+    loaded.  ``source_bytes`` is the size of its file, ``version`` the version of its ``points`` layer.
     """
 
     id: str
@@ -40,14 +40,14 @@ class CellInfo(NamedTuple):
 
 
 class MapListing(Sequence[CellInfo]):
-    """Cells of the map in id order, all from one map version; some ninety bytes for each.
+    """Cells of the map in id order, all from one map version; about 90 bytes per cell.
 
     Attributes
     ----------
     map_version : int
-        Give it as ``since`` next time, to get only what changed.
+        Pass it as ``since`` next time, to get only the changes.
     since_known : bool
-        False: the daemon did not know ``since`` any more, this is the whole list.
+        False: the daemon no longer knew ``since``, and this is the whole list.
     removed : tuple of str
         Ids that left the map after ``since``.
     """
@@ -119,7 +119,7 @@ def list_cells(
     since: int | None,
     most: int | None = None,
 ) -> MapListing:
-    """Ask for all pages of the daemon's list; see `shmmap.Client.metadata`.
+    """Request all pages of the daemon's list; see `shmmap.Client.metadata`.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def list_cells(
                     removed=tuple(session.whole_id(cell) for cell in page.removed),
                 )
             elif page.map_version != listing.map_version:
-                break  # a reload came in between: pages of two states do not fit together
+                break  # the map was reloaded in between: pages of two versions cannot be combined
             listing.add(page.rows)
             start = page.next if most is None or len(listing) <= most else None
         else:

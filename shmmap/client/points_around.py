@@ -20,9 +20,9 @@ __all__ = ["PointsAround", "points_around"]
 
 
 class PointsAround:
-    """Cells of a window that touch a circle, and which of their points lie in it.
+    """Cells that touch a circle, and the selection of their points that lie in it.
 
-    Nothing is copied, and no point is looked at, before `gather`, `mask` or `count` is called.
+    Nothing is copied, and no point is read, before `gather`, `mask` or `count` is called.
     Iterating gives the ``xyz`` of each cell as a whole: the points within the radius and those of
     border cells beyond it, zero-copy.
 
@@ -35,10 +35,10 @@ class PointsAround:
     cells : tuple of Cell
         Cells whose box touches the circle.
     whole : tuple of bool
-        For each of them, whether its box lies wholly in the circle.
+        For each cell, whether its box lies wholly in the circle.
     covered : bool
-        Whether these are all the cells that the map has there.  False where the circle reaches beyond what
-        the window's last answer was about, touches a cell that has failed, or while cells of the window are
+        Whether these are all cells that the map has in the circle.  False if the circle reaches beyond the
+        area of the window's last answer or touches a cell that has failed, or while cells of the window are
         being loaded: see `MapWindow.covers`.
     """
 
@@ -64,14 +64,14 @@ class PointsAround:
         return f"<PointsAround ({self.x:g}, {self.y:g}), {self.radius:g} m: {len(self.cells)} cells>"
 
     def __len__(self) -> int:
-        """How many cells."""
+        """Return the number of cells."""
         return len(self.cells)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         return (cell.xyz for cell in self.cells)
 
     def _check_points(self) -> None:
-        """Refuse layers whose rows are no points."""
+        """Raise `NoColumn` for layers whose rows are not points."""
         for cell in self.cells[:1]:
             if "xyz" not in cell.column_names:
                 raise NoColumn(
@@ -81,7 +81,7 @@ class PointsAround:
                 )
 
     def views(self, column: str = "xyz") -> list[NDArray[Any]]:
-        """Whole columns of the cells, one read-only view each; nothing is copied.
+        """Return a column of each cell as a whole, as read-only views; nothing is copied.
 
         Raises
         ------
@@ -91,14 +91,14 @@ class PointsAround:
         return [cell[column] for cell in self.cells]
 
     def mask(self, index: int) -> NDArray[np.bool_]:
-        """Which points of cell number ``index`` lie in the circle, (N,) bool.
+        """Return which points of cell number ``index`` lie in the circle, (N,) bool.
 
         Distances are computed in float64, whatever the dtype of the coordinates.
 
         Raises
         ------
         NoColumn
-            The layer's rows are no points: it has no column ``xyz``.
+            The layer's rows are not points: it has no column ``xyz``.
         """
         self._check_points()
         cell = self.cells[index]
@@ -114,12 +114,12 @@ class PointsAround:
         return inside
 
     def count(self) -> int:
-        """How many points lie in the circle.
+        """Return the number of points in the circle.
 
         Raises
         ------
         NoColumn
-            The layer's rows are no points: it has no column ``xyz``.
+            The layer's rows are not points: it has no column ``xyz``.
         """
         self._check_points()
         return sum(
@@ -149,7 +149,7 @@ class PointsAround:
         Returns
         -------
         array or dict of array
-            Of one column its values; of several a dict by name, whose rows belong together.
+            For one column its values; for several a dict by name, with corresponding rows.
 
         Raises
         ------
@@ -165,7 +165,7 @@ class PointsAround:
 
 
 def _farthest_in_boxes(x: float, y: float, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance in metres from a point to the farthest point of each box ((N, 4) float64), as (N,)."""
+    """Return the distance from a point to the farthest point of each box ((N, 4) float64), (N,) metres."""
     dx = np.maximum(np.abs(boxes[:, 0] - x), np.abs(boxes[:, 2] - x))
     dy = np.maximum(np.abs(boxes[:, 1] - y), np.abs(boxes[:, 3] - y))
     distance: NDArray[np.float64] = np.hypot(dx, dy)
@@ -197,7 +197,7 @@ def points_around(
     Raises
     ------
     BadRequest
-        The circle makes no sense (not finite, negative radius).
+        The circle is invalid (not finite, negative radius).
     """
     Circle(x, y, radius)
     near = np.flatnonzero(distance_to_boxes(x, y, boxes) <= radius)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all requests of one client share: the connection, the attached cells, a lock, and fork.
+"""State that all requests of one client share: connection, attached cells, lock, and handling of forks.
 
-A request for cells is over when its handles are attached: what went stale meanwhile is asked for again.
+A request for cells is complete when its handles are attached; handles that became stale meanwhile are
+requested again.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ __all__ = ["Session"]
 
 R = TypeVar("R")
 
-_STALE_ROUNDS: Final = 5  # how often a handle that went stale before it was attached is asked for again
-_MAX_STALE_WAIT_S: Final = 5.0  # that such a request lets the daemon wait
+_STALE_ROUNDS: Final = 5  # how often a handle that became stale before it was attached is requested again
+_MAX_STALE_WAIT_S: Final = 5.0  # longest wait that such a request allows the daemon
 
 
 class Session:
-    """One client's session; one request is on its way at a time, other threads wait for it.
+    """One client's session; requests are sent one at a time, other threads wait.
 
     After a fork the child begins a session of its own with its first request; the parent's
     connection is not touched.
@@ -51,18 +52,18 @@ class Session:
     connect_timeout_s
         How long `Welcome` may take.
     name
-        How the program appears in the daemon's lists; empty: by its own name.
+        Name of this client in the daemon's lists; empty: the name of its program.
     shm_dir
-        Directory of the segments; empty: as the daemon says.
+        Directory of the segments; empty: the directory that the daemon reports.
 
     Attributes
     ----------
     welcome : Welcome
-        What the daemon said when the session began.
+        The daemon's message when the session began.
     map_version : int
-        Of the last reply about cells.
+        State of the map in the last reply about cells.
     attacher : Attacher
-        Knows what is mapped.
+        Attaches cells and records mapped segments.
     """
 
     def __init__(
@@ -97,15 +98,15 @@ class Session:
 
     @property
     def lost_since(self) -> float | None:
-        """`time.monotonic` of when the connection broke; None while it stands, or has yet to be made."""
+        """`time.monotonic` when the connection broke; None while it stands, or before it is established."""
         return self._connection.lost_since if self._connection is not None else None
 
     def notify_when_lost(self, queue: SimpleQueue[Any]) -> None:
-        """Put a None into a queue from now on when the connection breaks."""
+        """From now on put None into this queue when the connection breaks."""
         self._waiting.append(queue)
 
     def stop_notifying(self, queue: SimpleQueue[Any]) -> None:
-        """End `notify_when_lost`; may be repeated."""
+        """Undo `notify_when_lost`; may be repeated."""
         if queue in self._waiting:
             self._waiting.remove(queue)
 
@@ -121,7 +122,7 @@ class Session:
         Raises
         ------
         BadRequest
-            This is a signal handler that has interrupted a request.
+            A signal handler that interrupted a request calls this.
         """
         if self._lock.locked():
             _check_not_within_a_turn(self)
@@ -129,14 +130,14 @@ class Session:
             connection = self._connection
             if not self._closed and connection is not None:
                 self._report_unmapped(connection)
-                if not self.attacher.any_mapped:  # else the daemon should still know its holder
+                if not self.attacher.any_mapped:  # else the daemon should keep this process as a holder
                     connection.send(messages.Bye(connection.new_request()))
             self._closed = True
             if connection is not None:
                 connection.close()
 
     def _in_turn(self, timeout_s: float, work: Callable[[Connection], R]) -> R:
-        """Use the connection for one request, when no other thread does any more."""
+        """Wait until no other thread uses the connection, then use it for one request."""
         if self._lock.locked():
             _check_not_within_a_turn(self)
         entered = False
@@ -164,10 +165,10 @@ class Session:
         quiet_s: float = 0.0,
         timeout_s: float | None = None,
     ) -> R:
-        """Send the request that ``make`` builds for a request id; returns its reply.
+        """Send the request that ``make`` builds for a request id; return its reply.
 
-        ``quiet_s`` is how long the daemon may be busy with it, during which silence means nothing,
-        ``timeout_s`` how long the reply may take beyond that, instead of the session's own.
+        ``quiet_s`` is how long the daemon may work on the request, during which silence is normal.
+        ``timeout_s`` is how long the reply may take beyond that, instead of the session's own timeout.
         """
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
 
@@ -188,18 +189,18 @@ class Session:
         populate: bool = False,
         timeout_s: float | None = None,
     ) -> CellSet:
-        """Send a request for cells and attach what it brings.
+        """Send a request for cells and attach the cells of its reply.
 
         Parameters
         ----------
         wait_s
-            What the request lets the daemon wait.
+            Seconds that the request lets the daemon wait.
         removed
-            Makes ids of the reply's two lists of removals.
+            Returns the removed ids from the reply's two lists of removals.
         populate
-            Let the kernel map every page now.
+            Map every page now, not at first access.
         timeout_s
-            Instead of the session's own.
+            Replaces the session's own timeout.
         """
         quiet_s = wait_s or 0.0
         all_s = (self.timeout_s if timeout_s is None else timeout_s) + quiet_s
@@ -217,7 +218,7 @@ class Session:
                 if not answer.gone or time.monotonic() >= deadline_s:
                     break
                 answer.ask_again(connection, deadline_s)
-                if answer.gone:  # not at first: a daemon that ends takes all its segments away
+                if answer.gone:  # not at first: a daemon that ends removes all its segments
                     check_visible(
                         self._shm_dir or connection.welcome.shm_dir, connection.welcome.segment_prefix
                     )
@@ -237,7 +238,7 @@ class Session:
         populate: bool = False,
         timeout_s: float | None = None,
     ) -> CellSet:
-        """Ask for the cells of an area that are not held, see `shmmap.Client.differential`."""
+        """Request the cells of an area that are not held; see `shmmap.Client.differential`."""
         message = messages.area_to_message(area)
         return self.ask_cells(
             lambda n: messages.Differential(n, message, layers, held.named, held.packed, wait_s, intent),
@@ -248,11 +249,11 @@ class Session:
         )
 
     def report_unmapped(self) -> int:
-        """Report to the daemon what was unmapped since the last request; returns how many versions."""
+        """Report to the daemon the versions unmapped since the last request; return how many."""
 
         def work(connection: Connection) -> int:
             reported = self._reported
-            # the reply to this one means that the report before it has arrived
+            # the reply to this request means that the report before it has arrived
             connection.ask(
                 messages.Release(connection.new_request(), b""), messages.Released, timeout_s=self.timeout_s
             )
@@ -268,7 +269,7 @@ class Session:
             versions.clear()
 
     def whole_id(self, cell_id: str) -> str:
-        """Return the cell id of what a reply carries."""
+        """Return the full cell id of an id that a reply contains."""
         return cell_id if cell_id.startswith("/") else self.welcome.id_prefix + cell_id
 
     def _attach(self, handle: Handle, connection: Connection, populate: bool) -> Cell:
@@ -289,7 +290,7 @@ class Session:
 
     def _restart_in_child(self) -> None:
         if self._connection is not None:
-            # left alone, and kept, so that nothing here tries to end the parent's sockets
+            # referenced, but unused, so that this process never closes the parent's sockets
             self._inherited.append(self._connection)
             self._connection = None
         self._lock = threading.Lock()
@@ -298,14 +299,14 @@ class Session:
 
 
 class _ReplyCells:
-    """Cells of one reply while they are attached, each at its place in it.
+    """Cells of one reply while they are being attached, each at its place in the reply.
 
     Parameters
     ----------
     attach
-        Makes a cell of a handle; `StaleHandle` and `SegmentCorrupt` cost that cell only.
+        Makes a cell from a handle; `StaleHandle` and `SegmentCorrupt` affect that cell only.
     whole_id
-        Makes a cell's id of what replies carry.
+        Makes the full cell id from an id in a reply.
 
     Attributes
     ----------
@@ -322,11 +323,11 @@ class _ReplyCells:
         self.gone: list[tuple[int, Handle]] = []
 
     def take(self, reply: messages.Cells, places: Iterable[int]) -> None:
-        """Attach a reply's handles at these places; note what went stale meanwhile and what failed."""
+        """Attach a reply's handles at these places; record which became stale meanwhile and which failed."""
         for place, handle in zip(places, reply.cells, strict=True):
             try:
                 self._cells[place] = self._attach(handle)
-            except StaleHandle:  # noqa: PERF203  one cell must not cost the others
+            except StaleHandle:  # noqa: PERF203  one cell must not affect the others
                 self.gone.append((place, handle))
             except SegmentCorrupt as error:
                 cell_id = self._whole(handle.id)
@@ -343,7 +344,7 @@ class _ReplyCells:
         ]
 
     def ask_again(self, connection: Connection, deadline_s: float) -> None:
-        """Ask again for the handles whose segments were gone before they could be attached."""
+        """Request again the handles whose segments were gone before they could be attached."""
         gone, self.gone = self.gone, []
         places: dict[tuple[str, str], list[int]] = {}
         for place, handle in gone:
@@ -373,7 +374,7 @@ class _ReplyCells:
         reply: messages.Cells,
         removed: Callable[[Sequence[str], bytes], tuple[str, ...]] | None,
     ) -> CellSet:
-        """Return the answer; what is still gone counts as pending."""
+        """Return the answer; cells whose segments are still gone count as pending."""
         self._pending += [PendingLayer(self._whole(handle.id), handle.layer) for _, handle in self.gone]
         return CellSet(
             tuple(self._cells[place] for place in sorted(self._cells)),
@@ -389,14 +390,15 @@ class _ReplyCells:
 
 
 class _Turn:
-    """A turn to use the connection, taken and given back whatever exception a signal handler raises.
+    """Exclusive use of the connection, released whatever exception a signal handler raises.
 
-    A context manager that waits at most ``timeout_s`` for its lock; entering it later raises `StopIteration`.
+    A context manager that waits at most ``timeout_s`` for its lock; after that, entering raises
+    `StopIteration`.
 
-    Python runs signal handlers between the steps of its interpreter.  A ``with`` enters its block in the
-    same step in which what it calls returns, and leaves it likewise, if that is built in: no handler's
-    exception can come when the lock is taken and the block not entered, or left and the lock still taken.
-    So entering and leaving are no methods here but built-in functions, which each object has in its slots.
+    Python runs signal handlers between interpreter steps.  If ``__enter__`` and ``__exit__`` are built-in
+    functions, a ``with`` calls them and enters or leaves its block in the same step.  So no handler's
+    exception can arrive while the lock is taken outside the block.  Therefore both are not methods here but
+    built-in functions, which each object holds in its slots.
     """
 
     __slots__ = ("__enter__", "__exit__")
@@ -405,7 +407,7 @@ class _Turn:
     __exit__: Callable[..., None]
 
     def __init__(self, lock: threading.Lock, timeout_s: float) -> None:
-        # the False of a wait in vain is left out, and there is no next
+        # False, after a timeout, is filtered out, and there is no next element
         self.__enter__ = filter(None, map(lock.acquire, (True,), (timeout_s,))).__next__
         self.__exit__ = lock.__exit__
 
@@ -414,12 +416,12 @@ _TURNS: Final = (Session._in_turn.__code__, Session.close.__code__)
 
 
 def _check_not_within_a_turn(session: Session) -> None:
-    """Refuse a turn inside of a turn: it would wait for itself.
+    """Refuse a nested `_Turn` in one thread, which would be a deadlock.
 
     Raises
     ------
     BadRequest
-        This thread is in one of the session's already.
+        This thread is already in a `_Turn` of the session.
     """
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
@@ -432,7 +434,7 @@ def _check_not_within_a_turn(session: Session) -> None:
 
 
 _sessions: Final[list[weakref.ref[Session]]] = []
-"""All there are; not a weak set, which runs functions in Python when one ends (`shmmap.client.attaching`)."""
+"""All sessions; not a weak set, which runs Python code when a member ends (`shmmap.client.attaching`)."""
 
 
 def _after_fork_in_child() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where, with what intent, and what the client has already: the parts that requests for cells share."""
+"""Common parts of requests for cells: the area, the client's intent, and the cells it holds already."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = [
 ]
 
 FURTHEST_M: Final = 1e150
-"""Place and radius of a sphere are less, metres: so that their squares are numbers."""
+"""Bound of a sphere's centre and radius, metres, so that their squares stay finite."""
 MAX_VERTICES: Final = 4096
-"""Of a route, as it may be sent; the daemon goes by its beginning."""
+"""Most vertices of a route in a message; the daemon uses only the first ones."""
 
 
 class CircleMessage(msgspec.Struct, array_like=True, tag="circle", frozen=True):
-    """True circle; no z range where its bounds are nil."""
+    """True circle; without a z range if its bounds are nil."""
 
     x: float
     y: float
@@ -62,7 +62,7 @@ class BoxMessage(msgspec.Struct, array_like=True, tag="box", frozen=True):
 
 
 class SphereMessage(msgspec.Struct, array_like=True, tag="sphere", frozen=True):
-    """Voxels whose middles are within ``radius`` of a place; metres."""
+    """Voxels whose centres are within ``radius`` of a place; metres."""
 
     x: float
     y: float
@@ -76,7 +76,7 @@ LiveArea: TypeAlias = BoxMessage | SphereMessage
 
 
 def area_from_message(message: AreaMessage) -> geometry.Area:
-    """Return the area a message describes; `BadRequest` if it makes no sense."""
+    """Return the area that a message describes; raise `BadRequest` if it is invalid."""
     z = None
     if (message.z_min is None) != (message.z_max is None):
         raise BadRequest("a z range needs both bounds", hint="give z_min and z_max, or neither")
@@ -102,9 +102,9 @@ def area_to_message(area: geometry.Area) -> AreaMessage:
 
 
 class Intent(msgspec.Struct, array_like=True, frozen=True):
-    """Where a client is and where it goes: metres and metres per second, map frame.
+    """Pose, velocity and route of a client: metres and metres per second, map frame.
 
-    ``route`` is the polyline ahead, (x, y) each.
+    ``route`` is the polyline ahead, a sequence of (x, y).
     """
 
     x: float
@@ -116,9 +116,9 @@ class Intent(msgspec.Struct, array_like=True, frozen=True):
 
 
 class HeldCell(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """A cell the client says it has: version nil means "the current one", layers nil "all asked for".
+    """A cell that the client holds: version nil means the current one, layers nil all requested ones.
 
-    A version stands for the layer that has it, of those named or asked for.
+    A version identifies the layer that has it, among the named or requested layers.
     """
 
     id: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to bytes and back; whatever does not decode is a `BadRequest` or a `ProtocolMismatch`."""
+"""Encode and decode messages; invalid bytes raise `BadRequest` or `ProtocolMismatch`."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ __all__ = [
 ]
 
 MAX_REQUEST_BYTES: Final = 4 << 20
-"""Larger requests are refused by the socket itself: 10^5 packed held cells fit 800 kB."""
+"""Largest request; the socket itself refuses larger ones.  10^5 packed held cells need 800 kB."""
 
 
 def _plain(value: object) -> object:
-    """Numbers that numpy computed (a pose, a radius) travel as the plain numbers they are."""
+    """Convert numpy numbers (a pose, a radius) to plain numbers for encoding."""
     item = getattr(value, "item", None)
     if item is None or getattr(value, "shape", None) != ():
         raise TypeError(f"a message cannot carry {type(value).__name__}")
@@ -44,7 +44,7 @@ encode: Final = _encoder.encode
 
 
 def encode_request(message: Request) -> bytes:
-    """Return a request's bytes; `BadRequest` of one that no daemon takes: it would end the connection."""
+    """Return a request's bytes; raise `BadRequest` if it is too large, which would end the connection."""
     data = encode(message)
     if len(data) > MAX_REQUEST_BYTES:
         raise BadRequest(
@@ -54,7 +54,7 @@ def encode_request(message: Request) -> bytes:
     return data
 
 
-@cache  # made when it is first needed: a client never decodes requests, and importing it should be cheap
+@cache  # created at first use: a client never decodes requests, and imports should be cheap
 def _requests() -> msgspec.msgpack.Decoder[Request]:
     return msgspec.msgpack.Decoder(Request)
 
@@ -65,12 +65,12 @@ def _replies() -> msgspec.msgpack.Decoder[Reply]:
 
 
 def encode_handle(handle: Handle) -> bytes:
-    """Return a handle's bytes, to be reused in every reply that carries it."""
+    """Return a handle's bytes, to be reused in every reply that contains it."""
     return _encoder.encode(handle)
 
 
 class PackedArray:
-    """An array of a message, encoded a part at a time: very many elements at once take long."""
+    """An array of a message, encoded in parts, since many elements at once would take too long."""
 
     def __init__(self, elements: Sequence[object] = ()) -> None:
         self._count = 0
@@ -78,13 +78,13 @@ class PackedArray:
         self.add(elements)
 
     def add(self, elements: Sequence[object]) -> None:
-        """Encode some more elements."""
+        """Encode and append elements."""
         if elements:
             self._count += len(elements)
             self._parts.append(encode(elements)[len(_head(len(elements))) :])
 
     def add_encoded(self, elements: Sequence[bytes]) -> None:
-        """Add elements that are encoded already."""
+        """Append elements that are encoded already."""
         self._count += len(elements)
         self._parts.append(b"".join(elements))
 
@@ -118,7 +118,7 @@ def encode_cells(
     *,
     reason: str = "",
 ) -> bytes:
-    """Return a `Cells` reply put together from what is encoded already."""
+    """Return a `Cells` reply assembled from encoded parts."""
     start = encode(("cells", request, epoch, map_version))
     dropped = encode((removed, removed_packed))
     end = encode((layers, covered, reason))
@@ -128,7 +128,7 @@ def encode_cells(
 
 
 def decode_request(data: bytes | memoryview) -> Request:
-    """Return the request; `BadRequest` says at which element it is wrong."""
+    """Return the request; raise `BadRequest` that names the invalid element."""
     try:
         return _requests().decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
@@ -136,7 +136,7 @@ def decode_request(data: bytes | memoryview) -> Request:
 
 
 def request_number(data: bytes | memoryview) -> int:
-    """Return the request id of a message that does not decode as a whole; 0 where there is none."""
+    """Return the request id of a message that does not decode as a whole; 0 if it has none."""
     try:
         start = msgspec.msgpack.decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
@@ -153,14 +153,14 @@ def pack_versions(versions: Iterable[int]) -> bytes:
 
 
 def unpack_versions(packed: bytes) -> tuple[int, ...]:
-    """Read packed cell versions; `BadRequest` if they are no multiple of 8 bytes."""
+    """Return packed cell versions; raise `BadRequest` if their size is no multiple of 8 bytes."""
     if len(packed) % 8:
         raise BadRequest(f"packed versions of {len(packed)} bytes are no multiple of 8")
     return struct.unpack(f"<{len(packed) // 8}Q", packed)
 
 
 def decode_reply(data: bytes | memoryview) -> Reply:
-    """Return the reply; `ProtocolMismatch` if it is none of this protocol version."""
+    """Return the reply; raise `ProtocolMismatch` if it is not one of this protocol version."""
     try:
         return _replies().decode(data)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:

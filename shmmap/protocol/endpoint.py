@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the daemon listens, and where clients look for it."""
+"""Paths at which the daemon listens and clients look for it."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ __all__ = [
 DEFAULT_INSTANCE: Final = "default"
 SYSTEM_RUNTIME_DIR: Final = "/run/shmmap"
 EVENTS_LONGER: Final = len(".events")
-"""By how much the path of the socket of events is longer than that of requests."""
+"""Bytes by which the path of the events socket is longer than that of the request socket."""
 _SUN_PATH_BYTES: Final = 107  # sizeof(sockaddr_un.sun_path) - 1 on Linux
 
 
 def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
-    """Directories a client looks in, in order: the user's own, then the system's.
+    """Return the directories that a client searches, in order: the user's own, then the system's.
 
-    ``XDG_RUNTIME_DIR`` is ignored where it is not absolute, as its specification says.  The directory in
-    /tmp counts where it is there and belongs to this user.
+    ``XDG_RUNTIME_DIR`` is ignored if it is not absolute, as its specification demands.  The directory in /tmp
+    is included if it exists and belongs to this user.
     """
     own = environ.get("XDG_RUNTIME_DIR", "")
     found = [f"{own}/shmmap"] if own.startswith("/") else []
@@ -43,12 +43,12 @@ def runtime_dirs(environ: Mapping[str, str] = os.environ) -> tuple[str, ...]:
 
 
 def fallback_runtime_dir() -> str:
-    """Where a user's daemon has its socket without ``XDG_RUNTIME_DIR``, in an ssh session, say."""
+    """Return the directory of a user's sockets without ``XDG_RUNTIME_DIR``, as in some ssh sessions."""
     return f"/tmp/shmmap-{os.geteuid()}"  # noqa: S108  its owner is checked
 
 
 def why_not_private(directory: str) -> str:
-    """Return why a directory that any user could have made is not this user's own; empty where it is."""
+    """Return why a directory in /tmp is not private to this user; empty if it is."""
     try:
         status = os.lstat(directory)
     except OSError as error:
@@ -63,7 +63,7 @@ def why_not_private(directory: str) -> str:
 
 
 def socket_path(runtime_dir: str, instance: str = DEFAULT_INSTANCE) -> str:
-    """Path of the instance's request socket."""
+    """Return the path of the instance's request socket."""
     return f"{runtime_dir.rstrip('/')}/{instance}.sock"
 
 
@@ -75,7 +75,7 @@ def endpoint_path(endpoint: str, *, longer: int = 0) -> str:
     endpoint
         The path or URL.
     longer
-        How many bytes a name beside it is longer, which must fit into a socket address, too.
+        Bytes by which a neighbouring name is longer; that name must fit into a socket address, too.
 
     Raises
     ------

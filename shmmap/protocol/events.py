@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The events that the daemon publishes.  ``PROTOCOL.md`` is the byte-exact document.
+"""The events that the daemon publishes.  ``PROTOCOL.md`` is the byte-exact specification.
 
-An event is one MessagePack array: its kind, its number, the epoch it belongs to, when it happened, and
-what happened.  Events of one epoch are numbered from 1 without gaps, so that a missed one is noticed;
-`UNNUMBERED` ones have the number of the last that is.
+An event is one MessagePack array: kind, number, epoch, time, and the fields of the kind.  Events of one epoch
+are numbered from 1 without gaps, so that a lost event is noticed.  `UNNUMBERED` events repeat the number of
+the last numbered one.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 
 
 class _Numbered(msgspec.Struct, array_like=True, frozen=True):
-    """Every event's number in its epoch, its epoch, and the wall clock when it happened."""
+    """Fields of every event: its number in its epoch, its epoch, and the wall-clock time."""
 
     seq: int
     epoch: int
@@ -52,7 +52,7 @@ class _Numbered(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Epoch(_Numbered, tag="epoch", frozen=True):
-    """A run of the daemon: ``what`` is started or stopping; segments taken over from the previous run."""
+    """A daemon run: ``what`` is started or stopping; counts segments taken over from the previous run."""
 
     what: str
     map_version: int
@@ -61,10 +61,10 @@ class Epoch(_Numbered, tag="epoch", frozen=True):
 
 
 class Loaded(_Numbered, tag="loaded", frozen=True):
-    """A segment can be handed out; ``load_ns`` is 0 for one that was retired, still whole and wanted again.
+    """A segment is available; ``load_ns`` is 0 for an intact retired segment that was requested again.
 
-    ``again`` says that this very version had been evicted to make room; ``replaces`` is the version
-    that it supersedes, 0 for none; ``ahead`` that it was prefetched.
+    ``again``: this version had been evicted to make room.  ``replaces``: the version that it supersedes, 0
+    for none.  ``ahead``: it was prefetched.
     """
 
     id: str
@@ -79,7 +79,7 @@ class Loaded(_Numbered, tag="loaded", frozen=True):
 
 
 class Changed(_Numbered, tag="changed", frozen=True):
-    """A cell's source: ``how`` is changed, added, removed or moved; version 0 for a removed one."""
+    """A cell's source changed: ``how`` is changed, added, removed or moved; version 0 if removed."""
 
     id: str
     version: int
@@ -87,7 +87,7 @@ class Changed(_Numbered, tag="changed", frozen=True):
 
 
 class Evicted(_Numbered, tag="evicted", frozen=True):
-    """A segment is handed out no more: ``why`` is room, request, map (its cell left) or damaged."""
+    """A segment left service: ``why`` is room, request, map (its cell left the map) or damaged."""
 
     id: str
     layer: str
@@ -97,7 +97,7 @@ class Evicted(_Numbered, tag="evicted", frozen=True):
 
 
 class Failed(_Numbered, tag="failed", frozen=True):
-    """A cell could not be loaded; it is not tried again for ``retry_s`` seconds, unless its file changes."""
+    """A cell could not be loaded; the next try is after ``retry_s`` seconds, or when its file changes."""
 
     id: str
     layer: str
@@ -107,7 +107,7 @@ class Failed(_Numbered, tag="failed", frozen=True):
 
 
 class Retried(_Numbered, tag="retried", frozen=True):
-    """A cell that failed is loaded again because it was requested; ``code`` of the failure."""
+    """A failed cell is loaded again because of a request; ``code`` is that of the failure."""
 
     id: str
     layer: str
@@ -115,10 +115,10 @@ class Retried(_Numbered, tag="retried", frozen=True):
 
 
 class Pressure(_Numbered, tag="pressure", frozen=True):
-    """Cells were refused because memory is full: how many since the last such event, and one of them.
+    """Cells were refused because memory is full: their number since the last such event, and an example.
 
-    ``code`` is over_budget, no_space, or quota: the client would keep too much for itself alone.  At
-    most one a second.
+    ``code`` is over_budget, no_space, or quota (one client alone would hold too much).  At most one such
+    event per second.
     """
 
     id: str
@@ -132,9 +132,9 @@ class Pressure(_Numbered, tag="pressure", frozen=True):
 
 
 class PrefetchMiss(_Numbered, tag="prefetch_miss", frozen=True):
-    """A moving client had to wait for cells: how many since the last such event, and one of them.
+    """A moving client had to wait for cells: their number since the last such event, and an example.
 
-    At most one a second for each client.
+    At most one such event per second and client.
     """
 
     session: int
@@ -146,7 +146,7 @@ class PrefetchMiss(_Numbered, tag="prefetch_miss", frozen=True):
 
 
 class Reloaded(_Numbered, tag="reload", frozen=True):
-    """The map's catalogue was read again; ``error`` says why that failed.
+    """The map's catalogue was read again; ``error`` is the reason if that failed.
 
     The first ``listed`` of its changes follow as `Changed`.
     """
@@ -162,7 +162,8 @@ class Reloaded(_Numbered, tag="reload", frozen=True):
 class LongTurn(_Numbered, tag="long_turn", frozen=True):
     """A turn of the daemon's loop took ``cpu_ns`` of processor time, more than it should.
 
-    ``kind`` is what took most of it, see `shmmap.statistics.counters.TURN_KINDS`; at most one a second.
+    ``kind`` is the work that took most of it, see `shmmap.statistics.counters.TURN_KINDS`; at most one such
+    event per second.
     """
 
     kind: str
@@ -170,7 +171,7 @@ class LongTurn(_Numbered, tag="long_turn", frozen=True):
 
 
 class Joined(_Numbered, tag="joined", frozen=True):
-    """A client opened a session; pid 0 where the kernel does not say."""
+    """A client opened a session; pid is 0 if the kernel does not report it."""
 
     session: int
     pid: int
@@ -179,7 +180,7 @@ class Joined(_Numbered, tag="joined", frozen=True):
 
 
 class Left(_Numbered, tag="left", frozen=True):
-    """A session ended; ``bytes`` is what it held."""
+    """A session ended; ``bytes`` is the memory that it held."""
 
     session: int
     pid: int
@@ -201,14 +202,14 @@ class LiveEnded(_Numbered, tag="live_ended", frozen=True):
 
 
 class LiveProblem(_Numbered, tag="live_problem", frozen=True):
-    """Chunks of a live map cannot be loaded or saved, and why; an empty reason: the problem is over."""
+    """Chunks of a live map cannot be loaded or saved; an empty reason means that the problem is over."""
 
     map: str
     problem: str
 
 
 class LiveDamaged(_Numbered, tag="live_damaged", frozen=True):
-    """A damaged file of a live map was quarantined, or a chunk is missing: which, and why."""
+    """A damaged file of a live map was quarantined, or a chunk is missing; with its name and the reason."""
 
     map: str
     what: str
@@ -217,7 +218,7 @@ class LiveDamaged(_Numbered, tag="live_damaged", frozen=True):
 class LiveChanged(_Numbered, tag="live_changed", frozen=True):
     """A live map has changed; ``change`` is the number of its last change, as in `LiveChunkPage`.
 
-    Sent at most twice a second for a map, and not remembered: the next one follows.
+    Sent at most twice per second and map.  The daemon does not remember these events.
     """
 
     map: str
@@ -225,9 +226,9 @@ class LiveChanged(_Numbered, tag="live_changed", frozen=True):
 
 
 class Beat(_Numbered, tag="beat", frozen=True):
-    """Nothing happened: ``seq`` is the last event's number.
+    """Heartbeat: ``seq`` is the last event's number.
 
-    Sent at a subscription, and once a second, so that a missed last event is noticed too.
+    Sent at a subscription and once per second, so that the loss of the last event is noticed, too.
     """
 
 
@@ -254,11 +255,11 @@ Event: TypeAlias = (
 
 
 UNNUMBERED: Final = (LiveChanged, Beat)
-"""Kinds that take no number: ``seq`` is the last event's, and the daemon does not remember them."""
+"""Kinds without their own number, which the daemon does not remember; ``seq`` is the last event's."""
 
 
 class Recent(msgspec.Struct, array_like=True, tag="recent"):
-    """Events the daemon remembers: those numbered above ``after``, and not older than ``since_unix_ns``."""
+    """Request remembered events: those numbered above ``after``, and not older than ``since_unix_ns``."""
 
     request: int
     after: int = 0
@@ -269,8 +270,8 @@ class Recent(msgspec.Struct, array_like=True, tag="recent"):
 class EventPage(msgspec.Struct, array_like=True, tag="events"):
     """Answer to `Recent`, oldest first.
 
-    ``first`` is the number of the oldest event remembered, ``next`` the number the next one will
-    get.  Ask again with ``after`` = number of the last one here until there are no more.
+    ``first`` is the number of the oldest remembered event, ``next`` that of the next event.  Repeat the
+    request with ``after`` = number of the last event of the page until a page is empty.
     """
 
     request: int
@@ -284,18 +285,18 @@ _encoder: Final = msgspec.msgpack.Encoder()
 encode_event: Final = _encoder.encode
 
 
-@cache  # made when it is first needed: most clients subscribe to no events
+@cache  # created at first use: most clients subscribe to no events
 def _events() -> msgspec.msgpack.Decoder[Event]:
     return msgspec.msgpack.Decoder(Event)
 
 
 def decode_event(data: bytes | memoryview | msgspec.Raw) -> Event | None:
-    """Return the event; None for a kind that this version does not know.
+    """Return the event; None if this version does not know its kind.
 
     Raises
     ------
     ProtocolMismatch
-        It is no event.
+        The data is no event.
     """
     try:
         return _events().decode(data)

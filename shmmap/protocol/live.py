@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps on the wire: what mappers and readers ask, and what is answered.
+"""Messages about live maps: requests of mappers and readers, and their replies.
 
-The daemon passes these requests on to the process that keeps live maps, and its answers back.
+The daemon forwards these requests to the process that keeps live maps, and returns its answers.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = [
 
 MAX_NAME_BYTES: Final = 64
 MAX_CHUNK_ROWS: Final = 1000
-"""Rows of one page of chunks."""
+"""Most rows of one page of chunks."""
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(max_length=MAX_NAME_BYTES)]
 Point: TypeAlias = tuple[float, float, float]
@@ -49,7 +49,7 @@ Key: TypeAlias = tuple[int, int, int]
 
 
 class LiveList(msgspec.Struct, array_like=True, tag="live_list"):
-    """Which live maps there are, and how they are."""
+    """List the live maps and their state."""
 
     request: int
 
@@ -57,7 +57,7 @@ class LiveList(msgspec.Struct, array_like=True, tag="live_list"):
 class LiveOpen(msgspec.Struct, array_like=True, tag="live_open"):
     """Use a live map; with the name of a ``mapper`` send scans to it, too.
 
-    ``frame_id`` is the frame that the client works in; empty: whatever the map's is.
+    ``frame_id`` is the frame in which the client works; empty: the map's own.
     """
 
     request: int
@@ -67,10 +67,10 @@ class LiveOpen(msgspec.Struct, array_like=True, tag="live_open"):
 
 
 class LiveScan(msgspec.Struct, array_like=True, tag="live_scan"):
-    """A scan's marks are in the file ``marks`` of the directory of marks, ``bytes`` long.
+    """Apply a scan: its marks are in the file ``marks`` of the marks directory, ``bytes`` long.
 
-    ``mapper`` is the number that `LiveOpened` gave, ``scan`` rises with each scan.  ``sensor`` is where it
-    was: the window of chunks in memory follows it.
+    ``mapper`` is the number from `LiveOpened`; ``scan`` increases with each scan.  ``sensor`` is the sensor's
+    position, which the window of chunks in memory follows.
     """
 
     request: int
@@ -83,7 +83,7 @@ class LiveScan(msgspec.Struct, array_like=True, tag="live_scan"):
 
 
 class LiveMove(msgspec.Struct, array_like=True, tag="live_move"):
-    """The client is here: chunks around it stay in memory."""
+    """Set the client's position: chunks around it stay in memory."""
 
     request: int
     map: Name
@@ -91,17 +91,17 @@ class LiveMove(msgspec.Struct, array_like=True, tag="live_move"):
 
 
 class LiveSave(msgspec.Struct, array_like=True, tag="live_save"):
-    """Save all chunks now; answered when everything applied before is durable."""
+    """Save all chunks now; answered when all previously applied scans are durable."""
 
     request: int
     map: Name
 
 
 class LiveChunks(msgspec.Struct, array_like=True, tag="live_chunks"):
-    """The chunks in memory, and with ``saved`` those that are on disk alone, too.
+    """List the chunks in memory, with ``saved`` also the chunks that are only on disk.
 
-    ``since`` is a `LiveChunkPage.change`: only what changed after it.  ``after`` is the last key of the
-    page before.
+    ``since`` is a `LiveChunkPage.change`: only later changes are listed.  ``after`` is the last key of the
+    previous page.
     """
 
     request: int
@@ -113,7 +113,7 @@ class LiveChunks(msgspec.Struct, array_like=True, tag="live_chunks"):
 
 
 class LiveVoxels(msgspec.Struct, array_like=True, tag="live_voxels"):
-    """Voxels of a kind, ``occupied`` or ``free``, of an area, in a segment of their own.
+    """List the ``occupied`` or ``free`` voxels of an area, in a separate segment.
 
     ``scope`` is ``memory``, ``disk`` or ``all``; ``since`` as in `LiveChunks`: only voxels of chunks that
     changed after it.
@@ -128,7 +128,7 @@ class LiveVoxels(msgspec.Struct, array_like=True, tag="live_voxels"):
 
 
 class LiveRelease(msgspec.Struct, array_like=True, tag="live_release"):
-    """The client has read the segment of a `LiveVoxelsReply`, or does not need it: it may go."""
+    """Release the segment of a `LiveVoxelsReply`, which the client has read or does not need."""
 
     request: int
     map: Name
@@ -156,23 +156,23 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
     Attributes
     ----------
     map_id
-        16 bytes, permanently the map's.
+        Permanent id of the map, 16 bytes.
     resolution, frame_id
         Edge of a voxel, metres; frame of the map.
     hit, miss, clamp_min, clamp_max, occupied_above, free_below
-        What evidence is worth: log-odds in thousandths.
+        Weights, bounds and thresholds of log-odds, thousandths.
     shm_dir, prefix
         Chunks are ``prefix`` + key + ``.`` + generation in this directory.
     marks_dir
-        Where files of marks are to lie; empty for a session that does not map.
+        Directory for files of marks; empty for a session that does not map.
     mapper, next_scan
-        The mapper's number, and the least that a new scan of it may have.
+        The mapper's number, and the lowest number that its next scan may have.
     max_marks_bytes
-        The longest file of marks.
+        Largest size of a file of marks.
     probabilities
-        The six that the log-odds stand for, as they were set.
+        The six configured probabilities from which the log-odds were computed.
     applied
-        All scans of the mapper up to this one are in the map: at least.
+        At least all scans of the mapper up to this number are in the map.
     """
 
     request: int
@@ -196,7 +196,7 @@ class LiveOpened(msgspec.Struct, array_like=True, tag="live_opened"):
 
 
 class LiveApplied(msgspec.Struct, array_like=True, tag="live_applied"):
-    """Answer to `LiveScan`: it is applied; all scans of the mapper up to ``durable`` are on the disk."""
+    """Answer to `LiveScan`: the scan is applied; the mapper's scans up to ``durable`` are on disk."""
 
     request: int
     scan: int
@@ -211,7 +211,7 @@ class LiveMoved(msgspec.Struct, array_like=True, tag="live_moved"):
 
 
 class LiveDurable(msgspec.Struct, array_like=True, tag="live_durable"):
-    """Answer to `LiveSave`; ``scan``: all scans up to it, of the session's mapper, are on the disk."""
+    """Answer to `LiveSave`; all scans of the session's mapper up to ``scan`` are on disk."""
 
     request: int
     scan: int
@@ -219,9 +219,10 @@ class LiveDurable(msgspec.Struct, array_like=True, tag="live_durable"):
 
 
 class LiveChunkRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """A chunk: ``state`` is ``loading``, ``clean``, ``dirty``, ``saving`` or ``saved`` (on disk alone).
+    """A chunk: ``state`` is ``loading``, ``clean``, ``dirty``, ``saving`` or ``saved`` (only on disk).
 
-    ``version`` rises with each scan that it takes in; ``bytes`` is its memory, or its file.
+    ``version`` increases with each scan applied to the chunk; ``bytes`` is the size of its memory, or of its
+    file.
     """
 
     key: Key
@@ -237,9 +238,9 @@ class LiveChunkRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
 class LiveChunkPage(msgspec.Struct, array_like=True, tag="live_chunk_page"):
     """Answer to `LiveChunks`, in the order of keys; ``more`` is false on the last page.
 
-    ``change`` numbers the map's changes: send it as ``since`` to get what comes after.  ``gone`` are chunks
-    that left memory after ``since``; ``since_known`` is false when that was not known any more, and all is
-    answered instead.
+    ``change`` is the number of the map's last change: send it as ``since`` to get later changes.  ``gone``
+    lists chunks that left memory after ``since``.  ``since_known`` is false if the daemon no longer knew
+    ``since``, and the reply lists everything instead.
     """
 
     request: int
@@ -251,7 +252,7 @@ class LiveChunkPage(msgspec.Struct, array_like=True, tag="live_chunk_page"):
 
 
 class LiveVoxelsReply(msgspec.Struct, array_like=True, tag="live_voxels_reply"):
-    """Answer to `LiveVoxels`: where ``count`` voxels are.
+    """Answer to `LiveVoxels`: the segment with ``count`` voxels.
 
     The segment's columns are ``voxel`` (3 x int32, indices) and ``log_odds`` (int16).
     """

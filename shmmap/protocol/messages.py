@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every message between client and daemon, one declaration each.  ``PROTOCOL.md`` is the byte-exact document.
+"""All messages between client and daemon.  ``PROTOCOL.md`` is the byte-exact specification.
 
-A message is one MessagePack array whose first element is its kind and whose second is the request
-id that the client chose and the reply repeats.  Arrays may grow at the end: a receiver ignores
-elements it does not know and assumes the default for those it misses.  Lists of a request have a greatest
-length, so that what is too long is refused before anything of it is decoded.
+A message is one MessagePack array whose first element is its kind and whose second is the request id that the
+client chose and the reply repeats.  Arrays may grow at the end: a receiver ignores elements it does not know
+and assumes the default for those it misses.  Lists in a request have a maximum length, so that longer ones
+are refused before they are decoded.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ __all__ = [
 PROTOCOL_VERSION: Final = (2, 0)
 
 MAX_NAMES: Final = 20_000
-"""Cells that a request names one by one."""
+"""Most cells that a request may name one by one."""
 MAX_LAYERS: Final = 64
 
 Ids: TypeAlias = Annotated[tuple[str, ...], msgspec.Meta(max_length=MAX_NAMES)]
@@ -89,8 +89,8 @@ Held: TypeAlias = Annotated[tuple[HeldCell, ...], msgspec.Meta(max_length=MAX_NA
 class Hello(msgspec.Struct, array_like=True, tag="hello"):
     """First message of a session.
 
-    ``session`` is the number that the client's session had with a previous run of the daemon, 0 for none.
-    The session keeps this number, so that the locks that the client holds still name it.
+    ``session`` is the number of the client's session with a previous run of the daemon, 0 for none.  The new
+    session gets the same number, so that the client's locks on segments stay valid.
     """
 
     request: int
@@ -101,10 +101,10 @@ class Hello(msgspec.Struct, array_like=True, tag="hello"):
 
 
 class Metadata(msgspec.Struct, array_like=True, tag="metadata"):
-    """One page of the catalogue.
+    """Request one page of the catalogue.
 
-    ``since`` is a map version: only what changed after it is answered, if the daemon still knows it
-    (`MetadataPage.since_known` says).  ``start`` is `MetadataPage.next` of the page before.
+    ``since`` is a map version: the reply lists only later changes, if the daemon still knows that version
+    (`MetadataPage.since_known`).  ``start`` is `MetadataPage.next` of the previous page.
     """
 
     request: int
@@ -115,10 +115,10 @@ class Metadata(msgspec.Struct, array_like=True, tag="metadata"):
 
 
 class Area(msgspec.Struct, array_like=True, tag="area"):
-    """Cells that touch an area.
+    """Request cells that touch an area.
 
-    ``wait`` is how many seconds the reply may wait for loads; nil answers at once with what is
-    resident, and lists the rest as pending.
+    ``wait`` is how many seconds the reply may wait for loads; with nil the daemon answers at once with the
+    resident cells, and lists the others as pending.
     """
 
     request: int
@@ -129,7 +129,7 @@ class Area(msgspec.Struct, array_like=True, tag="area"):
 
 
 class Differential(msgspec.Struct, array_like=True, tag="differential"):
-    """Cells that touch an area, minus those the client holds.
+    """Request cells that touch an area, minus those that the client holds.
 
     ``held`` names cells one by one; ``packed`` is the same as versions alone, 8 bytes little-endian
     each: a version names one layer of one cell.
@@ -145,7 +145,7 @@ class Differential(msgspec.Struct, array_like=True, tag="differential"):
 
 
 class Selected(msgspec.Struct, array_like=True, tag="selected"):
-    """Cells by id, in the order asked for, duplicates preserved."""
+    """Request cells by id; the reply keeps order and duplicates."""
 
     request: int
     ids: Ids
@@ -155,20 +155,20 @@ class Selected(msgspec.Struct, array_like=True, tag="selected"):
 
 
 class Release(msgspec.Struct, array_like=True, tag="release"):
-    """The client dropped these versions (8 bytes little-endian each; nil: all) and unmapped them."""
+    """Report that the client unmapped these versions (8 bytes little-endian each; nil: all)."""
 
     request: int
     packed: bytes | None = None
 
 
 class Stats(msgspec.Struct, array_like=True, tag="stats"):
-    """Counters, sessions and what fills the budget."""
+    """Request counters, sessions, and the use of the budget."""
 
     request: int
 
 
 class Show(msgspec.Struct, array_like=True, tag="show"):
-    """Everything about one cell: versions, segments, their holders, last failure."""
+    """Request all data about one cell: versions, segments, their holders, last failure."""
 
     request: int
     id: str
@@ -196,7 +196,7 @@ class Pin(msgspec.Struct, array_like=True, tag="pin"):
 
 
 class Unpin(msgspec.Struct, array_like=True, tag="unpin"):
-    """Keep cells, all when ``ids`` is nil, no longer than others (privileged)."""
+    """Remove pins from cells, from all when ``ids`` is nil (privileged)."""
 
     request: int
     ids: Ids | None = None
@@ -209,7 +209,7 @@ class Shutdown(msgspec.Struct, array_like=True, tag="shutdown"):
 
 
 class Bye(msgspec.Struct, array_like=True, tag="bye"):
-    """The session ends; there is no reply.  What it still maps stays in use, according to the kernel."""
+    """End the session; there is no reply.  Segments that the client still maps stay in use."""
 
     request: int
 
@@ -237,10 +237,10 @@ Request: TypeAlias = (
 class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
     """Answer to `Hello`.
 
-    ``session`` is the slot the client locks in every segment it opens.  Cell ids in replies are
-    relative to ``id_prefix`` and segment names to ``segment_prefix``.  ``events`` is the path of the
-    socket that events leave by; empty where there is none.  ``(point + origin) / unit_m`` is a point
-    in the coordinate system ``crs`` of the files that the map was made of.
+    ``session`` is the slot the client locks in every segment it opens.  Cell ids in replies are relative to
+    ``id_prefix`` and segment names to ``segment_prefix``.  ``events`` is the path of the events socket; empty
+    if there is none.  ``(point + origin) / unit_m`` is a point in the coordinate system ``crs`` of the files
+    that the map was made of.
     """
 
     request: int
@@ -268,7 +268,7 @@ class Welcome(msgspec.Struct, array_like=True, tag="welcome"):
 
 
 class Handle(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """Where one layer of one cell lies in shared memory.
+    """Location of one layer of one cell in shared memory.
 
     ``id`` and ``segment`` lack the prefixes that `Welcome` gives.  ``stale`` marks a version whose
     successor exists but could not be loaded yet.
@@ -289,16 +289,16 @@ class Handle(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
 
 class PendingCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell still being loaded when the reply had to leave; ``id`` lacks the prefix."""
+    """A cell still being loaded when the reply was sent; ``id`` lacks the prefix."""
 
     id: str
     layer: str
 
 
 class FailedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell that could not be loaded; ``id`` as the client asked for it, else without the prefix.
+    """A cell that could not be loaded; ``id`` is as the client requested it, else without the prefix.
 
-    ``box`` says where it lies, ``min_x, min_y, max_x, max_y`` in metres; None where that is not known.
+    ``box`` is its ``min_x, min_y, max_x, max_y`` in metres; None if that is not known.
     """
 
     id: str
@@ -312,11 +312,11 @@ class FailedCell(msgspec.Struct, array_like=True, frozen=True):
 class Cells(msgspec.Struct, array_like=True, tag="cells"):
     """Answer to `Area`, `Differential` and `Selected`.
 
-    ``removed`` repeats held ids that the client should drop, in the order it gave them;
-    ``removed_packed`` the same for packed versions, in any order.  ``layers`` are those of the request,
-    one for each that it named, in their canonical form.  ``covered`` is false where part of what was asked
-    about is not known yet; nothing lying there is removed.  ``reason`` says why that is not waited for:
-    ``offline``, where it cannot be reached at present; empty where it is about to become known.
+    ``removed`` repeats held ids that the client should drop, in the client's order; ``removed_packed`` does
+    the same for packed versions, in any order.  ``layers`` are the requested layers, in order, in canonical
+    form. ``covered`` is false if the list of cells is not yet known for part of the request; no cell of that
+    part is removed.  ``reason`` is ``offline`` if that list is unreachable at present, and empty if it is
+    being fetched.
     """
 
     request: int
@@ -349,9 +349,9 @@ class MetadataRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
 class MetadataPage(msgspec.Struct, array_like=True, tag="metadata_page"):
     """Answer to `Metadata`; ``next`` is nil on the last page.
 
-    ``since_known`` is false when ``since`` was not known any more and the whole list is answered
-    instead.  ``removed`` lists ids (without the prefix) that vanished after ``since``; it comes
-    with the first page.
+    ``since_known`` is false if the daemon no longer knew ``since``, and the reply contains the whole list
+    instead.  ``removed`` lists ids (without the prefix) that left the map after ``since``; only the first
+    page contains it.
     """
 
     request: int
@@ -382,7 +382,7 @@ class StatsReply(msgspec.Struct, array_like=True, tag="stats_reply"):
 
 
 class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
-    """Answer to `Show`; ``id`` is whole, ``failure`` the last one that still stands.
+    """Answer to `Show`; ``id`` is complete, ``failure`` is the last failure if it still applies.
 
     ``pinned`` names the layers that an operator keeps resident.
     """
@@ -404,7 +404,7 @@ class ShownCell(msgspec.Struct, array_like=True, tag="shown_cell"):
 
 
 class Reloaded(msgspec.Struct, array_like=True, tag="reloaded"):
-    """Answer to `Reload`: how many cells changed, appeared, vanished; what looked odd."""
+    """Answer to `Reload`: how many cells changed, were added and were removed; warnings."""
 
     request: int
     map_version: int
@@ -428,7 +428,7 @@ class Evicted(msgspec.Struct, array_like=True, tag="evicted"):
 
 
 class PinnedCell(msgspec.Struct, array_like=True, frozen=True):
-    """A cell an operator keeps: ``state`` resident, stale, loading, absent, or why it cannot be loaded."""
+    """A pinned cell: ``state`` is resident, stale, loading, absent, or the reason why it cannot be loaded."""
 
     id: str
     layer: str
@@ -437,7 +437,7 @@ class PinnedCell(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Pinned(msgspec.Struct, array_like=True, tag="pinned"):
-    """Answer to `Pin` and `Unpin`: the cells asked for, else all that are pinned; ids the map lacks."""
+    """Answer to `Pin` and `Unpin`: the requested cells, else all pinned ones; and unknown ids."""
 
     request: int
     cells: tuple[PinnedCell, ...]
@@ -451,7 +451,7 @@ class Stopping(msgspec.Struct, array_like=True, tag="stopping"):
 
 
 class ErrorReply(msgspec.Struct, array_like=True, tag="error"):
-    """The request as a whole was refused; code ``no_session`` asks for a new `Hello`."""
+    """The request as a whole was refused; code ``no_session`` requires a new `Hello`."""
 
     request: int
     code: str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows about segments, clients and live maps: the same in replies and in the statistics segment."""
+"""Rows about segments, clients and live maps, used in replies and in the statistics segment."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Shape: TypeAlias = Literal["circle", "square", "box"]
 
 
 class Holder(msgspec.Struct, array_like=True, frozen=True):
-    """A user of the daemon's memory; ``str`` of it is a line to read.
+    """A user of the daemon's memory; its ``str`` is a readable line.
 
-    ``session`` 0 stands for a process that maps segments without one, ``pid`` 0 and ``uid`` -1 for what the
-    kernel does not say, ``cells`` 0 for an unknown number of segments.  ``client`` is the client's own name,
-    ``command`` the kernel's name of the process.
+    ``session`` 0 means a process that maps segments without a session.  ``pid`` 0 and ``uid`` -1 mean that
+    the kernel does not report them, ``cells`` 0 an unknown number of segments.  ``client`` is the client's
+    own name, ``command`` the kernel's name of the process.
     """
 
     session: int
@@ -41,10 +41,11 @@ class CellRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """A segment that the daemon keeps: one layer of one cell.
 
     In the statistics ``id`` and ``segment`` lack the prefixes that `Welcome` gives, and ``holders`` is empty;
-    in `ShownCell` they are whole.  ``state`` is resident, stale (its source has changed) or zombie (retired,
-    but still in use).  ``bytes`` is its memory as measured, ``box`` (min_x, min_y, max_x, max_y) in metres,
-    map frame.  ``last_use_monotonic_ns`` is when it was last handed out (CLOCK_MONOTONIC), 0 for never;
-    ``load_ns`` how long loading took; ``ahead`` marks what was prefetched and not requested yet.
+    in `ShownCell` they are complete.  ``state`` is resident, stale (its source has changed) or zombie
+    (retired, but still in use).  ``bytes`` is its memory as measured, ``box`` (min_x, min_y, max_x, max_y) in
+    metres, map frame.  ``last_use_monotonic_ns`` is when it was last handed out (CLOCK_MONOTONIC), 0 for
+    never; ``load_ns`` how long loading took; ``ahead`` marks a segment that was prefetched and not requested
+    yet.
     """
 
     id: str
@@ -62,7 +63,7 @@ class CellRow(msgspec.Struct, array_like=True, frozen=True, gc=False):
     holders: tuple[Holder, ...] = ()
 
     def idle_s(self, now_monotonic_ns: int) -> float | None:
-        """Return the seconds since it was last handed out; None if it never was."""
+        """Return the seconds since the segment was last handed out; None if it never was."""
         if not self.last_use_monotonic_ns:
             return None
         return max(now_monotonic_ns - self.last_use_monotonic_ns, 0) * 1e-9
@@ -82,14 +83,14 @@ class Window(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
 
 class ClientRow(msgspec.Struct, array_like=True, frozen=True):
-    """A client as the daemon sees it; ``pid`` is what the kernel says, 0 where it says nothing (uid then -1).
+    """A client as the daemon sees it; ``pid`` is from the kernel, 0 if unknown (``uid`` is then -1).
 
     ``cells`` and ``bytes`` are the versions that it was handed and has not released, and their memory.
     ``last_request_monotonic_ns`` is the time of its last request, CLOCK_MONOTONIC; ``pose`` (x, y) in metres,
     map frame, and ``heading`` in radians are None while unknown.
 
-    Only `StatsReply` has the last three: ``mapped_bytes`` is what the client maps according to the kernel,
-    ``superseded`` the segments among them that have left service or have a successor.
+    Only `StatsReply` has the last three: ``mapped_bytes`` is the memory that the client maps according to the
+    kernel, ``superseded`` the number of mapped segments that have left service or have a successor.
     """
 
     session: int
@@ -110,7 +111,7 @@ class ClientRow(msgspec.Struct, array_like=True, frozen=True):
     superseded_bytes: int = 0
 
     def idle_s(self, now_monotonic_ns: int) -> float:
-        """Return the seconds since its last request."""
+        """Return the seconds since the client's last request."""
         return max(now_monotonic_ns - self.last_request_monotonic_ns, 0) * 1e-9
 
 
@@ -122,25 +123,25 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
     chunks, active, bytes
         Chunks in memory, known voxels in them, and their memory.
     loading, dirty, saving
-        Chunks being read, changed and not saved, being written.
+        Numbers of chunks being read, changed but not saved, and being written.
     waiting_bytes
-        Scans that wait for chunks or for memory.
+        Size of the scans that wait for chunks or for memory.
     files, file_bytes
         Chunks on disk.
     scans, durable
-        Scans applied since the start, and those of them that are on disk.
+        Number of scans applied since the start, and how many of them are on disk.
     damaged, mappers
-        Quarantined files and missing chunks; mappers, ``uid/name``.  In the statistics either may be empty
-        for lack of room: the numbers are ``damaged_count`` and ``mapper_count``.
+        Names of quarantined files and missing chunks; mappers as ``uid/name``.  In the statistics either may
+        be empty for lack of space; ``damaged_count`` and ``mapper_count`` are always set.
     problem
-        What keeps chunks from being saved or loaded at present; empty: nothing.
+        Reason why chunks cannot be saved or loaded at present; empty if they can.
     change
         Number of the map's last change, as in `LiveChunkPage`.
     beside_bytes
-        Memory of lists of voxels and of marks, within the budget as the chunks.
+        Memory of voxel lists and marks, which counts towards the budget like the chunks.
     readers
-        Sessions whose requests took most of the worker's time in the last seconds, and how much of one
-        processor each took, in thousandths; the greatest first.
+        Sessions whose requests used most of the worker's time in the last seconds, in descending order, each
+        with its share of one processor, thousandths.
     """
 
     name: str
@@ -170,7 +171,7 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
 
     @property
     def unsaved(self) -> int:
-        """Chunks that are newer in memory than on disk."""
+        """Number of chunks that are newer in memory than on disk."""
         return self.dirty + self.saving
 
     @property
@@ -180,6 +181,6 @@ class LiveMapRow(msgspec.Struct, array_like=True, frozen=True):
 
     @property
     def states(self) -> dict[str, int]:
-        """Chunks in memory, counted by state."""
+        """Number of chunks in memory by state."""
         clean = max(0, self.chunks - self.unsaved)
         return {"loading": self.loading, "clean": clean, "dirty": self.dirty, "saving": self.saving}

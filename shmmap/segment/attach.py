@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Attaching to a segment: read-only numpy views over shared memory.
+"""Attach to a segment: read-only numpy views over shared memory.
 
-A mapping lives exactly as long as any array over it: every view's ``base`` chain ends at the
-mapping object, whose end unmaps.  Nothing is ever unmapped under a live view.  No file descriptor
-is kept (Python's own ``mmap`` keeps one each, which ends at RLIMIT_NOFILE), so the mapping is made
-with the C library's ``mmap``; the kernel keeps the open file, and the session's lock on it, for as
-long as the mapping lives.  Neither is lost to an exception that comes at the wrong moment (`Owned`).
+A mapping lives exactly as long as any array over it: every view's ``base`` chain ends at the mapping object,
+whose finalizer unmaps.  No memory is unmapped under a live view.  No file descriptor is kept: Python's own
+``mmap`` keeps one per mapping, up to RLIMIT_NOFILE, so the C library's ``mmap`` is used.  The kernel keeps
+the open file, and the session's lock on it, as long as the mapping lives.  An exception at a bad moment leaks
+neither (`Owned`).
 """
 
 from __future__ import annotations
@@ -51,45 +51,47 @@ __all__ = ["AttachedSegment", "Owned", "attach", "attach_writable", "map_file"]
 
 
 class Owned:
-    """One thing that a built-in function gives and another one takes back when this object ends.
+    """A resource that one built-in function acquires, and another releases when this object ends.
 
-    It is given back whatever exception a signal handler raises wherever.  Python runs signal handlers between
-    the steps of its interpreter, as a rule after a call.  So a handler's exception may come when a function
-    has returned a descriptor that no variable holds yet; or at the first step of a ``__del__`` written in
-    Python, which then does nothing.  Between functions that are built in and call each other no handler runs:
-    taking, keeping and giving back are made of those alone.
+    The resource is released whatever exception a signal handler raises, and wherever.  Python runs signal
+    handlers between interpreter steps, usually after a call.  So a handler's exception may arrive when a
+    function has returned a descriptor that no variable holds yet, or at the first step of a ``__del__``
+    written in Python, which then does nothing.  No handler runs between built-in functions that call each
+    other; acquiring, holding and releasing use only those.
 
     Parameters
     ----------
     given
-        Yields one tuple, whose first is the thing: a `zip` of a `map` of the built-in function that gives it.
+        Yields one tuple, whose first element is the resource: a `zip` of a `map` of the acquiring built-in
+        function.
     take_back
-        Built in, too; is called with what is in the tuple, once, and then returns None or 0.
+        Built-in function that releases the resource.  Called once with the elements of the tuple; returns
+        None or 0.
 
     Raises
     ------
     Exception
-        What the giving function raises.
+        As the acquiring function raises.
     """
 
     __slots__ = ("__del__", "__weakref__", "value")
 
-    __del__: Callable[[], object]  # in a slot: what Python calls is built in, and no function of ours
+    __del__: Callable[[], object]  # in a slot: Python calls a built-in function, not Python code
 
     def __init__(self, given: Iterable[tuple[Any, ...]], take_back: Callable[..., Any]) -> None:
         kept: list[tuple[Any, ...]] = []
-        # each in the list is taken back once, since an iterator is at an end after that
+        # each element of the list is released once, since its iterator is exhausted after that
         self.__del__ = partial(any, starmap(take_back, kept))
         kept.extend(given)
         self.value = kept[0][0]
-        """What was given."""
+        """The resource."""
 
     def keep(self, take_back: Callable[[], object]) -> None:
-        """Need less memory from now on: ``take_back``, built in, does all when this object ends."""
+        """Replace the release by ``take_back``, a built-in function, to save memory."""
         self.__del__ = take_back
 
     def give_back(self) -> None:
-        """Give it back now, not only when this object ends; not after `keep`."""
+        """Release the resource now, not only when this object ends; not allowed after `keep`."""
         self.__del__()
 
     def end(self) -> None:
@@ -99,7 +101,7 @@ class Owned:
 
 
 LEASE_S: Final = 0.2
-"""How long a lease may keep an open waiting; the daemon holds one for microseconds."""
+"""How long a lease may delay an open; the daemon holds a lease for microseconds."""
 LEASE_RETRY_S: Final = 0.0002
 
 _libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -119,21 +121,21 @@ _MAP_FAILED: Final = ctypes.c_void_p(-1).value
 
 
 def map_file(fd: int, nbytes: int, *, populate: bool = False, private: bool = False) -> Owned:
-    """Map a file's first bytes; they are unmapped when the result ends, whose value is their address.
+    """Map a file's first bytes; the result's value is their address, and its end unmaps them.
 
     Parameters
     ----------
     fd, nbytes
-        The file, open for reading, and how much of it.
+        The file, open for reading, and the number of bytes to map.
     populate
-        Let the kernel map every page now.
+        Map every page now, not at first access.
     private
-        Readable and writable: the kernel copies a page at its first write, which only this process sees.
+        Make the mapping writable, copy-on-write: only this process sees its writes.
 
     Raises
     ------
     SegmentError
-        The kernel refuses.
+        The kernel refuses the mapping.
     """
     if private:
         protection, flags = _PROT_READ | _PROT_WRITE, _MAP_PRIVATE | _MAP_NORESERVE
@@ -154,10 +156,10 @@ def map_file(fd: int, nbytes: int, *, populate: bool = False, private: bool = Fa
 
 
 class _Mapping:
-    """Has mapped memory as long as any array over it lives: the root of the base chain of all of them.
+    """Owner of mapped memory, alive as long as any array over it: the root of all their base chains.
 
-    The last view is dropped in any thread and in the middle of anything, so what happens then is made of
-    built-in functions alone: no signal handler runs in it, whose exception Python would have to ignore.
+    The last view may be dropped in any thread, at any moment.  So the release uses only built-in functions:
+    no signal handler can run in it and raise an exception that Python would have to ignore.
     """
 
     __slots__ = ("__array_interface__", "__del__", "_beside")
@@ -171,7 +173,7 @@ class _Mapping:
         sinks: Sequence[SimpleQueue[Owned | None]],
         beside: NDArray[np.uint8] | None,
     ) -> None:
-        # a private mapping keeps the first one, by which the daemon knows the segment's user
+        # a private mapping keeps the first mapping alive, whose lock identifies the user to the daemon
         self._beside = beside
         # True: read-only; numpy then refuses to make any view of it writeable
         self.__array_interface__ = {
@@ -180,7 +182,7 @@ class _Mapping:
             "typestr": "|u1",
             "version": 3,
         }
-        # into the first of the queues that there are then; where there is none, it is unmapped here
+        # put into the first queue of that moment; without a queue, unmapped here
         self.__del__ = partial(any, map(SimpleQueue.put, sinks, (memory,)))
 
 
@@ -195,12 +197,12 @@ def _bytes_of(
     """Return mapped memory as an array that keeps it mapped."""
     mapping = _Mapping(memory, end, sinks, beside)
     raw: NDArray[np.uint8] = np.asarray(mapping)
-    del mapping.__array_interface__  # it has done its work, and windows have hundreds of mappings
+    del mapping.__array_interface__  # not needed any more, and windows have hundreds of mappings
     return raw[offset:] if offset else raw
 
 
 class AttachedSegment:
-    """A verified view of one segment, read-only as a rule.
+    """A verified view of one segment, usually read-only.
 
     ``raw`` (total_bytes,) uint8 is all of its bytes; ``outside_points`` lie outside the cell's box.
     """
@@ -215,7 +217,7 @@ class AttachedSegment:
 
     @property
     def header(self) -> SegmentHeader:
-        """What the segment says about itself; read when first asked for."""
+        """The segment's header, read at the first access."""
         header = self._header
         if header is None:
             header = self._header = unpack_header(self.raw.data, len(self.raw))
@@ -229,16 +231,16 @@ class AttachedSegment:
 
     @property
     def published(self) -> PublishBlock | None:
-        """The publish block; None for bytes that no daemon published."""
+        """The publish block; None if no daemon published the segment."""
         return unpack_publish_block(self.raw.data, self.header.header_bytes)
 
     def copy(self) -> AttachedSegment:
-        """Return the same in memory of this process alone, which may be written.
+        """Return a writable copy in private memory.
 
         Raises
         ------
         LimitReached
-            There is not so much memory.
+            There is not enough memory.
         """
         try:
             return AttachedSegment(self.columns, self.raw.copy(), self.outside_points)
@@ -251,7 +253,7 @@ class AttachedSegment:
         Raises
         ------
         SegmentCorrupt
-            Naming the first column whose bytes changed.
+            A column's bytes changed; the message names the first such column.
         """
         with needed_packages("verify()"):
             import xxhash
@@ -273,7 +275,7 @@ _FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 def _open(name: str, shm_dir: str) -> Owned:
-    """Open a segment, never waiting: a pipe that has its name by now would block the opener."""
+    """Open a segment without blocking, even if a pipe has its name by now."""
     fds: Iterable[Any]
     if shm_dir == DEFAULT_SHM_DIR:
         fds = map(_fd_of, map(_open_shared, (name,)))
@@ -283,12 +285,12 @@ def _open(name: str, shm_dir: str) -> Owned:
 
 
 def _open_soon(name: str, shm_dir: str) -> Owned:
-    """Open a segment on which the daemon has a lease, held for a moment to see whether it is in use."""
+    """Open a segment, retrying while the daemon holds its short lease that checks for users."""
     end_s = time.monotonic() + LEASE_S
     while True:
         try:
             return _open(name, shm_dir)
-        except BlockingIOError:  # noqa: PERF203  it is the only way to find out
+        except BlockingIOError:  # noqa: PERF203  the only way to detect the lease
             if time.monotonic() > end_s:
                 raise
             time.sleep(LEASE_RETRY_S)
@@ -311,34 +313,34 @@ def attach(
     Parameters
     ----------
     name
-        As a handle gives it, leading slash included.
+        Name from a handle, leading slash included.
     offset, nbytes
-        Where in the shared-memory object the segment lies; 0 bytes means all of it.
+        Position of the segment in the shared-memory object, bytes; 0 ``nbytes`` means the whole object.
     shm_dir
-        Directory of the segments, as the daemon's ``hello`` names it.
+        Directory of the segments, as `Welcome` reports it.
     slot
-        The session's slot, by which the daemon knows the segment's user.
+        The session's slot, which identifies the user to the daemon.
     owner
-        User that the segment must belong to: where any account may make files, a name that the daemon
-        gave up may be another one's by now.
+        User id that must own the segment.  In a directory that any account may write, a name that the daemon
+        released may be another account's file by now.
     populate
-        Let the kernel map every page now (``MAP_POPULATE``) instead of at first touch.
+        Map every page now (``MAP_POPULATE``), not at first access.
     sinks
-        The first of these queues gets the memory when the last array over it is gone, to unmap it in a
-        thread; they may change at any time.  Without any it is unmapped on the spot.
+        The first of these queues receives the memory when the last array over it is gone, to unmap it in a
+        thread. They may change at any time.  Without a queue the memory is unmapped on the spot.
     on_mapped
-        Is given the memory as soon as it is mapped; not to be kept.
+        Called with the memory as soon as it is mapped; must not keep a reference.
 
     Raises
     ------
     StaleHandle
-        The segment is gone, or its name is another file's by now.
+        The segment is gone, or another file has its name by now.
     SegmentCorrupt
-        Its bytes are not a segment of a layout this program reads.
+        The bytes are not a segment of a layout that this program reads.
     SegmentError
-        It may not be opened by this user, or cannot be mapped.
+        This user may not open the segment, or it cannot be mapped.
     LimitReached
-        This process may open no more files.
+        This process has no more file descriptors.
     """
     try:
         try:
@@ -356,7 +358,7 @@ def attach(
         raise StaleHandle(
             f"segment {name} cannot be opened: its lease is not given back", hint="ask the daemon again"
         ) from None
-    except (OSError, posix_ipc.Error) as error:  # posix_ipc raises some without a number
+    except (OSError, posix_ipc.Error) as error:  # posix_ipc raises some errors without errno
         raise no_files_left(error) or SegmentError(f"segment {name}: {_reason(error)}") from None
     fd = file.value
     try:
@@ -368,7 +370,7 @@ def attach(
                 hint="ask the daemon again",
             )
         if slot is not None:
-            with contextlib.suppress(OSError):  # it is as safe without; only its user is not known
+            with contextlib.suppress(OSError):  # safe without the lock; only the user stays unidentified
                 lock_slot(fd, slot)
         step("client.lock")
         available = status.st_size
@@ -376,7 +378,7 @@ def attach(
         if end > available or end == 0:
             raise SegmentCorrupt(f"segment {name} has {available} bytes, the daemon's handle says {end}")
         size = end - offset
-        # reading the header is cheaper than the page fault that looking at it would cost
+        # reading the header is cheaper than the page fault of an access
         page = read_page(fd, size, offset)
         _, columns = read_columns(memoryview(page), size)
         (outside,) = OUTSIDE.unpack_from(page, OUTSIDE_AT)
@@ -398,23 +400,23 @@ def _reason(error: Exception) -> str:
 def attach_writable(
     segment: AttachedSegment, name: str, *, offset: int = 0, shm_dir: str = DEFAULT_SHM_DIR
 ) -> AttachedSegment:
-    """Return a view of a segment that may be written, for libraries that know no read-only memory.
+    """Return a writable view of a segment, for libraries that do not support read-only memory.
 
-    It is a second mapping, private and copy-on-write: it is read without a copy, a page that is written
-    becomes the process's own, and neither the segment nor any other view changes.  Where the kernel does not
-    allow that (the limit of data, ``ulimit -d``) or the segment has no name any more, it is a copy.
+    It is a second mapping, private and copy-on-write: reading copies nothing, a written page becomes private
+    memory, and neither the segment nor any other view changes.  If the kernel refuses the mapping (data
+    limit, ``ulimit -d``), or the segment has no name any more, the result is a copy.
 
     Parameters
     ----------
     segment
-        As it is attached; stays so as long as the result's arrays.
+        The attached segment; stays attached as long as the result's arrays.
     name, offset, shm_dir
-        As it was attached by, see `attach`; a retired segment is found, too.
+        As passed to `attach`; a retired segment is found, too.
 
     Raises
     ------
     LimitReached
-        A copy is needed, and there is not so much memory.
+        A copy is needed, and there is not enough memory.
     """
     for path in (name, retired_name(name)):
         try:
@@ -432,7 +434,7 @@ def attach_writable(
 
 
 def _same_bytes(segment: AttachedSegment, fd: int, offset: int) -> NDArray[np.uint8] | None:
-    """Map a file privately; None where it is not the segment's own."""
+    """Map a file privately; return None if it is not the segment's own file."""
     first = segment.raw
     end = offset + len(first)
     head = min(len(first), PAGE_BYTES)

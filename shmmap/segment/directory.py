@@ -22,12 +22,12 @@ __all__ = ["DEFAULT_SHM_DIR", "ShmDirectory", "measured_bytes"]
 
 
 def measured_bytes(fd: int) -> int:
-    """Bytes of memory the file really occupies (``st_blocks`` counts 512-byte units)."""
+    """Return the bytes of memory that a file really occupies (``st_blocks`` counts 512-byte units)."""
     return os.fstat(fd).st_blocks * 512
 
 
 class ShmDirectory:
-    """One directory on a tmpfs, by default the one of POSIX shared memory.
+    """A directory on a tmpfs, by default that of POSIX shared memory.
 
     Raises
     ------
@@ -65,10 +65,9 @@ class ShmDirectory:
     def publish(
         self, fd: int, name: str, *, block: PublishBlock, header_bytes: int, mode: int, gid: int
     ) -> int:
-        """Stamp, chmod and name a finished segment; returns the bytes it occupies.
+        """Stamp, chmod and name a finished segment; return the bytes it occupies.
 
-        The name appears only when everything else is done, so any process that can open the segment
-        sees it whole.
+        The name appears last, so any process that can open the segment sees it complete.
         """
         step("daemon.stamp")
         os.pwrite(fd, pack_publish_block(block), header_bytes - 64)
@@ -76,14 +75,14 @@ class ShmDirectory:
             os.fchown(fd, -1, gid)
         os.fchmod(fd, mode)
         nbytes = measured_bytes(fd)
-        os.ftruncate(fd, nbytes)  # whole pages: a handle's bytes are what can be mapped
+        os.ftruncate(fd, nbytes)  # whole pages: a handle states the bytes that can be mapped
         step("daemon.link")
         self.link(fd, name)
         step("daemon.linked")
         return nbytes
 
     def link(self, fd: int, name: str) -> None:
-        """Give an unnamed file a name; FileExistsError if there is such a name."""
+        """Give an unnamed file a name; raise FileExistsError if the name exists."""
         # src_dir_fd makes CPython call linkat(2); link(2) would try to link the symlink in /proc
         os.link(
             f"/proc/self/fd/{fd}",
@@ -94,13 +93,13 @@ class ShmDirectory:
         )
 
     def open(self, name: str) -> int:
-        """Open a segment for reading; close it at once, an open file looks like a pin."""
-        # a pipe of that name would keep the opener waiting
+        """Open a segment for reading; close it soon, since an open file counts as a user."""
+        # a pipe of that name would block the opener
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         return os.open(name.lstrip("/"), flags, dir_fd=self._fd)
 
     def open_path(self, name: str) -> int:
-        """Open a segment's place alone: it can be unlinked at once, its memory goes when this is closed."""
+        """Open a segment by ``O_PATH``: once unlinked, its memory is freed when this is closed."""
         return os.open(name.lstrip("/"), os.O_PATH | os.O_CLOEXEC | os.O_NOFOLLOW, dir_fd=self._fd)
 
     @contextlib.contextmanager
@@ -133,7 +132,7 @@ class ShmDirectory:
         return True
 
     def size_of(self, name: str) -> int:
-        """Length of a segment in bytes; -1 if it is gone, or if something else has its name."""
+        """Return the length of a segment in bytes; -1 if it is gone or not a regular file."""
         try:
             status = os.stat(name.lstrip("/"), dir_fd=self._fd, follow_symlinks=False)
         except OSError:
@@ -141,13 +140,13 @@ class ShmDirectory:
         return status.st_size if stat.S_ISREG(status.st_mode) else -1
 
     def names(self, prefix: str) -> list[str]:
-        """Names that start with ``prefix`` (slash included), sorted."""
+        """Return the names that start with ``prefix`` (slash included), sorted."""
         bare = prefix.lstrip("/")
         with os.scandir(self.path) as entries:
             return sorted("/" + entry.name for entry in entries if entry.name.startswith(bare))
 
     def used_bytes(self, prefix: str) -> int:
-        """Memory that files whose names start with ``prefix`` occupy, bytes."""
+        """Return the memory of files whose names start with ``prefix``, bytes."""
         total = 0
         for name in self.names(prefix):
             with contextlib.suppress(FileNotFoundError):
@@ -155,16 +154,16 @@ class ShmDirectory:
         return total
 
     def free_bytes(self) -> int:
-        """Bytes the file system has left for us; very large where it sets no limit."""
+        """Return the bytes available to this user in the file system; very large if it has no limit."""
         state = os.statvfs(self._fd)
         return state.f_bavail * state.f_frsize if state.f_blocks else 1 << 62
 
     def size_bytes(self) -> int:
-        """Size of the file system; very large where it sets no limit."""
+        """Return the size of the file system in bytes; very large if it has no limit."""
         state = os.statvfs(self._fd)
         return state.f_blocks * state.f_frsize if state.f_blocks else 1 << 62
 
 
 def is_full(error: OSError) -> bool:
-    """Whether ``error`` says that the file system is full."""
+    """Return whether ``error`` means that the file system is full."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.ENOMEM)

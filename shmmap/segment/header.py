@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A segment's header to bytes and back, and checks of a segment's bytes against its own checksums.
+"""Encode and decode a segment's header, and verify a segment's bytes by its checksums.
 
-``LAYOUT.md`` is the byte-exact document.  The header's last 64 bytes are the *publish block*: which run of
-the daemon published the segment, and as which version.
+``LAYOUT.md`` is the byte-exact specification.  The header's last 64 bytes are the *publish block*: the daemon
+run that published the segment, and the version.
 
-Files are read, not mapped: no page of them stays in the checking process, and one that is shorter than it
-claims is an error instead of SIGBUS.
+Files are read, not mapped: no page of a file stays in the checking process, and a file that is shorter than
+its header states causes an error instead of SIGBUS.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ CRC: Final = struct.Struct("<II")
 
 
 class PublishBlock(NamedTuple):
-    """Which run of the daemon published the segment, and as which version of its cell."""
+    """The daemon run that published a segment, and the version of its cell."""
 
     epoch: int
     version: int
@@ -80,7 +80,7 @@ def unpack_publish_block(header_page: memoryview, header_bytes: int) -> PublishB
     Raises
     ------
     SegmentCorrupt
-        If it is neither empty nor whole.
+        The block is neither empty nor complete.
     """
     raw = bytes(header_page[header_bytes - PUBLISH_BYTES : header_bytes])
     magic, epoch, version, crc = PUBLISH.unpack(raw)
@@ -162,10 +162,9 @@ _DTYPES: dict[bytes, np.dtype[np.generic]] = {
 
 
 def check_start(start: memoryview, available_bytes: int) -> tuple[int, int]:
-    """Check magic, version and sizes of a segment's first bytes; returns (header, total) bytes.
+    """Check magic, version and sizes of a segment's first bytes; return (header, total) bytes.
 
-    ``available_bytes`` is how much is really there (fstat): everything the header claims must lie
-    inside it.
+    ``available_bytes`` is the real size of the file (fstat): all that the header describes must lie within.
     """
     if len(start) < FIXED.size:
         raise SegmentCorrupt(f"a segment of {len(start)} bytes is shorter than its header")
@@ -187,7 +186,7 @@ def check_start(start: memoryview, available_bytes: int) -> tuple[int, int]:
 
 
 def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[ColumnRow]]:
-    """Verify a header and read its column table: the part of it that every reader needs.
+    """Verify a header and read its column table, which every reader needs.
 
     Parameters and errors are those of `unpack_header`, which also reads the rest.
 
@@ -196,7 +195,7 @@ def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[Colu
     header_bytes : int
         Size of the header.
     rows : list of tuple
-        One for each column: what `Column` takes, in order.
+        One tuple per column: the fields of `Column`, in order.
     """
     header_bytes, total_bytes = check_start(page, available_bytes)
     if len(page) < header_bytes:
@@ -219,7 +218,7 @@ def read_columns(page: memoryview, available_bytes: int) -> tuple[int, list[Colu
             or offset < header_bytes
             or offset % ALIGNMENT_BYTES
             or offset + nbytes > total_bytes
-            or (nbytes == 0 and max(shape, default=0) > total_bytes)  # numpy has no such array
+            or (nbytes == 0 and max(shape, default=0) > total_bytes)  # numpy cannot represent such an array
         ):
             raise SegmentCorrupt(f"column {len(rows)} ({bytes(name)!r}) contradicts the layout")
         rows.append(
@@ -244,7 +243,7 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
     page
         The segment's bytes, from its start, at least the whole header.
     available_bytes
-        How many bytes the segment really has.
+        Real size of the segment, bytes.
 
     Raises
     ------
@@ -284,7 +283,7 @@ def unpack_header(page: memoryview, available_bytes: int) -> SegmentHeader:
     )
 
 
-@lru_cache(maxsize=256)  # hundreds of attached segments have the same few names of columns
+@lru_cache(maxsize=256)  # hundreds of attached segments share a few column names
 def _shared_text(raw: bytes) -> str:
     return _text(raw)
 
@@ -304,7 +303,7 @@ def _unpack_lattice(page: memoryview) -> Lattice | None:
 
 
 def read_page(fd: int, available_bytes: int, offset: int = 0) -> bytes:
-    """Read a segment's header out of a file: its first page, all of it where it claims to be longer."""
+    """Read a segment's header from a file: its first page, or more if the header is longer."""
     page = os.pread(fd, min(available_bytes, PAGE_BYTES), offset)
     header_bytes = int.from_bytes(page[16:24], "little")
     return os.pread(fd, header_bytes, offset) if PAGE_BYTES < header_bytes <= available_bytes else page
@@ -316,7 +315,7 @@ def read_header(fd: int) -> tuple[SegmentHeader, PublishBlock]:
     Raises
     ------
     SegmentCorrupt
-        As `unpack_header`; or it was never published.
+        As `unpack_header`; or the segment was never published.
     """
     available = os.fstat(fd).st_size
     page = memoryview(read_page(fd, available))
@@ -328,14 +327,14 @@ def read_header(fd: int) -> tuple[SegmentHeader, PublishBlock]:
 
 
 def checked_blocks(fd: int, header: SegmentHeader, block_bytes: int) -> Iterator[tuple[int, memoryview]]:
-    """Read every column of a segment file; yields each block's place and bytes, valid until the next one.
+    """Read every column of a segment file; yield each block's position and bytes, valid until the next block.
 
     Raises
     ------
     SegmentCorrupt
-        After its last block, naming a column whose bytes do not match its checksum.
+        A column does not match its checksum; raised after its last block.
     """
-    import xxhash  # clients have none
+    import xxhash  # clients may lack it
 
     buffer = memoryview(bytearray(block_bytes))
     for column in header.columns:
@@ -355,7 +354,7 @@ def verify_file(fd: int) -> SegmentHeader:
     Raises
     ------
     SegmentCorrupt
-        As `read_header`, or naming the first column whose bytes changed.
+        As `read_header`; or a column's bytes changed: the message names the first such column.
     """
     header, _ = read_header(fd)
     for _at, _block in checked_blocks(fd, header, _BLOCK_BYTES):

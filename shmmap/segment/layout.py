@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a segment is made of: one header, then columns.  ``LAYOUT.md`` is the byte-exact document.
+"""Structure of a segment: one header, then columns.  ``LAYOUT.md`` is the byte-exact specification.
 
-A segment is one layer of one cell at one version.  Its header carries everything a reader needs
-(a handle names only segment, offset and size), and is immutable but for the 64-byte *publish
-block* at its end, which the daemon fills in when it gives the segment a name.
+A segment is one layer of one cell at one version.  Its header contains all that a reader needs (a handle
+names only segment, offset and size).  It is immutable except for the 64-byte *publish block* at its end,
+which the daemon fills in when it gives the segment a name.
 
-The header's bytes are the business of `shmmap.segment.header`.
+`shmmap.segment.header` encodes and decodes the header.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ COLUMNS_OFFSET: Final = 512
 TAIL_BYTES: Final = 72  # header CRC, padding, publish block
 MAX_DIMENSIONS: Final = 4
 COLUMN: Final = struct.Struct("<40s8s16sII4QQQQ")
-_TOKEN: Final = struct.Struct("<Qqq")  # a size is not negative; the first 8 bytes of a hash may be any
+_TOKEN: Final = struct.Struct("<Qqq")  # a size is not negative; the first 8 bytes of a hash are arbitrary
 
 
 class SourceStamp(NamedTuple):
-    """What ``stat`` says about one state of a source file without reading it: bytes and nanoseconds.
+    """State of a source file according to ``stat``, without reading the file: bytes and nanoseconds.
 
-    ``ctime_ns`` is what makes it sound: no program can set it back, so a rewrite that restores size
-    and mtime (``cp -p``, ``rsync -t``) still shows.
+    ``ctime_ns`` makes it reliable: no program can set it back, so a rewrite that restores size and mtime
+    (``cp -p``, ``rsync -t``) is still detected.
     """
 
     size: int
@@ -60,17 +60,17 @@ class SourceStamp(NamedTuple):
 
     @classmethod
     def of(cls, status: os.stat_result) -> SourceStamp:
-        """Stamp of a file from its `os.stat` or `os.fstat` result."""
+        """Return the stamp of a file from its `os.stat` or `os.fstat` result."""
         return cls(status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
     @classmethod
     def from_token(cls, token: bytes) -> SourceStamp:
-        """Stamp whose `token` this is."""
+        """Return the stamp with this `token`."""
         return cls(*_TOKEN.unpack(token))
 
     @property
     def token(self) -> bytes:
-        """The same as bytes, which is all that versions and the daemon know of it."""
+        """The stamp as bytes, the only form that versions and the daemon use."""
         return _TOKEN.pack(*self)
 
 
@@ -89,7 +89,7 @@ class Column(msgspec.Struct, frozen=True):
     shape
         Up to four dimensions; rows first.
     offset, nbytes
-        Where the C-contiguous array lies, counted from the start of the segment.
+        Position of the C-contiguous array from the start of the segment, and its size, bytes.
     unit
         SI unit of the values, empty where unknown.
     checksum
@@ -106,7 +106,7 @@ class Column(msgspec.Struct, frozen=True):
 
 
 class Lattice(NamedTuple):
-    """A global lattice and the box of it that a layer occupies.
+    """A global lattice, and the box of voxels in it that a layer occupies.
 
     A point lies in voxel ``floor(coordinate / leaf)`` along each axis, the same in every cell of a
     map.  An axis that the lattice does not divide (z of a height grid) has an infinite ``leaf``,
@@ -119,7 +119,7 @@ class Lattice(NamedTuple):
     first
         Index of the first voxel of the box along x, y, z.
     shape
-        Voxels of the box along x, y, z; 0 where nothing is occupied.
+        Voxels of the box along x, y, z; 0 if no voxel is occupied.
     """
 
     leaf: tuple[float, float, float]
@@ -132,14 +132,14 @@ ColumnRow: TypeAlias = tuple[str, "np.dtype[np.generic]", tuple[int, ...], int, 
 
 
 class SegmentHeader(msgspec.Struct, frozen=True):
-    """Everything a segment says about itself; metres, map frame.
+    """All fields of a segment's header; metres, map frame.
 
     ``box`` is the cell's (min_x, min_y, max_x, max_y); ``z_min``/``z_max`` bound the points and are
     NaN for an empty cell.  Coordinates in columns are relative to ``origin`` ((0, 0, 0) for
     `points`, which keeps the source's bits).  ``rows`` counts the points kept,
     ``source_points`` those in the file, ``dropped_points`` those left out as not finite,
     ``outside_points`` those kept although they lie outside ``box``.
-    For a computed layer ``rows`` are its own (points, voxels), and ``lattice`` is what they lie on.
+    For a computed layer ``rows`` counts its own rows (points, voxels), which lie on ``lattice``.
     """
 
     cell_id: str
@@ -167,13 +167,13 @@ def _up(value: int, step: int) -> int:
 
 
 def header_size(column_count: int, cell_id: str, layer: str, frame_id: str) -> int:
-    """Bytes of the header of such a segment: a whole number of pages."""
+    """Return the size of a segment's header in bytes, a multiple of the page size."""
     strings = len(cell_id.encode()) + len(layer.encode()) + len(frame_id.encode())
     return _up(COLUMNS_OFFSET + column_count * COLUMN.size + strings + TAIL_BYTES, PAGE_BYTES)
 
 
 def plan_columns(specs: Sequence[ColumnSpec], rows: int, header_bytes: int) -> tuple[tuple[Column, ...], int]:
-    """Place one column after the other, each 64-byte aligned; returns them and the total bytes."""
+    """Place one column after the other, each 64-byte aligned; return the columns and the total bytes."""
     columns = []
     offset = header_bytes
     for spec in specs:
@@ -187,7 +187,7 @@ def plan_columns(specs: Sequence[ColumnSpec], rows: int, header_bytes: int) -> t
 def plan_arrays(
     arrays: Mapping[str, NDArray[np.generic]], units: Mapping[str, str], header_bytes: int
 ) -> tuple[tuple[Column, ...], int]:
-    """Place arrays of any shapes, as `plan_columns` does; returns them and the total bytes."""
+    """Place arrays of any shapes as `plan_columns` does; return the columns and the total bytes."""
     columns = []
     offset = header_bytes
     for name, array in arrays.items():

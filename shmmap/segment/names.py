@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names in the shared-memory directory, and what is said where another file has one.
+"""Names in the shared-memory directory, and the error if another file has such a name.
 
-``/shmmap.<instance>.<unique>`` is a published segment; ``<unique>`` is 64 random bits, handed out
-by the daemon and never used again.  ``/shmmap.<instance>.<unique>.zombie`` is the same segment once
-retired: new readers cannot find it, old ones keep it.  ``/shmmap.<instance>.statistics`` is the one
-name that can be derived.
+``/shmmap.<instance>.<unique>`` is a published segment; ``<unique>`` is 64 random bits, chosen by the daemon
+and never used again.  ``/shmmap.<instance>.<unique>.zombie`` is the same segment after it was retired: new
+readers cannot find it, present readers keep it.  ``/shmmap.<instance>.statistics`` is the only name that
+follows from the instance alone.
 
-In /dev/shm and /tmp any account may make files, and only its owner (or root) can remove one.
+In /dev/shm and /tmp any account may create files, and only a file's owner (or root) can remove it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def check_instance(instance: str) -> str:
 
 
 def segment_prefix(instance: str) -> str:
-    """Return what every name of this instance starts with, slash included."""
+    """Return the prefix of all names of this instance, slash included."""
     return f"/shmmap.{instance}."
 
 
@@ -64,7 +64,7 @@ def statistics_name(instance: str) -> str:
 
 
 def usual_directory(instance: str, places: tuple[str, str] = (DEFAULT_SHM_DIR, HUGE_PAGES_DIR)) -> str:
-    """Return where the instance's names are, by default: /dev/shm, or on huge pages."""
+    """Return the instance's default directory: /dev/shm, or the one on huge pages."""
     plain, huge = places
     if os.path.exists(plain + statistics_name(instance)) or not os.path.ismount(huge):
         return plain
@@ -87,7 +87,7 @@ def retired_name(name: str) -> str:
 
 
 def is_retired(name: str) -> bool:
-    """Whether ``name`` is that of a retired segment."""
+    """Return whether ``name`` is that of a retired segment."""
     return name.endswith(_RETIRED)
 
 
@@ -101,22 +101,22 @@ _KINDS: Final = {
 
 
 def name_taken(what: str, path: str, error: OSError | None, *, otherwise: str) -> CannotStart:
-    """Return the error that says why ``path`` cannot be ours.
+    """Return the error for a ``path`` that the daemon cannot use.
 
     Parameters
     ----------
     what
-        What should have been there: "the lock file".
+        Purpose of the path: "the lock file".
     error
-        The kernel's refusal; None where it gave none, but what lies there is not ours.
+        The kernel's error; None if there was none, but the existing file is not the daemon's.
     otherwise
-        What else can be done than removing it: "choose another --instance".
+        Alternative to removing the file: "choose another --instance".
     """
-    import shlex  # clients take no names
+    import shlex  # clients create no names
 
     try:
         status = os.lstat(path)
-    except OSError:  # nothing is there: it is the place itself
+    except OSError:  # the file does not exist: the directory is the problem
         return CannotStart(f"{what} cannot be {path}: {_reason(error)}", hint=otherwise)
     kind = _KINDS.get(stat.S_IFMT(status.st_mode), "device")
     why = f" ({_reason(error)})" if error is not None else ""

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The users of a segment: what the kernel reports, not a timer.
+"""Find the users of a segment, from the kernel instead of a timer.
 
 A write lease (``F_SETLEASE``) on a file is granted only if no other descriptor or mapping of it exists.  That
 holds through renames, client crashes, SIGSTOP and daemon restarts, and costs 6 us.  A process that
 takes a lease must ignore SIGIO: an opener makes the kernel send it.
 
-*Which* session it is comes from open-file-description locks: a reader locks the one byte at its session's
-slot right after opening, and the lock lives as long as its mapping.
+*Which* session uses a segment is known from open-file-description locks: a reader locks the byte at its
+session's slot right after opening, and the lock lives as long as its mapping.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ __all__ = [
 MAX_SLOT: Final = (1 << 62) - 1
 MAX_RANGES: Final = 32
 TIMEOUT_S: Final = 0.02
-"""Time of the processor that asking for one segment's holders may take; 100 of them take 0.5 ms."""
+"""Processor time limit for listing one segment's holders; 100 holders take 0.5 ms."""
 LOADER_SLOT: Final = 0
-"""The daemon's own loaders lock this one while they look at a segment; no session has it."""
+"""Slot that the daemon's own loaders lock while they read a segment; no session has it."""
 
 _FLOCK: Final = struct.Struct("@hhqqi4x")  # struct flock of 64-bit Linux: type, whence, start, len, pid
 _OFD_GETLK: Final = 36
@@ -43,28 +43,28 @@ _OFD_SETLK: Final = 37
 
 
 def prepare_process() -> None:
-    """Ignore SIGIO; without this an opener that meets our lease would kill this process."""
-    import signal  # for daemons: clients take no lease
+    """Ignore SIGIO; otherwise a process that opens a leased file would kill this process."""
+    import signal  # daemons only: clients take no lease
 
     signal.signal(signal.SIGIO, signal.SIG_IGN)
 
 
 def lock_slot(fd: int, slot: int) -> None:
-    """Take the shared lock that says "session ``slot`` uses this"; the mapping keeps it."""
+    """Take the shared lock that marks a use by session ``slot``; the mapping keeps it."""
     fcntl.fcntl(fd, _OFD_SETLK, _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, slot, 1, 0))
 
 
 def has_slot(fd: int, slot: int) -> bool:
-    """Whether session ``slot`` holds the file, or a lock of a range covers it."""
+    """Return whether session ``slot`` holds the file, or a range lock covers that slot."""
     asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, slot, 1, 0)
     return bool(_FLOCK.unpack(fcntl.fcntl(fd, _OFD_GETLK, asked))[0] != fcntl.F_UNLCK)
 
 
 def in_use(fd: int) -> bool:
-    """Whether the file is open or mapped other than by this descriptor.
+    """Return whether the file is open or mapped other than by this descriptor.
 
-    By whatever process; an operator's pins are another thing.  The caller must own the
-    file (or be root) and hold no other descriptor or mapping of it.
+    The user may be any process; this is unrelated to pins by an operator.  The caller must own the file (or
+    be root) and hold no other descriptor or mapping of it.
     """
     if not keep_if_unused(fd):
         return True
@@ -74,7 +74,7 @@ def in_use(fd: int) -> bool:
 
 
 def keep_if_unused(fd: int) -> bool:
-    """Return `in_use`, negated; an open of the file waits from now on until ``fd`` is closed."""
+    """Return whether the file is unused; if it is, opens of the file block until ``fd`` is closed."""
     try:
         fcntl.fcntl(fd, fcntl.F_SETLEASE, fcntl.F_WRLCK)
     except BlockingIOError:
@@ -83,16 +83,16 @@ def keep_if_unused(fd: int) -> bool:
 
 
 def holders(fd: int, *, limit: int = 1024) -> list[int]:
-    """Slots of the sessions that hold the file, ascending, at most ``limit`` of them.
+    """Return the slots of the sessions that hold the file, ascending, at most ``limit`` of them.
 
-    Users without a lock are not among them.  The kernel answers with *some* conflicting lock of the
-    range asked about, so the range is split around each answer.  A reader may hold locks without
-    number, and each question takes the kernel longer the more there are: asking ends after
-    `TIMEOUT_S` or `MAX_RANGES` locks that are no session's, with what was found by then.
+    Users without a lock are not listed.  The kernel returns *some* conflicting lock of the queried range, so
+    the range is split around each result.  A reader may hold any number of locks, and queries slow down with
+    their number.  So the search ends after `TIMEOUT_S`, or after `MAX_RANGES` locks that belong to no
+    session, and returns the slots found so far.
     """
     found: list[int] = []
     ranges = [(0, MAX_SLOT)]
-    end_s = time.thread_time() + TIMEOUT_S  # of work: a busy machine does not make the answer shorter
+    end_s = time.thread_time() + TIMEOUT_S  # processor time: a busy machine does not shorten the result
     asked_times = strange = 0
     while ranges and len(found) < limit and strange < MAX_RANGES:
         asked_times += 1
@@ -107,7 +107,7 @@ def holders(fd: int, *, limit: int = 1024) -> list[int]:
         if length == 1:
             found.append(at)
         else:
-            strange += 1  # a lock over a range is no session's slot
+            strange += 1  # a lock of several bytes is no session's slot
         if at > first:
             ranges.append((first, at - 1))
         if end < last:

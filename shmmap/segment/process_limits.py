@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process may have no more of: descriptors, threads, memory, bytes of a file; the limit is named.
+"""Name the limit that a process has reached: descriptors, threads, memory, or file size.
 
-The kernel's own words ("Resource temporarily unavailable", "File too large") name none.
+The kernel's messages ("Resource temporarily unavailable", "File too large") do not name the limit.
 
-libzmq ends the process where it gets no descriptor or thread (``epoll.cpp``, ``thread.cpp``), so whether
-there are enough is found out before, by taking them for a moment.  Descriptors are taken as objects that
-close them when they go: an exception from a signal handler may come after any of them.
+libzmq aborts the process if it gets no descriptor or thread (``epoll.cpp``, ``thread.cpp``).  So a check
+takes the needed number for a moment beforehand.  It takes descriptors as objects that close them when they
+are dropped, since a signal handler's exception may arrive after any of them.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ __all__ = [
 _GONE_S: Final = 0.0001
 _GROUPS: Final = "/sys/fs/cgroup"
 _NO_ROOM: Final = ("Cannot allocate memory", "failed to map segment")
-"""What the dynamic loader says of a library for which there is no memory."""
+"""Messages of the dynamic loader for a library for which there is no memory."""
 
 
 def file_size_limit() -> int | None:
-    """Bytes that a file of this process may have (RLIMIT_FSIZE); None where there is no limit."""
-    import resource  # a client needs none of it as a rule
+    """Return the largest size of a file of this process (RLIMIT_FSIZE), bytes; None if there is no limit."""
+    import resource  # clients rarely need it
 
     soft, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     return None if soft == resource.RLIM_INFINITY else soft
 
 
 def limit_behind(error: BaseException) -> LimitReached | None:
-    """Return the error that names the limit which any other error comes of; None where it comes of none."""
+    """Return an error that names the limit which caused ``error``; None if no limit did."""
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EMFILE, errno.ENFILE):
         return no_files_left(OSError(number, ""))
@@ -57,7 +57,7 @@ def limit_behind(error: BaseException) -> LimitReached | None:
             hint="raise it above the size of the largest segment: ulimit -f, in a unit LimitFSIZE=",
         )
     is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM
-    # short of memory, CPython may lose the exception itself
+    # without memory, CPython may lose the exception itself
     is_memory = is_memory or (isinstance(error, SystemError) and bool(_memory_limits()))
     if is_memory or (isinstance(error, ImportError) and any(text in str(error) for text in _NO_ROOM)):
         return no_memory_left()
@@ -65,17 +65,17 @@ def limit_behind(error: BaseException) -> LimitReached | None:
 
 
 def check_files(count: int, what: str) -> None:
-    """Find out whether this process may open this many files more.
+    """Check that this process can open this many more files.
 
     Raises
     ------
     LimitReached
-        It may not; ``what`` needs them.
+        It cannot; the message names ``what`` as what needs them.
     """
     held: list[select.epoll] = []
     try:
         for _ in range(count):
-            held.append(select.epoll())  # noqa: PERF401  how many there were is said
+            held.append(select.epoll())  # noqa: PERF401  the message contains their number
     except OSError as error:
         left = len(held)
         held.clear()
@@ -86,7 +86,7 @@ def check_files(count: int, what: str) -> None:
 
 
 def no_files_left(error: Exception, what: str = "") -> LimitReached | None:
-    """Return the error that names the limit of open files which an error means; None where it means none."""
+    """Return an error that names the limit of open files if ``error`` means that; else None."""
     number = getattr(error, "errno", None)
     if number == errno.ENFILE:
         return LimitReached(
@@ -94,7 +94,7 @@ def no_files_left(error: Exception, what: str = "") -> LimitReached | None:
             hint="close some, or raise it: sysctl fs.file-max",
         )
     if number == errno.EMFILE or (number is None and _may_open_none()):
-        most = os.sysconf("SC_OPEN_MAX")  # as `resource` says, which would have to be loaded from a file
+        most = os.sysconf("SC_OPEN_MAX")  # as in `resource`, which would have to be loaded from a file
         return LimitReached(
             f"{what}this process has as many files open as it may, {most} (RLIMIT_NOFILE)",
             hint="close some, or raise the limit: ulimit -n, in a unit LimitNOFILE=",
@@ -111,12 +111,12 @@ def _may_open_none() -> bool:
 
 
 def check_threads(count: int, what: str) -> None:
-    """Find out whether this many threads more may be started.
+    """Check that this many more threads can be started.
 
     Raises
     ------
     LimitReached
-        They may not; ``what`` needs them.
+        They cannot; the message names ``what`` as what needs them.
     """
     stay = _thread.allocate_lock()
     started: list[str] = []
@@ -137,13 +137,13 @@ def check_threads(count: int, what: str) -> None:
         finally:
             while len(started) < begun:
                 time.sleep(0)
-    # a thread counts until the kernel has taken it off its list
+    # a thread counts until the kernel has removed it
     while any(map(os.path.exists, started)):
         time.sleep(_GONE_S)
 
 
 def no_threads_left(what: str = "") -> LimitReached:
-    """Return the error that names what limits threads, and how far each limit is."""
+    """Return an error that names the limits of threads, and how much of each is used."""
     limits = []
     if (most := os.sysconf("SC_CHILD_MAX")) >= 0:
         limits.append(f"{most} processes and threads of this user (RLIMIT_NPROC)")
@@ -158,7 +158,7 @@ def no_threads_left(what: str = "") -> LimitReached:
 
 
 def _group_limit() -> str | None:
-    """Return what the control group of this process allows, or the strictest of those above it."""
+    """Return the strictest thread limit of this process's control group and its ancestors."""
     limits = []
     try:
         with open("/proc/self/cgroup", encoding="utf-8") as file:
@@ -181,7 +181,7 @@ def _group_limit() -> str | None:
 
 
 def no_memory_left(nbytes: int | None = None) -> LimitReached:
-    """Return the error of a process that gets no more memory of its own, with what limits it."""
+    """Return the error for a process that gets no more private memory, with the limits that apply."""
     limits = ", ".join(_memory_limits()) or "no limit is set"
     what = "more private memory is" if nbytes is None else f"{nbytes} bytes of private memory are"
     return LimitReached(

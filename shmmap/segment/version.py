@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell's source, and versions: 64-bit numbers that name the bytes of one layer of one cell.
+"""Sources of cells, and versions: 64-bit numbers that identify the bytes of one layer of one cell.
 
-``LAYOUT.md`` has the recipe.  A cell's version is that of its ``points``.  It follows from the cell's id, its
-source's *stamp* and its box; a computed layer's from that, from how the layer is computed, and from the cells
-that it looks into.  So a version is the same across restarts, and differs as soon as anything changes
-that the bytes depend on.
+``LAYOUT.md`` has the formula.  A cell's version is that of its ``points``: a hash of the cell's id, its
+source's *stamp* and its box.  The version of a computed layer also depends on the computation and on the
+neighbouring cells that it reads.  So a version is the same across restarts, and changes with anything on
+which the bytes depend.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = [
 
 
 class Source(msgspec.Struct, frozen=True, array_like=True):
-    """Where a cell's points come from.
+    """Source of a cell's points.
 
     Attributes
     ----------
     name
-        What messages call it; of a file its path, which is all there is to know.
+        Name in messages; for a file its path, which identifies it completely.
     words
-        What the origin that named it says beside, for its own reader (`shmmap.layers.sources`) alone.
+        Further data from the origin, only for the origin's own reader (`shmmap.layers.sources`).
     """
 
     name: str
@@ -41,8 +41,7 @@ class Source(msgspec.Struct, frozen=True, array_like=True):
 
 
 Stamp: TypeAlias = bytes
-"""Names one state of a cell's source.  Only the origin that made it knows what it says: of a file, what
-``stat`` says (`shmmap.segment.layout.SourceStamp`); elsewhere a hash of the content, say."""
+"""Identifies one state of a cell's source.  Only the origin that made it interprets it."""
 
 _LENGTH: Final = struct.Struct("<I")
 _BOX: Final = struct.Struct("<4d")
@@ -63,13 +62,13 @@ def layer_version(cell: int, layer: str, builder_version: int, neighbours: Seque
     Parameters
     ----------
     cell
-        Version of its cell.
+        Version of the layer's cell.
     layer
-        Its spec in canonical form.
+        The layer's spec in canonical form.
     builder_version
-        Of the code that computes it, as the segment's header has it.
+        Version of the code that computes the layer, as in the segment's header.
     neighbours
-        Versions of the cells that it looks into beside its own, in id order.
+        Versions of the other cells that the computation reads, in id order.
     """
     spec = layer.encode()
     return xxh3_64_intdigest(

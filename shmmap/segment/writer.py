@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a segment into a file descriptor: columns in blocks of rows, or a finished table of arrays.
+"""Write a segment into a file descriptor: columns in blocks of rows, or a finished table of arrays.
 
-Everything goes through ``pwrite``: twice as fast as filling a fresh mapping, and a full file
-system is an error (ENOSPC) instead of SIGBUS.  The header is written last, so that a half-written
-segment never looks like one.
+All data is written by ``pwrite``: that is twice as fast as filling a fresh mapping, and a full file system is
+an error (ENOSPC) instead of SIGBUS.  The header is written last, so that an incomplete segment is never
+valid.
 """
 
 from __future__ import annotations
@@ -40,12 +40,11 @@ __all__ = [
 
 
 PIECE_BYTES: Final = 1 << 16
-"""Written at a time, in 30 us: in between, other work for this processor may run.  A client that
-its reply has just woken would else wait until the loader beside it has to wait for something."""
+"""Bytes per write, about 30 us: between writes other work may run on this processor.  Otherwise a client just woken by its reply would wait until the loader on the same processor blocks."""
 
 
 def write_all(fd: int, data: memoryview, offset: int) -> None:
-    """Write all of ``data`` at ``offset``; a short write is continued where it stopped."""
+    """Write all of ``data`` at ``offset``, continuing after short writes."""
     while data:
         written = os.pwrite(fd, data[:PIECE_BYTES], offset)
         data = data[written:]
@@ -68,7 +67,7 @@ class SegmentWriter:
     Attributes
     ----------
     total_bytes
-        Size of the finished segment: what must be reserved before `start`.
+        Size of the finished segment, to be reserved before `start`.
     """
 
     def __init__(
@@ -98,10 +97,10 @@ class SegmentWriter:
         )
 
     def start(self, fd: int) -> None:
-        """Take the empty file to write into.
+        """Set the empty file to write into.
 
-        Nothing is allocated here: ``pwrite`` reaches every page and says ENOSPC itself, so no page is
-        left for a reader to stumble over (SIGBUS), and allocating first costs 4 % of a load.
+        Nothing is allocated here: ``pwrite`` writes every page and reports ENOSPC itself, so no page is
+        missing for a reader (SIGBUS).  Allocating first would cost 4 % of a load.
         """
         os.ftruncate(fd, self.total_bytes)
         self._fd = fd
@@ -127,12 +126,12 @@ class SegmentWriter:
         outside_points: int = 0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> SegmentHeader:
-        """Write the header; the segment is whole after this.
+        """Write the header, which completes the segment.
 
         Raises
         ------
         ValueError
-            If a column did not get exactly its rows.
+            A column did not receive exactly its number of rows.
         """
         columns: list[Column] = []
         for column, end, digest in zip(self._columns, self._at, self._hashes, strict=True):
@@ -161,7 +160,7 @@ class SegmentWriter:
 
 @dataclass(frozen=True, slots=True)
 class SegmentOrigin:
-    """What a segment says about the cell and the file it was made from.
+    """The parts of a segment's header about its cell and its source file.
 
     ``box`` (min_x, min_y, max_x, max_y) in metres; ``source_points``, ``dropped_points`` and
     ``outside_points`` count the file's points, those left out as not finite, those outside the box.
@@ -200,9 +199,9 @@ def write_table(
     columns
         C-contiguous little-endian arrays of up to four dimensions, in order.
     rows
-        What the header and handles count.
+        Number of rows in the header and in handles.
     reserve
-        Called with the segment's size in bytes before anything is written; it refuses by raising.
+        Called with the segment's size in bytes before anything is written; raises to refuse.
 
     Returns
     -------

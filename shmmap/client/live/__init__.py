@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps: a map that is written while it is read.  `shmmap.Client.live` gives one."""
+"""Live maps: maps that are written while they are read.  `shmmap.Client.live` returns one."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Look up voxels and rays in copies of chunks; the daemon lists which chunks there are.
 
-A chunk is opened, read and closed each time that it is looked at: nothing is held that its writer might wait
-for, or whose memory it could not free.
+A chunk is opened, read and closed at each access.  So no reader delays a writer or keeps a chunk's memory
+from being freed.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from shmmap.errors import SegmentCorrupt, SegmentError, StaleHandle
 __all__ = ["ChunkInfo", "ChunkReader", "Place"]
 
 MAX_COPIES: Final = 512
-"""Chunks of which copies are kept; the longest unused go first."""
+"""Number of chunk copies that are kept; the least recently used are dropped first."""
 VOXELS_PER_STEP: Final = 1 << 20
-"""Voxels of rays that are looked up at a time."""
+"""Number of voxels along rays that are looked up in one step."""
 ROUNDS: Final = 8
-"""How often to look again for a chunk that is gone before it is read."""
+"""How often a chunk that vanished before it was read is looked for again."""
 _FLAGS: Final = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
@@ -37,16 +37,16 @@ class ChunkInfo(msgspec.Struct, frozen=True):
     Attributes
     ----------
     state
-        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, or ``saved``:
-        on disk alone.
+        ``loading``, ``clean``, ``dirty`` (changed since it was saved), ``saving``, or ``saved`` (only on
+        disk).
     active, occupied, free
-        Known voxels, and of these occupied and free ones.
+        Number of known voxels, and how many of these are occupied and free.
     bytes
-        Of its memory, or of its file.
+        Size of its memory, or of its file if it is only on disk.
     version
-        Rises with each scan that it takes in.
+        Increases with each scan that is applied to the chunk.
     generation
-        Changes each time that it comes into memory; 0 where it is not.
+        Changes each time that the chunk is loaded into memory; 0 if it is not in memory.
     """
 
     key: ChunkKey
@@ -60,7 +60,7 @@ class ChunkInfo(msgspec.Struct, frozen=True):
 
 
 class Place(NamedTuple):
-    """Where the chunks of a map are: their paths begin with ``prefix``; and what they must be."""
+    """Location of a map's chunks (paths begin with ``prefix``), and the properties that they must have."""
 
     prefix: str
     map_id: bytes
@@ -69,11 +69,11 @@ class Place(NamedTuple):
 
 
 Changed: TypeAlias = tuple[dict[ChunkKey, ChunkInfo], list[ChunkKey], int, bool]
-"""Chunks that changed; those that left memory; the number of the last change; whether ``since`` was known."""
+"""Changed chunks; keys of chunks that left memory; number of the last change; whether ``since`` was known."""
 
 
 class _Copy(NamedTuple):
-    """A chunk as it was at one moment: ``view`` is of the file ``inode``, at its ``sequence``."""
+    """Copy of a chunk: ``view`` holds the content of the file ``inode`` at its ``sequence``."""
 
     generation: int
     inode: int
@@ -87,9 +87,9 @@ class ChunkReader:
     Parameters
     ----------
     place
-        Returns where they are now.
+        Returns the present location of the chunks.
     changes
-        Returns what came after the change of a number; 0: everything.
+        Returns the changes after the change with a given number; 0: all.
     """
 
     def __init__(self, place: Callable[[], Place], changes: Callable[[int], Changed]) -> None:
@@ -100,12 +100,12 @@ class ChunkReader:
         self._change = 0
 
     def look_up(self, xyz: NDArray[np.float64]) -> NDArray[np.int16]:
-        """Return log-odds of the voxels in which points lie, (N,) thousandths; 0 where nothing is known."""
+        """Return log-odds of the voxels that contain the points, (N,) thousandths; 0 for unknown voxels."""
         self._refresh()
         return self._look_up(voxel_indices(xyz, self._place().resolution))
 
     def first_hits(self, origins: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return metres to the centre of the first occupied voxel of each ray, (N,); infinity for none."""
+        """Return the distance to the first occupied voxel's centre on each ray, (N,) metres, or infinity."""
         resolution = self._place().resolution
         first, last = voxel_indices(origins, resolution), voxel_indices(ends, resolution)
         steps = np.abs(last.astype(np.int64) - first).max(axis=1, initial=0)
@@ -118,7 +118,7 @@ class ChunkReader:
         return found
 
     def _refresh(self) -> None:
-        """Learn which chunks are in memory now."""
+        """Update the list of chunks in memory."""
         rows, gone, change, known = self._changes(self._change)
         if not known or not self._change:
             self._rows = rows
@@ -129,16 +129,17 @@ class ChunkReader:
         self._change = change
 
     def _read(self, key: ChunkKey) -> ChunkView | None:
-        """Return a chunk in memory as it is now; None where there is none.
+        """Return the present content of a chunk in memory; None if it is not in memory.
 
         Raises
         ------
         StaleHandle
-            It is gone, or its writer died in the middle of a change: the next writer repairs or replaces it.
+            The chunk is gone, or its writer died in the middle of a change; the next writer repairs or
+            replaces it.
         SegmentError
-            This user may not read it.
+            This user may not read the chunk.
         SegmentCorrupt
-            It is not the chunk that it should be.
+            The file is not the expected chunk.
         """
         row = self._rows.get(key)
         copy = self._copies.pop(key, None)
@@ -154,7 +155,7 @@ class ChunkReader:
             raise SegmentError(f"{path}: {error.strerror}", hint="see `shmmap doctor`") from error
         try:
             inode = os.fstat(fd).st_ino
-            # not its version: a change that a writer's death undid may come again with other content
+            # not its version: a change undone by a writer's death may be repeated with other content
             if copy is None or copy[:3] != (row.generation, inode, sequence_of(fd, path)):
                 view = read_chunk(fd, path)
                 if view is None:
@@ -171,7 +172,7 @@ class ChunkReader:
             raise SegmentError(f"{path}: {error.strerror}") from error
         finally:
             os.close(fd)
-        self._copies[key] = copy  # the last used comes last
+        self._copies[key] = copy  # most recently used at the end
         while len(self._copies) > MAX_COPIES:
             self._copies.pop(next(iter(self._copies)))
         return copy.view
@@ -195,11 +196,11 @@ class ChunkReader:
         return found
 
     def _now(self, key: ChunkKey) -> ChunkView | None:
-        """Return a chunk in memory, in its newest generation; None where there is none."""
+        """Return the newest generation of a chunk in memory; None if it is not in memory."""
         for _ in range(ROUNDS):
             try:
                 return self._read(key)
-            except StaleHandle:  # noqa: PERF203  asked again, a few times
+            except StaleHandle:  # noqa: PERF203  retried a few times
                 self._refresh()
         raise SegmentError(f"chunk {key.text} is written and given up all the time", hint="ask again")
 

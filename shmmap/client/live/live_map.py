@@ -37,9 +37,9 @@ LIST_S: Final = 60.0
 """How long a list of voxels may take, beyond the timeout of any request."""
 SAVE_S: Final = 300.0
 MAX_RAY_VOXELS: Final = 100_000
-"""Length of a ray along an axis: 5 km of voxels of 5 cm take about half a second."""
+"""Longest ray along an axis, in voxels: 5 km of voxels of 5 cm take about half a second."""
 LIST_TRIES: Final = 4
-"""How often a list of voxels is requested until one is not removed while it is read."""
+"""How often a list of voxels is requested: a list may be removed while it is read."""
 _VOXEL_BYTES: Final = 14
 
 
@@ -65,7 +65,7 @@ class Voxels:
     resolution
         Edge of a voxel, metres.
     change
-        Number of the map's last change before: pass it as ``since`` to get what came after.
+        Number of the map's last change before the list was made; pass it as ``since`` to get later changes.
     """
 
     indices: NDArray[np.int32]
@@ -83,7 +83,7 @@ class Voxels:
 
     @property
     def probability(self) -> NDArray[np.float64]:
-        """Probability that each is occupied, (N,), between 0 and 1."""
+        """Probability that each voxel is occupied, (N,), between 0 and 1."""
         odds = self.log_odds.astype(np.float64) / 1000.0
         chance: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-odds))
         return chance
@@ -95,9 +95,9 @@ class LiveMap:
     Attributes
     ----------
     name, frame_id
-        The map's, and that of its frame.
+        Names of the map and of its frame.
     map_id
-        16 bytes: no other map has them.
+        Unique id of the map, 16 bytes.
     resolution
         Edge of a voxel, metres.
     """
@@ -117,14 +117,14 @@ class LiveMap:
         self.map_id, self.resolution, self.frame_id = opened.map_id, opened.resolution, opened.frame_id
 
     def _ask(self, make: Callable[[int], messages.LiveRequest], kind: type[R], *, quiet_s: float = 0.0) -> R:
-        """Send a request; again if the process that keeps live maps is restarting."""
+        """Send a request; repeat it while the process that keeps live maps is restarting."""
         return until_served(
             lambda: self._session.ask(make, kind, quiet_s=quiet_s), self._session.timeout_s + quiet_s
         )
 
     @property
     def occupancy(self) -> Occupancy:
-        """What a hit and a miss are worth, as set when the map was made."""
+        """The map's log-odds parameters (weights of hits and misses), as set when it was created."""
         return Occupancy(*self._opened.probabilities)
 
     def __repr__(self) -> str:
@@ -138,20 +138,21 @@ class LiveMap:
         resume: bool = False,
         timeout_s: float = 60.0,
     ) -> LiveMapper:
-        """Send scans to this map.
+        """Return a mapper that sends scans to this map.
 
         Parameters
         ----------
         name
-            Name of the mapper, at most 64 characters: each program that maps has its own, and keeps it.
+            Name of the mapper, at most 64 characters.  Each mapping program has its own, the same in every
+            run.
         scan_filter
-            Which points count.
+            Selects the points to use.
         resume
-            For a program that adds the same scans in the same order each time, from files: it must go on with
-            the scan after `LiveMapper.applied`. If it begins before that, scans get other numbers, and count
-            again.
+            For a program that adds the same scans in the same order in every run, from files: it must
+            continue with the scan after `LiveMapper.applied`.  If it begins earlier, scans get other numbers
+            and are counted twice.
         timeout_s
-            How long a scan may take until it is applied, a restart of the daemon included.
+            Seconds until a scan must be applied, a restart of the daemon included.
 
         Raises
         ------
@@ -168,19 +169,19 @@ class LiveMap:
         )
 
     def move_to(self, x: float, y: float, z: float) -> None:
-        """Set where this process is, metres in the map's frame: chunks around it stay in memory."""
+        """Set this process's position, metres in the map's frame: chunks around it stay in memory."""
         place = _points("position", [x, y, z])[0].tolist()
         self._ask(lambda n: messages.LiveMove(n, self.name, tuple(place)), messages.LiveMoved)
 
     def save(self, *, timeout_s: float = SAVE_S) -> int:
-        """Save everything that has been applied; return how many files there are.
+        """Save all applied scans; return the number of files of the map.
 
         Raises
         ------
         NotPermitted
             This user may not map.
         NoAnswer
-            It took longer: a disk is full, or slow; see `status`.
+            Saving took longer, because a disk is full or slow; see `status`.
         """
         seconds = checked_seconds("timeout_s", timeout_s)
         reply = self._ask(lambda n: messages.LiveSave(n, self.name), messages.LiveDurable, quiet_s=seconds)
@@ -204,14 +205,14 @@ class LiveMap:
         area
             Only chunks that touch it.
         saved
-            Also list those that are on disk alone.
+            Also list chunks that are only on disk.
         """
         return list(self._pages(area, 0, saved=saved)[0].values())
 
     def _pages(
         self, area: geometry.Box | Sphere | None, since: int, *, saved: bool = False
     ) -> tuple[dict[ChunkKey, ChunkInfo], list[ChunkKey], int, bool]:
-        """Return chunks that changed after ``since`` and that left, the last change, and if it is known."""
+        """Return changed chunks, keys that left memory, the last change, and whether ``since`` is known."""
         message = _area(area)
         found: dict[ChunkKey, ChunkInfo] = {}
         gone: list[ChunkKey] = []
@@ -253,7 +254,7 @@ class LiveMap:
         scope: str = "memory",
         since: int = 0,
     ) -> Voxels:
-        """List the voxels of an area; the daemon puts them together.
+        """List the voxels of an area; the daemon collects them.
 
         Parameters
         ----------
@@ -262,14 +263,14 @@ class LiveMap:
         area
             Only voxels whose centres lie in it; None: all.
         scope
-            ``memory``, ``disk`` (as last saved), or ``all``: what is not in memory as last saved.
+            ``memory``, ``disk`` (as last saved), or ``all``: chunks in memory, and all others as last saved.
         since
             `Voxels.change` of a previous list: only voxels of chunks that have changed since.
 
         Raises
         ------
         OverBudget
-            There are too many for the daemon's memory: ask for a smaller area.
+            There are too many voxels for the daemon's memory; request a smaller area.
         """
         message = _area(area)
 
@@ -297,7 +298,7 @@ class LiveMap:
         return self.voxels("free", area).xyz
 
     def log_odds(self, xyz: ArrayLike) -> NDArray[np.int16]:
-        """Return what is known of the voxels in which points lie, from chunks in memory.
+        """Return the log-odds of the voxels that contain the points, from chunks in memory.
 
         Parameters
         ----------
@@ -306,24 +307,24 @@ class LiveMap:
 
         Returns
         -------
-        (N,) int16, thousandths: above `occupied_above` occupied, below `free_below` free, 0 unknown.
+        (N,) int16, thousandths: occupied above `occupied_above`, free below `free_below`, unknown at 0.
         """
         return self._reader.look_up(_points("xyz", xyz))
 
     @property
     def occupied_above(self) -> int:
-        """Voxels of more log-odds are occupied; thousandths."""
+        """Log-odds above which a voxel is occupied, thousandths."""
         return self._opened.occupied_above
 
     @property
     def free_below(self) -> int:
-        """Voxels of less log-odds are free; thousandths."""
+        """Log-odds below which a voxel is free, thousandths."""
         return self._opened.free_below
 
     def first_hits(self, origins: ArrayLike, ends: ArrayLike) -> NDArray[np.float64]:
-        """Return how far rays get: the distance to the first occupied voxel on each.
+        """Return the distance to the first occupied voxel on each ray.
 
-        The walk is that of mapping: a ray visits as many voxels as its longest axis has steps.
+        Rays are traversed as in mapping: a ray visits one voxel per step along its longest axis.
 
         Parameters
         ----------
@@ -332,13 +333,13 @@ class LiveMap:
 
         Returns
         -------
-        (N,) float64, metres from the origin to the centre of the first occupied voxel; infinity where there
-        is none up to the last voxel, which is included.
+        (N,) float64, metres from the origin to the centre of the first occupied voxel; infinity if no voxel
+        is occupied up to and including the last one.
 
         Raises
         ------
         BadRequest
-            A ray is longer than 100 000 voxels along an axis, or is none.
+            A ray is longer than 100 000 voxels along an axis, or is not a valid ray.
         """
         ends = _points("ends", ends)
         origins = _points("origins", origins)
@@ -357,7 +358,7 @@ class LiveMap:
 
 
 def _points(what: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Return places as (N, 3); raise BadRequest where they are none, or masked."""
+    """Return points as an (N, 3) array; raise BadRequest if they are invalid or masked."""
     try:
         if np.ma.is_masked(values):
             raise ValueError("some are masked")
@@ -383,7 +384,7 @@ def _area(area: geometry.Box | Sphere | None) -> LiveArea | None:
 
 
 def _metres(*values: float) -> tuple[float, ...]:
-    """Return numbers as they can be sent; raise BadRequest where one is greater than any float."""
+    """Return numbers as floats to send; raise BadRequest if one is too large for a float."""
     try:
         return tuple(float(value) for value in values)
     except OverflowError as error:
@@ -396,9 +397,9 @@ def _read_voxels(path: str, count: int, resolution: float, change: int) -> Voxel
     Raises
     ------
     StaleHandle
-        It is gone, in part or whole: it is kept for some seconds only.
+        The list is partly or wholly removed: the daemon keeps it for a few seconds only.
     SegmentError, SegmentCorrupt
-        It may not be read, or has another size.
+        The file is not readable for this user, or has another size.
     """
     if not count:
         return Voxels(np.empty((0, 3), np.int32), np.empty(0, np.int16), resolution, change)
@@ -413,7 +414,7 @@ def _read_voxels(path: str, count: int, resolution: float, change: int) -> Voxel
         at = 0
         while at < len(data) and (some := os.preadv(fd, [data.data[at:]], at)):
             at += some
-        size = os.fstat(fd).st_size  # after that: what was cut meanwhile has lost its end first
+        size = os.fstat(fd).st_size  # after reading: a file truncated meanwhile is shorter now
     except OSError as error:
         raise SegmentError(f"{path}: {error.strerror}") from error
     finally:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`LiveMapper`: scans become marks here, and the daemon's live worker puts them into the map, each once.
+"""`LiveMapper`: turn scans into marks, which the daemon's live worker applies to the map exactly once.
 
-The thread that calls `LiveMapper.add` marks; another one, with a session of its own, sends and waits for the
-answers.  What the daemon has not answered is sent again when it, or its worker, has come back.
+The thread that calls `LiveMapper.add` computes the marks.  A second thread, with its own session, sends them
+and waits for the answers.  Marks without an answer are sent again after a restart of the daemon or its
+worker.
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ if TYPE_CHECKING:
 __all__ = ["LiveMapper"]
 
 PASSING: Final = (LiveInterrupted, Busy, DaemonUnreachable)
-"""Errors that pass by themselves."""
+"""Temporary errors: sending is retried."""
 MAX_UNANSWERED: Final = 3
-"""Scans that are marked and not answered; `LiveMapper.add` waits when there are as many."""
+"""Most scans without an answer; `LiveMapper.add` waits while there are this many."""
 LAST_S: Final = 1.0
-"""How long unanswered scans may take at the end of a program that has not closed the mapper."""
+"""Time for unanswered scans at the end of a program that has not closed the mapper."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Marked:
-    """A scan to send: what it says of voxels, and where the sensor was."""
+    """A scan to send: its marks of voxels, and the sensor's position."""
 
     number: int
     data: bytes
@@ -67,13 +68,13 @@ class _Sender:
     opened
         The daemon's description of the map.
     applied, durable
-        Numbers of scans, as of the last answer.
+        Numbers of the last applied and the last durable scan, as of the last answer.
     error
-        Why a scan, and all after it, did not get into the map.
+        Error because of which a scan, and all scans after it, were not applied.
     trouble
-        Why the next one is not in the map yet: it is sent until it is.
+        Why the next scan is not applied yet; sending is retried.
     changed
-        Notified when one of these changes.
+        Notified when one of these attributes changes.
     """
 
     def __init__(
@@ -97,12 +98,12 @@ class _Sender:
         self._thread.start()
 
     def put(self, scan: _Marked) -> None:
-        """Send a scan when those before are answered; wait while too many are unanswered.
+        """Queue a scan for sending; wait while too many scans are unanswered.
 
         Raises
         ------
         ShmmapError
-            `error`; or it was not taken in time, and may be added again.
+            The stored `error`; or the scan was not accepted in time, and may be added again.
         """
         with self.changed:
             taken = self.changed.wait_for(
@@ -119,14 +120,14 @@ class _Sender:
             self.changed.notify_all()
 
     def end(self, *, timeout_s: float | None = None) -> None:
-        """Send what is unanswered, then end the session; wait for that, for at most these seconds."""
+        """Send the unanswered scans, then end the session; wait at most ``timeout_s`` seconds for that."""
         with self.changed:
             self._ending = True
             self.changed.notify_all()
         self._thread.join(timeout_s)
 
     def save(self, timeout_s: float) -> int:
-        """Save everything, when all is applied; return the number up to which scans are durable."""
+        """Wait until all scans are applied, and save them; return the number of the last durable scan."""
         reply = until_served(
             lambda: self._connection.ask(
                 messages.LiveSave(self._connection.new_request(), self._map), messages.LiveDurable,
@@ -134,7 +135,7 @@ class _Sender:
             ),
             timeout_s,
         )  # fmt: skip
-        # a restarted worker does not know what came before, and has it saved all the same
+        # a restarted worker does not know earlier scans, which are saved all the same
         self.durable = max(reply.scan, self.applied)
         return self.durable
 
@@ -152,7 +153,7 @@ class _Sender:
                     if isinstance(error, PASSING) and not self._ending:
                         continue
                     self.error = error
-                    self._waiting.clear()  # what comes later cannot go in before it
+                    self._waiting.clear()  # later scans cannot be applied before it
                     self.changed.notify_all()
             else:
                 with self.changed:
@@ -173,12 +174,12 @@ class _Sender:
         )
 
     def _send(self, scan: _Marked) -> int:
-        """Send a scan until it is answered; return the scan up to which all are durable."""
+        """Send a scan until it is answered; return the number of the last durable scan."""
         end_s = time.monotonic() + self._timeout_s
         while True:
             try:
                 return self._try(scan, max(0.1, end_s - time.monotonic()))
-            except PASSING as error:  # noqa: PERF203  until it is there again
+            except PASSING as error:  # noqa: PERF203  until it is available again
                 self.trouble = error
                 if time.monotonic() >= end_s:
                     raise
@@ -211,9 +212,9 @@ class LiveMapper:
     Attributes
     ----------
     name
-        Under which it maps.
+        Name under which this mapper sends scans.
     counts : ScanCounts
-        What became of the points of the last scan.
+        How many points of the last scan were used, and how many were left out and why.
     """
 
     def __init__(
@@ -228,7 +229,7 @@ class LiveMapper:
         sender = self._sender = _Sender(
             session.path, live_map, name, frame_id, session.timeout_s, timeout_s, resume=resume
         )
-        # also without a call of close(), and at the end of the program
+        # runs also without close(), and at interpreter exit
         self._end = weakref.finalize(self, sender.end, timeout_s=LAST_S)
         self._marker = Marker(sender.opened.resolution, scan_filter)
         self._last = sender.applied
@@ -240,7 +241,7 @@ class LiveMapper:
         self.close()
 
     def close(self) -> None:
-        """Send what is unanswered, wait until it is applied, and end the session; raise no error."""
+        """Send the unanswered scans, wait until they are applied, and end the session; raise no error."""
         if self._end.detach() is not None:
             self._sender.end()
 
@@ -250,8 +251,8 @@ class LiveMapper:
         Parameters
         ----------
         points
-            (N, 3) float32 or float64, metres in the sensor's frame; those that are masked or not finite are
-            left out.
+            (N, 3) float32 or float64, metres in the sensor's frame; masked and non-finite points are left
+            out.
         pose
             (3, 4) or (4, 4): rotation and position of the sensor in the map's frame, metres.
 
@@ -262,13 +263,13 @@ class LiveMapper:
         Raises
         ------
         BadRequest
-            A shape is wrong, the pose is no rotation and finite position within the map's reach, the scan
-            touches too much, or the mapper is closed.
+            A shape is wrong, the pose is not a rotation with a finite position within the map's range, the
+            scan touches too many voxels, or the mapper is closed.
         LiveInterrupted, Busy, DaemonUnreachable
-            Earlier scans could not be sent for as long as the mapper's timeout.  They are still being sent;
-            this one was not taken and may be added again.
+            Earlier scans could not be sent within the mapper's timeout, and are still being sent.  This scan
+            was not accepted and may be added again.
         ShmmapError
-            Why an earlier scan, and all after it, did not get into the map.
+            The error because of which an earlier scan, and all scans after it, were not applied.
         """
         if not self._end.alive:
             raise BadRequest("this mapper is closed", hint="open another one")
@@ -287,23 +288,23 @@ class LiveMapper:
 
     @property
     def applied(self) -> int:
-        """All scans up to this one are in the map: no death of a process takes them out."""
+        """Number of the last applied scan; applied scans survive the death of any process."""
         return self._sender.applied
 
     @property
     def durable(self) -> int:
-        """All scans up to this one are on the disk, as of the last answer."""
+        """Number of the last scan on disk, as of the last answer."""
         return self._sender.durable
 
     def wait_applied(self, timeout_s: float | None = None) -> int:
-        """Wait until every scan that was added is applied; return the last one's number.
+        """Wait until every added scan is applied; return the number of the last scan.
 
         Raises
         ------
         NoAnswer
-            It took longer than ``timeout_s`` seconds (None: than the mapper's own).
+            That took longer than ``timeout_s`` seconds (None: the mapper's own timeout).
         ShmmapError
-            Why one could not be applied.
+            The error because of which a scan could not be applied.
         """
         timeout_s = self._timeout_s if timeout_s is None else checked_seconds("timeout_s", timeout_s)
         sender = self._sender
@@ -318,7 +319,7 @@ class LiveMapper:
         return sender.applied
 
     def wait_durable(self, timeout_s: float = 300.0) -> int:
-        """Save everything; return the number up to which all scans are on the disk.
+        """Save all scans; return the number of the last scan on disk.
 
         Raises as `wait_applied`.
         """
@@ -333,14 +334,14 @@ def _write(path: str, data: bytes) -> None:
     Raises
     ------
     LiveInterrupted
-        There is no directory for it just now, or no memory.
+        The directory does not exist at present, or there is no memory.
     CannotWrite
-        This user may not.
+        This user may not create the file.
     """
     try:
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
         with open(fd, "wb") as file:
-            os.fchmod(fd, 0o644)  # whatever the umask: the daemon may be another user
+            os.fchmod(fd, 0o644)  # despite the umask: the daemon may run as another user
             file.write(data)
     except OSError as error:
         if error.errno in (errno.ENOENT, errno.ENOSPC, errno.EDQUOT, errno.ENOMEM):

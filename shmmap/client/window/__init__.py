@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells around a moving pose, kept current in a thread."""
+"""Windows: the cells around a moving pose, kept current in a thread."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What keeps a window current: a thread that asks, attaches and unmaps, or the call that moves the window.
+"""Keep a window current: in a thread that requests, attaches and unmaps, or in the call that sets the pose.
 
-Either asks the daemon when the pose has moved (`shmmap.client.window.state.moved`), when
-``refresh_interval_s`` have passed since it last asked, and while something is missing.
+Both send a request when the pose has moved (`shmmap.client.window.state.moved`), ``refresh_interval_s``
+seconds after the last request, and while cells are missing.
 """
 
 from __future__ import annotations
@@ -30,36 +30,35 @@ from shmmap.segment.process_limits import no_files_left
 __all__ = ["BlockingFollower", "WindowFollower"]
 
 _PENDING_WAIT_S: Final = 0.25
-"""How long one request waits for loads: what is ready then is shown, and a new pose is taken."""
+"""How long one request waits for loads; then the loaded cells are published, and a new pose is accepted."""
 
-_RETRY_S: Final = 0.05  # first pause after an answer that brought nothing although something is missing
+_RETRY_S: Final = 0.05  # first pause after an answer without new cells while cells are missing
 _RETRY_MAX_S: Final = 1.0  # pauses double up to this
-_OVER_S: Final = 0.5  # a wait for the thread's end looks again after this long
+_OVER_S: Final = 0.5  # interval at which a wait for the thread's end checks again
 
-_BLOCKING_WAIT_S: Final = 5.0  # of a call that does not say how long it may take
-_FIRST_PAUSE_S: Final = 0.005  # between a call's requests for what does not fit; doubles
-_STALLED_S: Final = 0.5  # a call gives up on what does not fit after this long without progress
+_BLOCKING_WAIT_S: Final = 5.0  # wait of a call without a given one
+_FIRST_PAUSE_S: Final = 0.005  # between a call's requests for cells that do not fit; doubles
+_STALLED_S: Final = 0.5  # a call gives up on cells that do not fit after this long without progress
 
 
 class WindowFollower:
     """Keeps a window current in a thread of its own.
 
-    Everything reaches the thread through one queue: new poses, memory to unmap, that the connection
-    broke, the end.
-    Everything leaves it by replacing one attribute; that is waited for in queues, not by a lock that a
-    signal handler's exception could leave taken.
+    All inputs reach the thread through one queue: new poses, memory to unmap, loss of the connection, the
+    end. Its only output is the attribute `state`, which it replaces.  Callers wait for that in queues, not by
+    a lock that a signal handler's exception could leave locked.
 
     Parameters
     ----------
     owner
-        Whose thread it is: see `shmmap.client.connection_watch`.
+        The object that stops the thread; see `shmmap.client.connection_watch`.
 
     Attributes
     ----------
     state : WindowState
-        The latest; read it from any thread.
+        The latest state, readable from any thread.
     error : ShmmapError or None
-        Why the last request failed, None after one that did not.
+        The error of the last request; None if it succeeded.
     stale_since : float or None
         `time.monotonic` of the first failure after the last success.
     """
@@ -83,7 +82,7 @@ class WindowFollower:
         self._called = False
         self._stopping = False
         self._pause_s = 0.0
-        self._due_s = math.inf  # nothing to ask before there is a pose
+        self._due_s = math.inf  # no request before the first pose
         self._waiters: list[weakref.ref[SimpleQueue[None]]] = []
         self._over: SimpleQueue[None] = SimpleQueue()
         self._ended = False
@@ -112,7 +111,7 @@ class WindowFollower:
         return pose is not None and not moved(state, pose, self._update_distance)
 
     def move(self, pose: Intent, wait_s: float | None) -> WindowState:
-        """Take a new pose and return a state: at once, or when it is current, at the latest after ``wait_s``.
+        """Set a new pose and return a state: the current one at once, or one for this pose within ``wait_s``.
 
         Raises
         ------
@@ -125,22 +124,22 @@ class WindowFollower:
             )
         self._pose = pose
         if not self._called and moved(self.state, pose, self._update_distance):
-            self._called = True  # once is enough, however often poses come
+            self._called = True  # one wake-up is enough for any number of poses
             self._mailbox.put(None)
         return (self.wait_until_current(wait_s) if wait_s else None) or self.state
 
     def wait_until_current(self, timeout_s: float) -> WindowState | None:
-        """Wait until the state answers the latest pose and nothing is missing; None at the deadline.
+        """Wait until a state answers the latest pose and nothing is missing; return it, None at the deadline.
 
-        The state is that one, even if a later one has replaced it meanwhile.
+        The returned state is that one, even if a later state has replaced it meanwhile.
         """
         return self.wait_for(self._is_current, timeout_s)
 
     def wait_for(self, fits: Callable[[WindowState], bool], timeout_s: float) -> WindowState | None:
-        """Wait for a state that fits and return it; None at the deadline."""
+        """Wait for a state for which ``fits`` is true and return it; None at the deadline."""
         deadline_s = time.monotonic() + min(timeout_s, threading.TIMEOUT_MAX)
         changed: SimpleQueue[None] = SimpleQueue()
-        self._waiters.append(weakref.ref(changed))  # it ends with this call, however that ends
+        self._waiters.append(weakref.ref(changed))  # gone when this call ends, even by an exception
         while not fits(state := self.state):
             left_s = min(max(deadline_s - time.monotonic(), 0.0), threading.TIMEOUT_MAX)
             try:
@@ -153,11 +152,11 @@ class WindowFollower:
         return self.answers(state) and self.error is None and state.settled and not self._refresher.lost
 
     def stop(self) -> None:
-        """End the thread; what is attached stays so."""
+        """End the thread; attached cells stay attached."""
         if self._elsewhere:
             return
         self.request_stop()
-        while not self._ended and _thread.get_ident() != self._thread:  # it may be where garbage ends
+        while not self._ended and _thread.get_ident() != self._thread:  # a finalizer may run in the thread
             with contextlib.suppress(Empty):
                 self._over.get(timeout=_OVER_S)
 
@@ -191,7 +190,7 @@ class WindowFollower:
             self._over.put(None)
 
     def _wait(self, until_s: float) -> bool:
-        """Unmap what arrives, until it is time to ask or there is a new pose; False at the end."""
+        """Unmap memory from the queue until a request is due or a new pose arrives; False at the end."""
         while True:
             remaining_s = until_s - time.monotonic()
             try:
@@ -202,15 +201,15 @@ class WindowFollower:
             except Empty:
                 return not self._stopping
             if memory is not None:
-                memory.end()  # the thread that put it here may still have it for a moment
+                memory.end()  # the thread that put it here may still hold a reference for a moment
                 del memory
                 continue
-            self._called = False  # before the pose is read: the next one calls again
+            self._called = False  # before the pose is read: the next pose wakes the thread again
             if remaining_s > 0 or self._stopping:
                 return not self._stopping
 
     def _refresh(self, pose: Intent) -> float:
-        """Ask once and publish what came; returns after how many seconds to ask again."""
+        """Send one request and publish the resulting state; return the seconds until the next request."""
         before = self.state
         wait_s = _PENDING_WAIT_S if before.pending and self.error is None else None
         try:
@@ -219,12 +218,12 @@ class WindowFollower:
             self._publish(before, error)
             return self._pause()
         except (OSError, ImportError) as error:
-            limit = no_files_left(error)  # to load a module, say
+            limit = no_files_left(error)  # to load a module, for example
             if limit is None:
                 raise
             self._publish(before, limit)
             return self._pause()
-        del before  # the last reference to what was replaced may be this one
+        del before  # this may be the last reference to the replaced cells
         self._publish(state, None)
         if state.settled:
             self._pause_s = 0.0
@@ -239,7 +238,7 @@ class WindowFollower:
         return self._pause_s
 
     def _publish(self, state: WindowState, error: ShmmapError | None) -> None:
-        self.state = state  # before the error: where there is none, the state is the one that came with it
+        self.state = state  # before the error: a reader without an error sees the matching state
         if error is None:
             self.stale_since = None
         elif self.stale_since is None:
@@ -254,7 +253,7 @@ class WindowFollower:
 
 
 class BlockingFollower:
-    """Keeps a window current in the thread that moves it; otherwise as `WindowFollower`."""
+    """Keep a window current in the calling thread; same interface as `WindowFollower`."""
 
     def __init__(
         self, refresher: WindowRefresher, *, update_distance: float, refresh_interval_s: float
@@ -273,7 +272,7 @@ class BlockingFollower:
         return self._pose is not None and not moved(state, self._pose, self._update_distance)
 
     def move(self, pose: Intent, wait_s: float | None) -> WindowState:
-        """Take a new pose, ask until nothing is missing, nothing more comes, or time is up.
+        """Set a new pose; send requests until nothing is missing, no more cells arrive, or time is up.
 
         Raises
         ------
@@ -291,7 +290,7 @@ class BlockingFollower:
         return self.state
 
     def wait_until_current(self, timeout_s: float) -> WindowState | None:  # noqa: ARG002
-        """Return the state if it answers the latest pose and nothing is missing; waiting changes nothing."""
+        """Return the state if it answers the latest pose and nothing is missing, else None; never wait."""
         state = self.state
         asked_in_vain = self.error is not None or self._refresher.lost
         return state if self.answers(state) and state.settled and not asked_in_vain else None
@@ -308,7 +307,7 @@ class BlockingFollower:
         deadline_s = now_s + wait_s
         progress_s = now_s
         pause_s = _FIRST_PAUSE_S
-        del state  # the last reference to what is replaced may be this one
+        del state  # this may be the last reference to the replaced cells
         request_wait_s: float | None = None
         while True:
             after, progress = self._refresher.refresh(self.state, pose, request_wait_s)
@@ -320,9 +319,9 @@ class BlockingFollower:
             if progress or after.pending:
                 progress_s, pause_s = now_s, _FIRST_PAUSE_S
             elif now_s - progress_s >= _STALLED_S:
-                return  # what is missing waits for memory that others have
+                return  # the missing cells wait for memory that other clients use
             else:
-                time.sleep(min(pause_s, deadline_s - now_s))  # what was just dropped has to be freed
+                time.sleep(min(pause_s, deadline_s - now_s))  # the memory just dropped has to be freed first
                 pause_s *= 2
             del after
             request_wait_s = max(0.0, min(_PENDING_WAIT_S, deadline_s - now_s))

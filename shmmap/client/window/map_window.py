@@ -29,46 +29,45 @@ __all__ = ["MapWindow"]
 class MapWindow:
     """The cells around a moving pose, attached and kept current by differential requests.
 
-    In the background mode (the default) a thread asks the daemon, attaches and unmaps; `move_to`,
-    `cells` and `points_around` never wait, and never open, map or unmap anything.  Each answer
-    shows up as a whole: everything a call returns belongs to one state of the window.  A daemon that
-    fails shows in `error` and `stale_since`, while the window serves what it has; a restarted one is
-    found again by itself.
+    In the background mode (the default) a thread sends requests, attaches and unmaps; `move_to`, `cells` and
+    `points_around` never wait, and never open, map or unmap anything.  Each answer is applied as a whole: all
+    results of a call belong to one state of the window.  While the daemon fails, `error` and `stale_since`
+    show that, and the window keeps its cells; it reconnects by itself after a restart.
 
-    With ``background=False`` everything happens in `move_to`, which raises what goes wrong.
+    With ``background=False`` all work is done in `move_to`, which also raises the errors.
 
-    The daemon fetches what the window will ask for next before it does: along the ``route`` of `move_to`,
-    without one straight ahead and to both sides of that.  A radius larger than what is needed brings nothing.
+    The daemon prefetches the cells that the window will need next: along the ``route`` of `move_to`, or
+    without a route straight ahead and to both sides.  A radius larger than needed has no benefit.
 
     After a fork the child can read what the window held, but not move it.
 
     Parameters
     ----------
     client
-        Client to ask through (other threads' requests wait for the window's, a quarter of a second at
-        most, while cells load); or an endpoint as in `connect`, for a session of its own.
+        Client whose session to use: while cells load, requests of other threads wait up to a quarter of a
+        second for the window's.  Or an endpoint as in `connect`, for a separate session.
     radius
-        Of the window around the pose, metres.
+        Radius of the window around the pose, metres.
     layers
-        What to have of each cell.
+        Layers to attach of each cell.
     shape
         ``"circle"``, or ``"square"`` for Autoware's area test (a square of half-side ``radius``).
     update_distance
-        Metres the pose moves before the daemon is asked again (20 in Autoware).
+        Distance that the pose moves before the next request, metres (20 in Autoware).
     refresh_interval
-        Seconds after which it is asked anyhow: the window learns of a changed map, and the daemon of another
-        route or velocity.
+        Seconds after which a request is sent without movement: it shows the window a changed map, and the
+        daemon a new route or velocity.
     retention
-        What to keep attached of what has left the window; default nothing.
+        Policy for keeping cells attached that have left the window; by default none are kept.
     background
         Whether a thread does the work.
     z
         (lowest, highest) heights of interest, metres.
     name
-        How the window's own session appears in ``shmmap clients``; empty: by the name of the program.
+        Name of the window's own session in ``shmmap clients``; empty: the name of the program.
     timeout
-        Seconds that a reply to the window may take, beyond what it lets the daemon wait for loads; None:
-        those of the client.  A daemon that hangs shows in `error` after this long; one that ended, at once.
+        Seconds that a reply may take, in addition to the time that the daemon may wait for loads; None: the
+        client's timeout.  A daemon that hangs shows in `error` after this time, a daemon that ended at once.
 
     instance
         Name of the daemon's instance, instead of a client or an endpoint.
@@ -76,11 +75,11 @@ class MapWindow:
     Raises
     ------
     DaemonUnreachable, ProtocolMismatch
-        As `connect`, where no client is given.
+        As `connect`, if no client is given.
     LimitReached
         This process may not have the descriptors or threads that are needed.
     BadRequest
-        A parameter makes no sense.
+        A parameter is invalid.
     """
 
     def __init__(
@@ -121,7 +120,7 @@ class MapWindow:
                 shape=shape,
                 z=checked_heights(z),
                 retention=retention if retention is not None else Retention(),
-                populate=background,  # page faults, too, are better taken by the thread
+                populate=background,  # page faults, too, should occur in the thread
                 timeout_s=timeout,
             )
             if background:
@@ -140,7 +139,7 @@ class MapWindow:
             if self._owns_client:
                 self._client.close()
             raise
-        # also without a call of close(); at the end of the program Python stops the thread
+        # runs also without close(); at interpreter exit Python stops the thread
         self._finalizer = weakref.finalize(self, self._follower.stop)
         self._finalizer.atexit = False
 
@@ -166,7 +165,7 @@ class MapWindow:
         )
 
     def close(self) -> None:
-        """Stop following and let the window's cells go; views that live elsewhere stay readable."""
+        """Stop following and drop the window's cells; views held elsewhere stay readable."""
         if self._closed:
             return
         self._closed = True
@@ -190,31 +189,31 @@ class MapWindow:
         route: Sequence[tuple[float, float]] | NDArray[Any] = (),
         wait: float | None = None,
     ) -> WindowUpdate:
-        """Give the window the pose; returns what has changed since the last call.
+        """Set the window's pose; return the changes since the last call.
 
         Parameters
         ----------
         x, y
             Metres, map frame.
         vx, vy
-            Metres per second, map frame; both 0: the daemon learns them from the poses.
+            Velocity in metres per second, map frame; both 0: the daemon estimates it from the poses.
         heading
             Radians, counter-clockwise from the map's x axis.
         route
-            The polyline ahead, (x, y) each or (N, 2): give it with every pose.  The daemon fetches what lies
-            along it before the window asks for it, and keeps it longest.  Of a longer route 512 places are
-            sent, equally far apart.
+            The polyline ahead, a sequence of (x, y) or an (N, 2) array; pass it with every pose.  The daemon
+            prefetches the cells along it, and keeps them longest.  A route of more than 512 places is
+            resampled to 512, equally spaced.
         wait
             Seconds this call may take until the window is current.  None: no waiting in the background mode,
-            5 s in the blocking one, which waits no longer than half a second for cells that do not fit in
-            the budget, or cannot be reached or known.
+            5 s in the blocking mode.  The blocking mode waits at most half a second for cells that do not fit
+            in the budget, are unreachable, or are not listed yet.
 
         Raises
         ------
         BadRequest
-            A number is missing or makes no sense, the window is closed, or this is a forked child.
+            A number is missing or invalid, the window is closed, or this is a forked child.
         ShmmapError
-            Only in the blocking mode: the daemon cannot be asked; the window keeps what it has.
+            Only in the blocking mode: the request failed; the window keeps its cells.
         """
         pose = pose_intent(x, y, vx, vy, heading, route)
         if wait is not None:
@@ -229,22 +228,22 @@ class MapWindow:
     def wait_until_current(self, timeout: float) -> bool:
         """Wait until the window answers the latest pose and nothing is being loaded.
 
-        Cells that cannot be loaded (see `WindowUpdate.failed`) do not hold it up, except those that wait for
-        memory, or for an origin that cannot be reached.
+        Cells that cannot be loaded (see `WindowUpdate.failed`) do not prolong the wait, except cells that
+        wait for memory or for an unreachable origin.
 
         Returns
         -------
         bool
-            False if it was not so within ``timeout`` seconds, or the daemon cannot be asked.  In the
-            blocking mode, whether it is so.
+            False if the window was not current within ``timeout`` seconds, or requests fail.  In the blocking
+            mode, whether the window is current now.
         """
         return self._follower.wait_until_current(number("timeout", timeout)) is not None
 
-    # --- what the window holds ------------------------------------------------------------------------
+    # --- content of the window ------------------------------------------------------------------------
 
     @property
     def client(self) -> Client:
-        """The client the window asks through."""
+        """The client whose session the window uses."""
         return self._client
 
     @property
@@ -254,22 +253,22 @@ class MapWindow:
 
     @property
     def complete(self) -> bool:
-        """Whether the window answers the last pose, and nothing in it is pending, failed or not known yet.
+        """Whether the window answers the last pose, and no cell is pending, failed or not listed yet.
 
-        A pose is answered by an area that was asked for less than ``update_distance`` away from it, and
-        that it lies in.  So this is false right after a jump, and as soon as a vehicle leaves behind what
-        a daemon that has died answered last.
+        A pose is answered if it lies in the last requested area, less than ``update_distance`` from the pose
+        of that request.  So this is False right after a jump, and as soon as the vehicle leaves the area of
+        the last answer of a daemon that died.
         """
         state = self._follower.state
         answered = self._follower.answers(state) and state.covered
         return answered and not state.pending and not state.failed
 
     def covers(self, x: float, y: float, radius: float = 0.0) -> bool:
-        """Whether all that the map has within a circle is in the window, in all its layers.
+        """Return whether the window has all cells of the map within a circle, in all its layers.
 
-        It is False if the circle reaches beyond the last answer or touches a cell that has failed; while a
-        cell of the window is being loaded and has no older version attached; and while the daemon does not
-        know all cells in the window.
+        It is False if the circle reaches beyond the area of the last answer or touches a cell that has
+        failed; while a cell of the window is being loaded and no older version is attached; and while the
+        daemon does not know all cells in the window.
 
         Parameters
         ----------
@@ -279,14 +278,14 @@ class MapWindow:
         Raises
         ------
         BadRequest
-            The circle makes no sense.
+            The circle is invalid.
         """
         Circle(x, y, radius)
         return self._follower.state.covers(x, y, radius)
 
     @property
     def error(self) -> ShmmapError | None:
-        """Why the daemon cannot be asked, or could not the last time; None if it could."""
+        """The error of the last request or of the connection; None if the last request succeeded."""
         error = self._follower.error
         if error is None and self._client.disconnected_since is not None:
             return ConnectionLost(
@@ -297,16 +296,16 @@ class MapWindow:
 
     @property
     def stale_since(self) -> float | None:
-        """`time.monotonic` since when the daemon cannot be asked; None while it can.
+        """`time.monotonic` since when requests fail; None while they succeed.
 
-        A daemon that ends is noticed at once, one that hangs when a reply is overdue (``timeout``).
+        A daemon that ends is noticed at once, a daemon that hangs when a reply is overdue (``timeout``).
         """
         known = (self._follower.stale_since, self._client.disconnected_since)
         return min((since for since in known if since is not None), default=None)
 
     @property
     def map_version(self) -> int:
-        """State of the map the window shows."""
+        """State of the map that the window shows."""
         return self._follower.state.map_version
 
     def versions(self) -> dict[LayerKey, int]:
@@ -316,21 +315,21 @@ class MapWindow:
     def points_around(self, x: float, y: float, radius: float, *, layer: str | None = None) -> PointsAround:
         """Return views of the window's cells that touch a circle; nothing is copied.
 
-        `PointsAround.covered` says whether they are all that the map has there: a pose that has jumped, or
-        outrun a daemon that died, is not to be mistaken for an empty place.
+        `PointsAround.covered` is True if these are all points that the map has there.  Without it, a pose
+        beyond the window's area (after a jump, or after the daemon died) would look like an empty place.
 
         Parameters
         ----------
         x, y, radius
-            Metres, map frame; what lies beyond the window is not there, and not ``covered``.
+            Metres, map frame.  Points beyond the window are missing, and then ``covered`` is False.
         layer
-            Which of the window's layers, as it was asked for or as `Cell.layer` names it; by default the
-            first.  Of two layers of one kind, the name is that of `Cell.layer` (`layers.canonical_layer`).
+            One of the window's layers, as requested or as `Cell.layer` names it; by default the first.  To
+            distinguish two layers of one kind, use the name of `Cell.layer` (`layers.canonical_layer`).
 
         Raises
         ------
         BadRequest
-            The circle makes no sense, or the window has no such layer.
+            The circle is invalid, or the window has no such layer.
         """
         state = self._follower.state
         name = _layer_name(layer if layer is not None else self._layers[0], self._layers, state.by_layer)
@@ -343,16 +342,16 @@ class MapWindow:
 
 
 def _layer_name(layer: str, asked: Sequence[str], present: Collection[str]) -> str:
-    """Return the name that the cells of a layer have, in whatever form it is named.
+    """Return the layer name that `Cell.layer` uses, for a layer named in any form.
 
     Parameters
     ----------
     layer
-        As it was asked for, or as `Cell.layer` names it.
+        The layer as it was requested, or as `Cell.layer` names it.
     asked
-        The window's layers as they were asked for.
+        The window's layers as they were requested.
     present
-        Layers of the cells that are there, in canonical form.
+        Layers of the window's cells, in canonical form.
 
     Raises
     ------
@@ -364,7 +363,7 @@ def _layer_name(layer: str, asked: Sequence[str], present: Collection[str]) -> s
     kind = _kind(layer)
     alike = [one for one in asked if _kind(one) == kind]
     if len(alike) > 1:
-        return layer  # parameters distinguish them; only the canonical form does so by itself
+        return layer  # several layers of this kind: only the canonical form is unambiguous
     there = next((name for name in present if _kind(name) == kind), None)
     if layer in alike:
         return there or layer

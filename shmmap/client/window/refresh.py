@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A window's bookkeeping: one differential request, and the state that follows from its answer."""
+"""Send a window's differential requests, and compute the window's state from each answer."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ _SHAPES: Final[dict[str, _Shape]] = {"circle": geometry.Circle, "square": geomet
 
 
 class WindowRefresher:
-    """Turns answers of the daemon into states; used by one thread at a time.
+    """Turns the daemon's answers into states; used by one thread at a time.
 
     Parameters
     ----------
     client
-        Asks the daemon.
+        Client that sends the requests.
     radius
-        Of the window, metres.
+        Radius of the window, metres.
     layers
-        What to have of each cell.
+        Layers to attach of each cell.
     shape
         ``"circle"`` or ``"square"`` (Autoware's).
     z
         Heights of interest, or None.
     retention
-        What to keep of what leaves the window.
+        Policy for keeping cells that leave the window.
     populate
-        Let the kernel map every page while attaching.
+        Map every page while attaching, not at first access.
     timeout_s
-        How long a reply may take beyond what the request waits; None: as long as the client lets it.
+        Seconds that a reply may take beyond the request's wait; None: the client's timeout.
 
     Attributes
     ----------
     retained : dict
-        Cells outside the window that are kept attached, and since when.
+        Cells outside the window that are kept attached, with the time since when.
 
     Raises
     ------
     BadRequest
-        The shape is unknown, or the radius makes no sense.
+        The shape is unknown, or the radius is invalid.
     """
 
     def __init__(
@@ -91,31 +91,32 @@ class WindowRefresher:
         return self._client.disconnected_since is not None
 
     def refresh(self, state: WindowState, pose: Intent, wait_s: float | None) -> tuple[WindowState, bool]:
-        """Ask the daemon once.
+        """Send one request to the daemon.
 
         Returns
         -------
         state : WindowState
-            The new state; the old one's mappings are returned unchanged where nothing changed.
+            The new state; it shares the old state's unchanged mappings.
         progress : bool
-            Whether cells came or went.
+            Whether cells were added or removed.
 
         Raises
         ------
         ShmmapError
-            As `Client.differential`; the old state stays true.
+            As `Client.differential`; the old state stays valid.
         """
         area = self._make_area(pose.x, pose.y, self._radius, self._z)
         answer = self._ask(state, area, pose, wait_s, by_name=False)
         if answer.epoch != state.epoch and state.cells:
-            # Another run of the daemon cannot know what versions of a previous one belonged to, and does not
-            # recognise those that are not current.  What was attached stays so while asking again.
+            # A new run of the daemon cannot know which cells the versions of a previous run belonged to, and
+            # does not recognise versions that are not current.  Attached cells stay attached during the new
+            # request.
             first = answer
             answer = self._ask(state, area, pose, wait_s, by_name=True)
             del first
         now_s = time.monotonic()
         if answer.map_version != state.map_version or any(isinstance(f, OverBudget) for f in answer.failed):
-            # what is kept beyond the window may be outdated, or take the memory that cells in it need
+            # cells retained outside the window may be outdated, or use memory that cells in the window need
             self.retained.clear()
         progress = bool(answer.cells or answer.removed)
         if not progress:
@@ -180,5 +181,5 @@ class WindowRefresher:
         }
 
     def forget(self) -> None:
-        """Drop what is retained."""
+        """Drop the retained cells."""
         self.retained.clear()

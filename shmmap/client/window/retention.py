@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells a window keeps attached after they have left it: pure decisions, no clock of their own.
+"""Decide which cells a window keeps attached after they have left it; pure functions, without a clock.
 
-A cell that is kept costs memory that the daemon could use otherwise, and saves attaching it again
+A kept cell occupies memory that the daemon could reuse, and saves attaching it again
 (tens of microseconds) or loading it again (milliseconds) when the vehicle turns back.
 """
 
@@ -21,8 +21,8 @@ __all__ = ["Retention", "RetentionCandidate", "RetentionPolicy"]
 class RetentionCandidate(NamedTuple):
     """A cell outside the window that is still attached.
 
-    ``distance`` is from the present pose to the nearest point of its box, metres; ``nbytes`` its
-    size; ``age`` how many seconds ago it left.
+    ``distance`` is from the present pose to the nearest point of its box, metres; ``nbytes`` is its size;
+    ``age`` is the time since it left, seconds.
     """
 
     distance: float
@@ -31,22 +31,22 @@ class RetentionCandidate(NamedTuple):
 
 
 class RetentionPolicy(Protocol):
-    """What a window asks after each answer of the daemon."""
+    """Policy that a window applies after each answer of the daemon."""
 
     def keep(self, departed: Sequence[RetentionCandidate]) -> Sequence[bool]:
-        """Whether to keep each of the departed cells."""
+        """Return, for each departed cell, whether to keep it."""
 
 
 class Retention(msgspec.Struct, frozen=True):
-    """Keeps cells up to a distance, a sum of bytes, and an age; nearest first.
+    """Policy that keeps cells within limits of distance, total bytes and age, nearest first.
 
     Parameters
     ----------
     distance
         Metres from the pose to the nearest point of the cell; the default 0 keeps nothing.
     max_bytes
-        Sum of the sizes of what is kept.  What is kept is the nearest cells that fit one after the other:
-        a nearer cell is never dropped for the sake of a farther one.
+        Limit for the total size of the kept cells.  Cells are kept in order of distance while they fit: a
+        nearer cell is never dropped for a farther one.
     max_age
         Seconds since the cell left the window.
 
@@ -67,7 +67,7 @@ class Retention(msgspec.Struct, frozen=True):
                 raise BadRequest(f"retention: {name} must not be negative, it is {value!r}")
 
     def keep(self, departed: Sequence[RetentionCandidate]) -> list[bool]:
-        """Whether to keep each of the departed cells."""
+        """Return, for each departed cell, whether to keep it."""
         kept = [False] * len(departed)
         if not self.distance:
             return kept

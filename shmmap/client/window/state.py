@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a window holds at one moment, and what changed since another."""
+"""State of a window at one moment, and the difference between two states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["EMPTY", "LayerKey", "WindowState", "WindowUpdate", "moved", "update_between"]
 
 PASSING: Final = (OverBudget, Offline)
-"""Failures that pass by themselves, perhaps in a moment: worth asking again."""
+"""Temporary failures, after which the request is repeated."""
 
 LayerKey: TypeAlias = tuple[str, str]
 """Cell id and layer."""
@@ -30,13 +30,12 @@ Box: TypeAlias = tuple[float, float, float, float]
 
 
 class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
-    """What happened to a window since the last `MapWindow.move_to`.
+    """Changes of a window since the last `MapWindow.move_to`.
 
     Attributes
     ----------
     added, kept, changed : tuple of Cell
-        Cells new in the window; cells that stayed; cells whose version or bytes are others now (the
-        new ones).
+        New cells; cells that stayed; the new versions of cells whose version or bytes changed.
     removed : tuple of str
         Ids that left the window in any layer.
     pending : tuple of PendingLayer
@@ -47,7 +46,7 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
         Whether the window answers the pose just given.  In the background mode it may still answer an
         earlier one.
     covered : bool
-        Whether the daemon knows all that the map has in the window; where it does not, more may come.
+        Whether the daemon knows all cells of the map in the window; if not, more may follow.
     """
 
     added: tuple[Cell, ...] = ()
@@ -61,7 +60,7 @@ class WindowUpdate(msgspec.Struct, frozen=True, eq=False, weakref=True):
 
     @property
     def any(self) -> bool:
-        """Whether the set of cells is another one than before."""
+        """Whether the set of cells changed."""
         return bool(self.added or self.changed or self.removed)
 
     @property
@@ -78,14 +77,14 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
     cells
         By cell id and layer, in id order.
     versions
-        The same, versions alone: remembering them keeps nothing mapped.
+        Versions of the same cells; unlike ``cells``, keeping them keeps nothing mapped.
     boxes
-        By layer, boxes of its cells in the order of ``by_layer``, (N, 4) float64.
+        For each layer, the boxes of its cells in the order of ``by_layer``, (N, 4) float64.
     asked
-        The pose that was asked about; None before the first answer.
+        The pose of the last request; None before the first answer.
     area
-        What was asked about: all that the map has there is in ``cells``, or named in ``pending`` or
-        ``failed``, if the daemon knows all of it (``covered``).
+        The requested area: if ``covered``, every cell of the map in it is in ``cells``, ``pending`` or
+        ``failed``.
     """
 
     cells: Mapping[LayerKey, Cell] = {}
@@ -102,7 +101,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
 
     @property
     def settled(self) -> bool:
-        """Whether asking again at once cannot bring more."""
+        """Whether an immediate repetition of the request would return nothing new."""
         return (
             self.asked is not None
             and self.covered
@@ -111,10 +110,10 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         )
 
     def covers(self, x: float, y: float, radius: float, layer: str | None = None) -> bool:
-        """Whether all that the map has within a circle is in ``cells``, of one layer or of all.
+        """Return whether ``cells`` has all cells of the map within a circle, in one layer or in all.
 
-        A cell is missing that is being loaded or has failed, and of which no older version is here.  One
-        whose place is not known counts as if it lay in the circle.
+        A cell counts as missing if it is being loaded or has failed, and no older version is attached.  A
+        cell whose position is not known counts as lying in the circle.
         """
         if self.area is None or not self.covered or not self.area.contains_circle(x, y, radius):
             return False
@@ -138,7 +137,7 @@ class WindowState(msgspec.Struct, frozen=True, eq=False, weakref=True):
         map_version: int,
         covered: bool = True,
     ) -> WindowState:
-        """Sort the cells and lay their boxes out for `points_around`."""
+        """Sort the cells and collect their boxes in arrays for `points_around`."""
         ordered = {key: cells[key] for key in sorted(cells)}
         by_layer: dict[str, list[Cell]] = {}
         for (_, layer), cell in ordered.items():
@@ -164,13 +163,13 @@ def _may_touch(box: Box | None, x: float, y: float, radius: float) -> bool:
     return math.hypot(max(box[0] - x, x - box[2], 0.0), max(box[1] - y, y - box[3], 0.0)) <= radius
 
 
-EMPTY: Final = WindowState(covered=False)  # what the map has there is not known yet
+EMPTY: Final = WindowState(covered=False)  # the cells of the area are not known yet
 
 
 def moved(state: WindowState, pose: Intent, update_distance: float) -> bool:
-    """Whether ``pose`` is so far from where was last asked that the daemon must be asked again.
+    """Return whether ``pose`` is so far from the last request's pose that a new request is due.
 
-    That is ``update_distance`` metres, or outside the area that was answered.
+    That is ``update_distance`` metres or more, or outside the area of the answer.
     """
     if state.asked is None or state.area is None:
         return True
