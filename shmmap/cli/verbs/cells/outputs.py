@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs about cells print as JSON; imported for that alone."""
+"""JSON output of the verbs about cells; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class Found(msgspec.Struct):
 
     @classmethod
     def of(cls, found: CellSet, frame_id: str) -> Found:
-        """Return all of an answer."""
+        """Return the JSON form of an answer."""
         return cls(
             hexed(found.epoch),
             hexed(found.map_version),
@@ -185,7 +185,7 @@ class Bounds(msgspec.Struct):
 
     @classmethod
     def of(cls, found: CloudDescription) -> Bounds | None:
-        """Return the bounds of a file; None without a finite point."""
+        """Return the JSON form of a file's bounds; None without a finite point."""
         lowest, highest = (bound.tolist() for bound in found.bounds)
         return cls(lowest, highest) if all(map(math.isfinite, lowest)) else None
 
@@ -220,7 +220,7 @@ class CloudFile(msgspec.Struct):
 
     @classmethod
     def of(cls, found: CloudDescription) -> CloudFile:
-        """Return all that a file holds."""
+        """Return the JSON form of a file's description."""
         crs = found.crs
         return cls(
             found.path,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap status``, ``top`` and ``health`` print as JSON; imported for that alone."""
+"""JSON output of ``shmmap status``, ``top`` and ``health``; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Prefetching(msgspec.Struct):
 
     @classmethod
     def of(cls, counters: Mapping[str, int]) -> Prefetching:
-        """Return the setting, the storage's outages and the counters."""
+        """Return the setting, the storage's outages and the counters of prefetching."""
         ratio = over_fetch(counters)
         return cls(
             counters.get("outage_tolerance_ns", 0) * 1e-9,
@@ -97,7 +97,7 @@ class Published(msgspec.Struct):
 
     @classmethod
     def of(cls, counters: Mapping[str, int]) -> Published | None:
-        """Return what is known of it; None where the map is files."""
+        """Return the JSON form of a published map's counters; None if the map is files."""
         if not counters.get("published_version"):
             return None
         taken, expires, out = (
@@ -146,7 +146,7 @@ class Status(msgspec.Struct):
 
     @classmethod
     def of(cls, found: Snapshot, identity: DaemonIdentity) -> Status:
-        """Return all of it."""
+        """Return the state of a daemon."""
         return cls(
             found.state,
             round(found.beat_age_s, 6),
@@ -209,7 +209,7 @@ class Top(msgspec.Struct):
 
     @classmethod
     def of(cls, found: Snapshot) -> Top:
-        """Return all of it."""
+        """Return memory, latency and clients of a daemon."""
         count = found.counters
         verdict = cache_verdict(count)
         ratios = {}
@@ -277,7 +277,7 @@ class Shown(msgspec.Struct):
 
     @classmethod
     def of(cls, cell: ShownCell) -> Shown:
-        """Return all that a daemon knows of a cell."""
+        """Return the JSON form of a cell."""
         segments, now_ns = [], time.monotonic_ns()
         for row in cell.segments:
             segments.append(Segment.whole(row, now_ns))
@@ -311,7 +311,7 @@ class Diagnosis(msgspec.Struct):
 
 
 def json_events() -> object:
-    """Return the kinds of lines that ``--json`` prints: the protocol's events, and lost ones."""
+    """Return the types of the lines that ``--json`` prints: the protocol's events, and lost events."""
     from shmmap.client.event_stream import MissedEvents
     from shmmap.protocol.events import Event
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs that make and publish maps print as JSON; imported for that alone."""
+"""JSON output of the verbs that make and publish maps; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ __all__ = [
 
 
 def divided_kind() -> object:
-    """Return what ``--json`` prints."""
+    """Return the struct that ``divide --json`` prints."""
     from shmmap.origin.map_report import DividedMap
 
     return more_of(DividedMap, seconds=float, peak_memory_bytes=int)
 
 
 def merged_kind() -> object:
-    """Return what ``--json`` prints."""
+    """Return the struct that ``merge --json`` prints."""
     from shmmap.dividing.merge import MergedCloud
 
     return more_of(MergedCloud, seconds=float, peak_memory_bytes=int)
@@ -169,14 +169,14 @@ class Refreshed(msgspec.Struct):
 
 
 def rotated_kind() -> object:
-    """Return what ``--rotate`` prints."""
+    """Return the struct that ``versions --rotate`` prints."""
     from shmmap.publishing.signing import Rotated
 
     return more_of(Rotated, url=str)
 
 
 def pruned_kind() -> object:
-    """Return what ``--prune`` prints."""
+    """Return the struct that ``versions --prune`` prints."""
     from shmmap.publishing.prune import Pruned
 
     return more_of(Pruned, url=str)

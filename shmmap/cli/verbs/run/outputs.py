@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs that run a daemon print as JSON; imported for that alone."""
+"""JSON output of the verbs that run a daemon; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Checked(msgspec.Struct):
 
 
 def versions_kind() -> object:
-    """Return what ``--json`` prints."""
+    """Return the struct that ``version --json`` prints."""
     from shmmap.cli.verbs.run.about import Versions
 
     return more_of(Versions)
