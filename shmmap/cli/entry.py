@@ -96,7 +96,7 @@ class _GroupedHelp(argparse.RawDescriptionHelpFormatter):
 
 
 def verb_first(words: Sequence[str]) -> list[str]:
-    """Write ``--endpoint PATH status`` as ``status --endpoint PATH``: the verbs own all options."""
+    """Write ``--endpoint PATH status`` as ``status --endpoint PATH``, since options belong to the verbs."""
     end = 0
     while end < len(words) and words[end].startswith("--") and words[end] not in _OWN_OPTIONS:
         takes_value = words[end] not in _FLAGS and "=" not in words[end]

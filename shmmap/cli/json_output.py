@@ -56,7 +56,7 @@ class Failure(msgspec.Struct):
 
 
 class Holder(msgspec.Struct):
-    """A user of memory; session 0 and pid 0: a process that did not use the client library."""
+    """A process that holds memory; session 0 and pid 0: a process that did not use the client library."""
 
     session: Hex
     pid: int
@@ -83,7 +83,7 @@ class Holder(msgspec.Struct):
 
 
 class Client(msgspec.Struct):
-    """A client; ``cells`` and ``bytes`` were given to it and not returned."""
+    """A client; ``cells`` and ``bytes`` are those that it holds."""
 
     session: Hex
     pid: Annotated[int, msgspec.Meta(description="as the kernel says; 0: unknown")]
@@ -131,7 +131,7 @@ class Client(msgspec.Struct):
 
 
 class Segment(msgspec.Struct):
-    """A layer of a cell in shared memory; a zombie is retired, but still in use."""
+    """A layer of a cell in shared memory; a zombie is a retired segment that clients still map."""
 
     id: str
     version: Hex

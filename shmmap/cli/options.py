@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several verbs share, and how their values are read."""
+"""Options that several verbs share, and parsers of their values."""
 
 from __future__ import annotations
 

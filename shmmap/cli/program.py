@@ -33,7 +33,7 @@ __all__ = [
 
 _EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as in a shell
 
-_EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
+_EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE, as in a shell
 
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _LATER_S: Final = 0.005

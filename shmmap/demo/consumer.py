@@ -40,7 +40,7 @@ class Pose(msgspec.Struct, frozen=True):
 
 
 class Step(msgspec.Struct, frozen=True):
-    """The next pose.
+    """A pose to move to, and whether to wait for its cells.
 
     Attributes
     ----------

@@ -87,7 +87,7 @@ class DemoResult:
 
     @property
     def one_more_bytes(self) -> tuple[float, float]:
-        """Memory that each further process needs, from the first round to the last: shared, private."""
+        """Memory that each further process needs: with the shared map, and with private copies."""
         first, last = self.rounds[0], self.rounds[-1]
         more = last.consumers - first.consumers
         return (
@@ -97,7 +97,7 @@ class DemoResult:
 
 
 def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None = None) -> DemoResult:
-    """Build, drive, measure, clean up.
+    """Build the map, drive, measure, and clean up.
 
     Parameters
     ----------

@@ -193,8 +193,8 @@ def _cell_box(file: Path) -> tuple[float, float, float, float]:
 Ground: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[Any]]
 
 _NOTHING: Final = 0  # palette entry of pixels without a point
-_GROUND_LEVELS: Final = 16  # entries for the ground, dark asphalt to light paint
-_HEIGHT_LEVELS: Final = 100  # entries each for plants and for buildings, low to high
+_GROUND_LEVELS: Final = 16  # palette entries for the ground, from dark asphalt to light paint
+_HEIGHT_LEVELS: Final = 100  # palette entries each for plants and for buildings, from low to high
 _GROUND_METRES: Final = 0.3  # metres; lower points belong to the ground
 _LOW_METRES, _HIGH_METRES = 0.3, 25.0
 _PLANT_INTENSITY: Final = 52.0  # the town's leaves reflect more than its roofs

@@ -37,7 +37,7 @@ _PACE_S: Final = 0.1  # seconds between poses: a control loop at 10 Hz
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """One drive of several processes.
+    """Results of one drive of several processes.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ from shmmap.testing.daemon_process import wait_readable, without_settings
 
 __all__ = ["ProcessMemory", "Program", "Progress", "cpu_seconds", "descendants", "process_memory"]
 
-_LAST_WORDS: Final = 2000  # characters
+_LAST_WORDS: Final = 2000  # characters of stderr
 _USER: Final = 11  # utime, stime, cutime, cstime: their place in proc(5), counted after the command
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
@@ -44,7 +44,7 @@ class Progress:
 
 
 class Program:
-    """``python -m MODULE WORD...`` with pipes to its stdin and from its stdout.
+    """A process ``python -m MODULE WORD...`` with pipes to its stdin and from its stdout.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that divides a cloud for the daemon: ``python -m shmmap.dividing.child_main``.
+"""Entry point of the process that divides a cloud for the daemon (``python -m shmmap.dividing.child_main``).
 
 It sends packets of JSON: ``{"stage", "done", "total"}`` once a second, and ``{"error", "message", "hint"}``
 before it exits with an error.  It is killed when the daemon dies; the next such process resumes its work.

@@ -234,7 +234,7 @@ def _changed(path: str) -> MapDataError:
 
 
 class _BinaryPcd:
-    """Binary PCD: records straight from the file.
+    """Binary PCD, whose records are read directly.
 
     Like other sources it keeps the file open only while reading: a map has more cells than a process may have
     open files.

@@ -25,8 +25,8 @@ __all__ = ["Workspace"]
 
 _STATE: Final = "state.json"
 _LOCK: Final = "lock"
-_RENAME_EXCHANGE: Final = 2  # linux/fs.h
-_AT_FDCWD: Final = -100  # fcntl.h
+_RENAME_EXCHANGE: Final = 2  # from linux/fs.h
+_AT_FDCWD: Final = -100  # from fcntl.h
 
 
 class Workspace:

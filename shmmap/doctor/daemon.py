@@ -213,7 +213,7 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
 def check_pins(diagnosis: Diagnosis) -> Finding:
-    """Check that the kernel reports whether any process maps a segment."""
+    """Check that the kernel can report whether any process maps a segment."""
     name = "leases"
     try:
         directory = ShmDirectory(diagnosis.shm_dir)

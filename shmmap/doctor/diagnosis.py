@@ -80,7 +80,7 @@ class Diagnosis:
 
     @property
     def listening(self) -> set[str]:
-        """Paths of all sockets at which a process listens."""
+        """Paths of all sockets on which a process listens."""
         rows = (line.split(maxsplit=7) for line in self.machine.text("/proc/net/unix").splitlines())
         return {row[7] for row in rows if len(row) == 8 and row[7][0] == "/" and int(row[3], 16) & _LISTENS}
 

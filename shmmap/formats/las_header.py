@@ -21,18 +21,16 @@ from shmmap.formats.source_file import open_regular, refusal
 __all__ = ["LasHeader", "read_las_header"]
 
 _SIGNATURE: Final = b"LASF"
-_HEADER_BYTES: Final = 375  # of LAS 1.4; of 1.0 to 1.2 it has
-_SHORTEST_BYTES: Final = 227
+_HEADER_BYTES: Final = 375  # LAS 1.4
+_SHORTEST_BYTES: Final = 227  # LAS 1.0 to 1.2
 _START: Final = struct.Struct("<HII")  # at 94: header bytes, offset to points, records
 _POINTS: Final = struct.Struct("<BHI")  # at 104: format, record bytes, points (legacy count)
 _LEGACY_AT: Final = 107
 _SCALES: Final = struct.Struct("<6d")  # at 131: scales, offsets
-_LONG: Final = struct.Struct(
-    "<QQIQ"
-)  # at 227, from 1.4 on: waveforms, extended records, their number, points
+_LONG: Final = struct.Struct("<QQIQ")  # at 227, since 1.4: waveforms, extended records and count, points
 _LONG_AT: Final = 247
 _LAZ_BIT: Final = 0x80
-_WKT_BIT: Final = 0x10  # of the global encoding
+_WKT_BIT: Final = 0x10  # flag of the global encoding
 _RECORD: Final = struct.Struct("<2x16sHH32x")
 _EXTENDED: Final = struct.Struct("<2x16sHQ32x")
 _PROJECTION: Final = b"LASF_Projection"

@@ -82,7 +82,7 @@ class LasReader:
                     data_at=checked.data_at,
                 )
             if chunks is not None and not chunks.small:
-                backends = {"laz_backend": laspy.LazBackend.Lazrs}  # point by point
+                backends = {"laz_backend": laspy.LazBackend.Lazrs}  # serial: point by point
             counted = self.points
             if chunks is not None and chunks.points is not None and not checked.warnings:
                 counted = chunks.points

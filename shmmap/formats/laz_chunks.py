@@ -19,7 +19,7 @@ from shmmap.formats.source_file import refusal
 
 __all__ = ["LazChunks", "check_laz"]
 
-_RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points a chunk, items
+_RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points per chunk, items
 _ITEM: Final = struct.Struct("<HHH")  # type, bytes, version
 _VARIABLE: Final = (0, 0xFFFFFFFF)  # points per chunk if the table counts them
 _LAYERED: Final = 3  # compressor whose chunks count their points and layers

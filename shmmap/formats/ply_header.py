@@ -127,7 +127,7 @@ def parse_ply_header(head: bytes, *, path: str, file_bytes: int) -> PlyHeader:
 
 
 class _Parser:
-    """The lines of one header, and the checks between them."""
+    """Parser of a header's lines, and the checks between them."""
 
     def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
         self.head = head

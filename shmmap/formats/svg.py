@@ -47,7 +47,7 @@ _LETTER_PX: Final = 7.6  # average width of a letter of the usual size
 _LINE_PX: Final = 22.0
 _SYMBOL_PX: Final = 26.0
 _ENTRY_GAP_PX: Final = 18.0
-_SCALE_BAR_PX: Final = 180.0  # at most
+_SCALE_BAR_PX: Final = 180.0  # maximum length
 _SCALE_PX: Final = _SCALE_BAR_PX + 90.0  # including its label and the space before it
 _MAX_RASTER: Final = 2400  # pixels along the longer side
 

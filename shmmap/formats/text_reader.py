@@ -41,7 +41,7 @@ _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
 """Names of the columns after x, y and z, by their number, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
-_LOOKED_AT: Final = 32  # rows
+_LOOKED_AT: Final = 32  # rows to look at
 _SHOWN: Final = 60
 
 
@@ -184,7 +184,7 @@ class TextReader(FileReader):
 
 
 class _Lines:
-    """The first lines of a file: comments, a count, names, the first row of numbers."""
+    """Parser of a file's first lines: comments, a count, names, the first row of numbers."""
 
     def __init__(self, head: bytes, path: str, suffix: str, file_bytes: int) -> None:
         self.head = head

@@ -25,7 +25,7 @@ __all__ = ["Lidar", "LidarDrive", "LidarReturns", "LidarScan", "Traffic"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarReturns:
-    """One scan.
+    """The returns of one scan.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class LidarDrive:
     seed: int = 0
 
     def poses(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
-        """Time (seconds) and T_map_sensor of every scan."""
+        """Yield time (seconds) and T_map_sensor of every scan."""
         route = self.town.route(length=self.length, step=self.step)
         heights = self.town.ground_height(route[:, 0], route[:, 1]) + _SENSOR_METRES
         for number, ((x, y, heading), z) in enumerate(zip(route.tolist(), heights.tolist(), strict=True)):
@@ -179,7 +179,7 @@ class LidarDrive:
             yield number * self.step / self.speed, T
 
     def odometry(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
-        """Time and odometry pose of every scan, relative to the first scan's pose.
+        """Yield time and odometry pose of every scan, relative to the first scan's pose.
 
         Wheel odometry with errors: distances are 1 % too long, turns 2 % too wide.
         """

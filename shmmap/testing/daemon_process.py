@@ -177,7 +177,7 @@ class DaemonProcess:
         """Text that the daemon wrote to stderr in all its runs."""
         return self.log_path.read_text(errors="replace") if self.log_path.exists() else ""
 
-    # --- its runs -----------------------------------------------------------------------------------
+    # --- start and stop -----------------------------------------------------------------------------
 
     def spawn(self, *, arguments: Sequence[str] | None = None, notify: str = "") -> subprocess.Popen[bytes]:
         """Start the process without waiting for it to be ready."""

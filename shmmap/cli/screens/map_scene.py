@@ -77,7 +77,7 @@ class Scene:
     chunks: Sequence[CellSquare] = ()
 
     def by_cell(self) -> dict[str, list[CellRow]]:
-        """Segments of each cell, the most important state last."""
+        """Return the segments of each cell, the most important state last."""
         found: dict[str, list[CellRow]] = {}
         for row in sorted(self.rows, key=_rank):
             found.setdefault(row.id, []).append(row)

@@ -43,7 +43,7 @@ _NARROWEST: Final = 20  # columns that make breaking the text worthwhile
 
 
 class Column(NamedTuple):
-    """One column of a table; numbers are aligned right.
+    """One column of a table; numbers are right-aligned.
 
     A terminal too narrow for the table shows only the ``spare`` columns that fit, lowest number first.
     ``looks`` maps words of the column to colours.

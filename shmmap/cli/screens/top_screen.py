@@ -46,7 +46,7 @@ _LATENCIES: Final = {
 _SOURCES: Final = ("load_points", "load_computed", "load_cached")
 """Statistics of loaders' own time, by kind of work; shown if any."""
 _PARTS: Final = (
-    # part, what it is called, glyph, style
+    # part, name, glyph, style
     ("in_use", "in use", "█", "cyan"),
     ("idle", "idle", "▓", "green"),
     ("retired", "retired", "▒", "yellow"),
@@ -182,7 +182,7 @@ def _budget(counters: dict[str, int], width: int) -> list[Line]:
     for index, (name, _, glyph, style) in enumerate(_PARTS):
         cells = room - used if index == len(_PARTS) - 1 else round(room * parts[name] / total)
         if parts[name] and not cells:
-            cells = 1  # what there is can be seen
+            cells = 1  # even a small part is visible
         cells = min(cells, room - used)
         used += cells
         bar.append((glyph * cells, style))

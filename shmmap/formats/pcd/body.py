@@ -25,7 +25,7 @@ __all__ = [
     "record_blocks",
 ]
 
-_BLOCK_BYTES: Final = 1 << 20  # of file data per block, at most
+_BLOCK_BYTES: Final = 1 << 20  # bytes of file data per block, at most
 _BYTE: Final = np.dtype(np.uint8)
 
 _KEPT_BYTES: Final = 16 << 20  # larger sets of buffers are not kept
@@ -61,7 +61,7 @@ def record_blocks(
 
 
 def _balanced(points: int, limit: int) -> int:
-    """Rows per block: at most ``limit``, and no short block at the end."""
+    """Return the rows per block: at most ``limit``, without a short block at the end."""
     blocks = -(-points // max(1, limit))
     return -(-points // blocks)
 

@@ -27,7 +27,7 @@ IDENTITY_VIEWPOINT: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _KEYS: Final = frozenset(
     (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 )
-_ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # the name of FIELDS in the oldest files; PCL reads it too
+_ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # name of the FIELDS line in the oldest files; PCL accepts it, too
 _BOM: Final = b"\xef\xbb\xbf"
 _LFS: Final = b"version https://git-lfs"
 _INTEGER: Final = re.compile(rb"[+-]?[0-9]{1,19}\Z")
@@ -145,7 +145,7 @@ def _parse_any(head: bytes, path: str, file_bytes: int) -> PcdHeader:
 
 
 class _HeaderParser:
-    """The lines of one header, and the checks between them."""
+    """Parser of a header's lines, and the checks between them."""
 
     def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
         self.head = head
@@ -180,7 +180,7 @@ class _HeaderParser:
         raise refusal(cause, message, path=self.path, offset=self.offsets.get(key, 0))
 
     def _read_lines(self) -> int:
-        """Collect the header's lines; returns the offset of the first data byte."""
+        """Collect the header's lines; return the offset of the first data byte."""
         offset = self._collect_lines()
         if offset is None:
             self._refuse_without_data_line()

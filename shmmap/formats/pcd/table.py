@@ -87,7 +87,7 @@ class FieldTable:
         wide = values.dtype.kind in "iu" and values.dtype.itemsize == 8 and len(values) > 0
         if wide and (int(values.max()) > _EXACT or int(values.min()) < -_EXACT):
             raise refusal("coordinate_range", f"{AXES[axis]} has integers beyond 2**53", path=path)
-        with np.errstate(invalid="ignore"):  # signalling NaNs
+        with np.errstate(invalid="ignore"):  # signalling NaNs would warn
             xyz[:, axis] = values
 
     def put_records(self, block: tuple[NDArray[Any], ...], records: NDArray[Any], path: str) -> None:

@@ -38,7 +38,7 @@ __all__ = [
 
 
 class Reload(msgspec.Struct):
-    """What is different in the map."""
+    """Changes of the map found by a reload."""
 
     map_version: Hex
     changed: Annotated[int, msgspec.Meta(description="cells whose file changed")]
@@ -48,7 +48,7 @@ class Reload(msgspec.Struct):
 
 
 class Eviction(msgspec.Struct):
-    """Numbers of segments."""
+    """Numbers of segments after an eviction."""
 
     freed: int
     still_mapped: Annotated[int, msgspec.Meta(description="retired, freed when no client maps them")]
@@ -57,13 +57,13 @@ class Eviction(msgspec.Struct):
 
 
 class Stop(msgspec.Struct):
-    """The daemon that ends."""
+    """The daemon that is stopping."""
 
     stopping: Annotated[int, msgspec.Meta(description="its pid")]
 
 
 class Pin(msgspec.Struct):
-    """A layer of a cell that is kept."""
+    """A pinned layer of a cell."""
 
     id: str
     layer: str
@@ -74,14 +74,14 @@ class Pin(msgspec.Struct):
 
 
 class Pins(msgspec.Struct):
-    """What is pinned."""
+    """All pinned layers."""
 
     cells: list[Pin]
     unknown: Annotated[list[str], msgspec.Meta(description="ids that the map does not have")]
 
 
 class FoundCell(msgspec.Struct):
-    """Where a layer of a cell lies in shared memory."""
+    """Location of a layer of a cell in shared memory."""
 
     id: str
     version: Hex
@@ -95,14 +95,14 @@ class FoundCell(msgspec.Struct):
 
 
 class PendingLayer(msgspec.Struct):
-    """A layer of a cell that is being loaded."""
+    """A layer of a cell that is still being loaded."""
 
     id: str
     layer: str
 
 
 class FailedLayer(msgspec.Struct):
-    """A layer of a cell that could not be loaded; ``holders`` map memory of the full budget."""
+    """A layer of a cell that could not be loaded; if the budget is full, ``holders`` use its memory."""
 
     id: str
     layer: str
@@ -112,7 +112,7 @@ class FailedLayer(msgspec.Struct):
 
 
 class Found(msgspec.Struct):
-    """What a client would get."""
+    """The reply to a client's request for cells."""
 
     epoch: Hex
     map_version: Hex
@@ -155,7 +155,7 @@ class Found(msgspec.Struct):
 
 
 class File(msgspec.Struct):
-    """A file, and the ids of the cells in it."""
+    """An exported file, and the ids of the cells in it."""
 
     path: str
     points: int
@@ -163,13 +163,13 @@ class File(msgspec.Struct):
 
 
 class Exported(msgspec.Struct):
-    """What was written."""
+    """The files written by an export."""
 
     files: list[File]
 
 
 class Field(msgspec.Struct):
-    """A field; ``xyz`` is x, y and z."""
+    """A field of a cloud; ``xyz`` stands for x, y and z."""
 
     name: str
     dtype: Annotated[str, msgspec.Meta(description="as numpy writes it")]
@@ -178,7 +178,7 @@ class Field(msgspec.Struct):
 
 
 class Bounds(msgspec.Struct):
-    """Bounds of finite points."""
+    """Bounds of all finite points."""
 
     min: list[float]
     max: list[float]
@@ -191,7 +191,7 @@ class Bounds(msgspec.Struct):
 
 
 class Crs(msgspec.Struct):
-    """What a file says of its coordinates."""
+    """The coordinate system that a file names."""
 
     name: str
     epsg: Annotated[int, msgspec.Meta(description="0: not said")]
@@ -249,7 +249,7 @@ class CloudFile(msgspec.Struct):
 
 
 class UnreadFile(msgspec.Struct):
-    """A file that cannot be read, and why."""
+    """A file that cannot be read, and the reason."""
 
     path: str
     message: str
@@ -263,7 +263,7 @@ class Outside(msgspec.Struct):
 
 
 class ServedMap(msgspec.Struct):
-    """A directory as a divided map."""
+    """A directory, described as a divided map."""
 
     cells: int
     outside_box: list[Outside]
@@ -277,7 +277,7 @@ class ServedMap(msgspec.Struct):
 
 
 class Directory(msgspec.Struct):
-    """A directory of files: sums and bounds of all."""
+    """A directory of clouds: totals, and bounds of all points."""
 
     path: str
     files: list[CloudFile]

@@ -64,7 +64,7 @@ class ShownMap(msgspec.Struct):
 
 
 class Saved(msgspec.Struct):
-    """A live map that was saved."""
+    """The result of saving a live map."""
 
     map: str
     files: Annotated[int, msgspec.Meta(description="chunks on disk")]

@@ -42,7 +42,7 @@ State: TypeAlias = Annotated[
 
 
 class Prefetching(msgspec.Struct):
-    """Cells fetched before clients request them."""
+    """Counters of cells fetched before clients request them."""
 
     outage_tolerance_s: Annotated[float, msgspec.Meta(description="the setting")]
     origin_out: Annotated[bool, msgspec.Meta(description="no load succeeds")]
@@ -76,7 +76,7 @@ class Prefetching(msgspec.Struct):
 
 
 class Published(msgspec.Struct):
-    """The published map that is served; times are Unix seconds."""
+    """The published map that the daemon serves; times are Unix seconds."""
 
     version: int
     refused: Annotated[int | None, msgspec.Meta(description="number of an offered version that is refused")]
@@ -168,7 +168,7 @@ class Status(msgspec.Struct):
 
 
 class Latency(msgspec.Struct):
-    """Quantiles in seconds, null when there is none."""
+    """Quantiles in seconds, null without measurements."""
 
     p50: float | None
     p99: float | None
@@ -252,7 +252,7 @@ class Health(msgspec.Struct):
 
 
 class Listed(msgspec.Struct):
-    """The segments of a daemon, in its statistics' state."""
+    """The state of a daemon, and its segments."""
 
     state: str
     epoch: Hex
@@ -261,7 +261,7 @@ class Listed(msgspec.Struct):
 
 
 class Shown(msgspec.Struct):
-    """One cell."""
+    """Everything about one cell."""
 
     id: str
     version: Hex
@@ -296,7 +296,7 @@ class Shown(msgspec.Struct):
 
 
 class Clients(msgspec.Struct):
-    """The clients of a daemon, this program among them."""
+    """The clients of a daemon, including this program."""
 
     clients: list[Client]
     unknown_holders: Annotated[int, msgspec.Meta(description="segments mapped by unidentified processes")]
@@ -304,7 +304,7 @@ class Clients(msgspec.Struct):
 
 
 class Diagnosis(msgspec.Struct):
-    """Everything that was looked at."""
+    """All findings of the doctor."""
 
     worst: Literal["ok", "warn", "fail"]
     findings: list[Finding]

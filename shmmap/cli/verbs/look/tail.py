@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap tail``: the daemon's events as they happen."""
+"""``shmmap tail``: print the daemon's events as they happen."""
 
 from __future__ import annotations
 

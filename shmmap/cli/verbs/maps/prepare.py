@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon only reads them.
+"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon only needs to read them.
 
 ``shmmap prepare URL --shards I/N`` computes layers of a slice of a published map, for ``publish --join``.
 """

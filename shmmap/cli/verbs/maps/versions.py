@@ -105,7 +105,7 @@ def _days(text: str) -> float:
 
 
 def run_versions(args: argparse.Namespace) -> int:
-    """List, roll back, refresh, rotate or prune."""
+    """List versions, or roll back, refresh, rotate or prune."""
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
 

@@ -95,7 +95,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """Print every setting."""
+    """Print every setting and its source."""
     from dataclasses import asdict
 
     from shmmap.daemon.config import ROWS, installed_config_file, trace_settings

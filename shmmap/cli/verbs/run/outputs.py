@@ -13,21 +13,21 @@ __all__ = ["Checked", "Setting", "Settings", "versions_kind"]
 
 
 class Setting(msgspec.Struct):
-    """A setting, and FILE:LINE, the variable, or ``default`` that it comes from."""
+    """A setting, and its source: FILE:LINE, a variable, or ``default``."""
 
     value: Any
     origin: str
 
 
 class Settings(msgspec.Struct):
-    """Every setting; sizes stand there under two names, such as budget (as in the file) and budget_bytes."""
+    """All settings; sizes have two names, such as budget (text, as in the file) and budget_bytes."""
 
     file: str | None
     settings: dict[str, Setting]
 
 
 class Checked(msgspec.Struct):
-    """A file without mistakes."""
+    """A configuration file without mistakes."""
 
     file: str | None
     good: bool
