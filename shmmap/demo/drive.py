@@ -112,7 +112,7 @@ class Fleet:
     consumers
         Number of consumers.
     route
-        The poses to come.
+        The poses of the drive.
     work
         Directory for the consumers' stderr.
 

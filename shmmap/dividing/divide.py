@@ -390,7 +390,7 @@ def _check_cells(
     row: Any,
     progress: Progress,
 ) -> None:
-    """Read the cells back; check that files and numbers of points match ``counts``, and points their cell.
+    """Read the cells back; check files, numbers of points, and that each point is in its cell.
 
     Raises
     ------

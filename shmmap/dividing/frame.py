@@ -121,7 +121,7 @@ def choose_frame(
     Parameters
     ----------
     translation
-        Numbers to add to x, y and z; ``none`` to keep the frame; ``auto`` to move it where the
+        Numbers to add to x, y and z; ``none`` to keep the frame; ``auto`` to move it if the
         inputs are float64 and float32 would lose more than half a millimetre.  An automatic frame
         lies at whole metres and whole cells, so that the cells stay the same squares of ground.
     before

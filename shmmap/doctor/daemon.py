@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check the daemon: whether it runs, has read the map, leaves memory behind, and what the kernel grants."""
+"""Check the daemon: whether it runs, has read the map, leaves memory behind, and has the kernel's support."""
 
 from __future__ import annotations
 

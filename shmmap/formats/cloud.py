@@ -114,7 +114,7 @@ class CloudDescription:
     Attributes
     ----------
     path, format, encoding, version, file_bytes
-        The file; ``encoding`` and ``version`` are empty where the format has none.
+        The file; ``encoding`` and ``version`` are empty if the format has none.
     points, dropped
         Points in the file, and how many of them have an x, y or z that is not finite.
     width, height

@@ -127,7 +127,7 @@ def parse_ply_header(head: bytes, *, path: str, file_bytes: int) -> PlyHeader:
 
 
 class _Parser:
-    """Parser of a header's lines, and the checks between them."""
+    """Parses a header's lines, and checks them against each other."""
 
     def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
         self.head = head

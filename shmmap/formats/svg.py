@@ -174,7 +174,7 @@ class Page:
         y
             Baseline of the first line.
         entries
-            Symbols as `swatch` and `dash` return them, and texts.
+            Pairs of a symbol, as returned by `swatch` or `dash`, and its text.
         left, spare
             Widths kept free at the start and end of the lines, inside the margins.
         """

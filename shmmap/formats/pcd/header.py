@@ -145,7 +145,7 @@ def _parse_any(head: bytes, path: str, file_bytes: int) -> PcdHeader:
 
 
 class _HeaderParser:
-    """Parser of a header's lines, and the checks between them."""
+    """Parses a header's lines, and checks them against each other."""
 
     def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
         self.head = head
