@@ -40,7 +40,7 @@ class OnDisk(NamedTuple):
     cells
         Names and boxes of the cells; empty if there are more than `MAX_ON_DISK`.
     total
-        Number of cells, known also if they are too many to list; None if the daemon did not say.
+        Number of cells; for an area with too many only a larger number than `MAX_ON_DISK`; None if unknown.
     everywhere
         Bounds of the whole map; None if it has no cells, or the daemon did not say.
     """
@@ -199,7 +199,7 @@ def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk)
 
 
 def _published(counters: dict[str, int]) -> list[str]:
-    """Return a line about a published map: how many cells are known, whether its store answers."""
+    """Return texts about a published map, and for how long its store has been out of reach."""
     texts = [text for text, _trouble in published_words(counters)]
     if texts and counters.get("origin_out", 0):
         texts.append(f"its store is out of reach for {outage_so_far(counters)}")
