@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: related verbs share a file, which imports what it needs only when it runs."""
+"""The command line: related verbs share a module, which imports what a verb needs when the verb runs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Areas and cells on the command line: how they are named, and what is said where there is none."""
+"""Areas and cells as arguments on the command line, and messages for areas without cells."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Answer = TypeVar("Answer", "Evicted", "Pinned")
 def add_area_options(
     parser: argparse.ArgumentParser, group: argparse._MutuallyExclusiveGroup, *, heights: bool = True
 ) -> None:
-    """Add ``--circle``, ``--square``, ``--box`` to ``group``, and ``--z`` unless heights mean nothing."""
+    """Add ``--circle``, ``--square`` and ``--box`` to ``group``, and ``--z`` if ``heights``."""
     parser.set_defaults(z=None)
     group.add_argument(
         "--circle",
@@ -87,7 +87,7 @@ def add_area_or_ids(parser: argparse.ArgumentParser) -> None:
 
 
 def area_from(args: argparse.Namespace) -> Area | None:
-    """Return the area the options describe, or None where they name none."""
+    """Return the area that the options describe, or None if they describe none."""
     if all(getattr(args, name) is None for name in ("circle", "square", "box", "z")):
         return None
     import shmmap.geometry as geometry
@@ -106,7 +106,7 @@ def area_from(args: argparse.Namespace) -> Area | None:
 
 
 def those_in(area: Area, boxes: Sequence[BoxTuple]) -> list[int]:
-    """Return which of these boxes touch an area, by index; heights do not count."""
+    """Return the indices of the boxes that touch an area; heights are ignored."""
     import numpy as np
 
     if not boxes:
@@ -118,7 +118,7 @@ def those_in(area: Area, boxes: Sequence[BoxTuple]) -> list[int]:
 
 
 def add_cells_argument(parser: argparse.ArgumentParser) -> None:
-    """Add ``CELL...``, and the areas that may stand for them."""
+    """Add ``CELL...``, and the area options that can replace the cell ids."""
     parser.add_argument("cells", metavar="CELL", nargs="*", help="cell ids; a file's name where it is unique")
     add_area_options(parser, parser.add_mutually_exclusive_group())
 
@@ -132,23 +132,23 @@ def act_on_cells(
     nothing: Answer,
     optional: bool = False,
 ) -> int:
-    """Ask the daemon to do something with the cells that `add_cells_argument` names; returns the exit code.
+    """Apply a verb to the cells that the arguments name; return the exit code.
 
     Parameters
     ----------
     ask
-        Given the client and the ids, None for ``--all``; returns the daemon's answer.
+        Called with the client and the ids (None for ``--all``); returns the daemon's answer.
     show
-        Prints an answer, without ids that the map does not have unless ``--json`` is given.
+        Prints an answer; lists ids that the map does not have only with ``--json``.
     nothing
-        The answer that ``--json`` shows where an area touches no cell.
+        The answer that ``--json`` prints if the area touches no cell.
     optional
-        No cells may be given.
+        Whether neither cells nor an area need be given.
 
     Raises
     ------
     BadRequest
-        Cells and an area, or neither where something has to be said.
+        Both cells and an area are given, or neither although one is required.
     """
     from shmmap.cli.daemon_address import connect
     from shmmap.cli.screens.output import print_line
@@ -178,17 +178,17 @@ def act_on_cells(
 
 
 def _at_height(area: Area, cell: CellInfo) -> bool:
-    """Whether a cell may have points in the area's heights; those of a cell never loaded are not known."""
+    """Whether a cell may have points in the area's height range; True if the cell's heights are unknown."""
     from shmmap.geometry import heights_overlap
 
     return area.z is None or cell.z_bounds is None or heights_overlap(area.z, *cell.z_bounds)
 
 
-# --- where there is nothing ---------------------------------------------------------------------------
+# --- areas without cells ------------------------------------------------------------------------------
 
 
 def around(boxes: Iterable[BoxTuple]) -> BoxTuple | None:
-    """Return the rectangle around rectangles; None where there is none."""
+    """Return the smallest rectangle around all rectangles; None if there are none."""
     found = list(boxes)
     if not found:
         return None
@@ -197,9 +197,10 @@ def around(boxes: Iterable[BoxTuple]) -> BoxTuple | None:
 
 
 def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
-    """Return what has to be added to a map's coordinates to get those of the clouds it was divided from.
+    """Return the offset (metres) from a map's coordinates to those of the clouds it was divided from.
 
-    None where nothing was moved, where another program made the map, and where its files are not here.
+    None if the offset is zero, if another program made the map, or if the map's files are not on this
+    machine.
     """
     map_dir = os.path.dirname(os.path.dirname(id_prefix + "_"))
     if not os.path.exists(os.path.join(map_dir, "shmmap_divide.json")):
@@ -211,13 +212,13 @@ def moved_by(id_prefix: str) -> tuple[float, float, float] | None:
 
 
 def no_cell_there(args: argparse.Namespace, client: Client, area: Area) -> int:
-    """Say that no cell of the map touches an area, and where the map is; returns the exit code."""
+    """Report that no cell of the map touches an area, and where the map is; return the exit code."""
     return nothing_found(args, *nothing_there(client.welcome, area))
 
 
 def print_near_cells(hint: str) -> None:
-    """Print what `shmmap.lacking.near_cells_hint` returned, on stderr."""
+    """Print the hint of `shmmap.lacking.near_cells_hint` on stderr."""
     if hint:
-        from shmmap.cli.screens.output import print_line  # 5 ms, for complaints alone
+        from shmmap.cli.screens.output import print_line  # takes 5 ms to import: only for error messages
 
         print_line(f"hint: {hint}", file=sys.stderr)

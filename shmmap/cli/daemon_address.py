@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which daemon the options mean: flags first, then ``SHMMAP_*`` variables, then the defaults."""
+"""Find the daemon that the options mean: flags first, then ``SHMMAP_*`` variables, then the defaults."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 __all__ = ["connect", "endpoint", "has_lost_socket", "instance", "locate", "shm_dir", "snapshot"]
 
 ASKED_S: Final = 2.0
-"""How long a verb waits to find out which process has a socket."""
+"""Seconds that a verb waits for the owner of a socket to identify itself."""
 ANSWER_S: Final = 5.0
-"""How long a verb waits for a daemon that is there, to connect and for each answer."""
+"""Seconds that a verb waits for a running daemon to accept a connection, and for each reply."""
 
 
 def _setting(args: argparse.Namespace, name: str) -> str:
@@ -30,7 +30,7 @@ def _setting(args: argparse.Namespace, name: str) -> str:
 
 
 def endpoint(args: argparse.Namespace) -> str | None:
-    """Return the socket the options name; None means "look in the usual places"."""
+    """Return the socket that the options name; None for the default places."""
     if named := _endpoint_setting(args):
         return endpoint_path(named)
     directory, name = _setting(args, "runtime_dir"), _setting(args, "instance")
@@ -43,7 +43,7 @@ def endpoint(args: argparse.Namespace) -> str | None:
 
 
 def instance(args: argparse.Namespace) -> str:
-    """Return the instance's name; where only an endpoint is given, it is the socket's name."""
+    """Return the instance's name; with only an endpoint given, the name of its socket."""
     named = _endpoint_setting(args)
     name = args.instance if args.instance or args.endpoint else _setting(args, "instance")
     if name or not named:
@@ -52,38 +52,32 @@ def instance(args: argparse.Namespace) -> str:
 
 
 def _endpoint_setting(args: argparse.Namespace) -> str:
-    """Return the endpoint as given; a flag that names another daemon overrides ``SHMMAP_ENDPOINT``."""
+    """Return the endpoint setting; a flag that selects another daemon overrides ``SHMMAP_ENDPOINT``."""
     return args.endpoint or ("" if args.instance or args.runtime_dir else _setting(args, "endpoint"))
 
 
 def shm_dir(args: argparse.Namespace) -> str:
-    """Return the directory the instance's segments are in."""
+    """Return the directory of the instance's segments."""
     return _setting(args, "shm_dir") or usual_directory(instance(args))
 
 
 def locate(args: argparse.Namespace) -> tuple[str, str]:
-    """Return the instance that the options mean, and the directory of its segments.
+    """Return the instance that the options select, and the directory of its segments.
 
-    What a socket is named after need not be the instance's name, and its segments may be anywhere: where the
-    statistics of that name are not those of the daemon at this socket, the socket is asked.  An instance's
-    name alone means the one with these statistics, wherever it listens.
+    A socket's name may differ from its instance's name, and the segments may be in any directory.  So if the
+    statistics found under the socket's name belong to another daemon, the daemon at the socket is asked. An
+    instance name alone selects the daemon with the statistics of that name, wherever it listens.
 
     Raises
     ------
     NoSocket
-        No daemon has this socket, and the one of that name has another.
-    ProtocolMismatch
-        The daemon at this socket is of another version, and no statistics name it.
+        No daemon listens at the socket, and the instance of that name listens elsewhere.
     """
     named, by_name = _named_socket(args), (instance(args), shm_dir(args))
     if _is_at(*by_name, named if _endpoint_setting(args) or _setting(args, "runtime_dir") else ""):
         return by_name
-    found, mismatch = None, None
-    try:
-        found = _asked(args, named) if named else None
-    except ProtocolMismatch as error:
-        mismatch = error
-    if found is None and named:  # it does not answer, or this user may not ask: whose statistics name it?
+    found = _asked(args, named) if named else None
+    if found is None and named:  # no reply, or no permission: look for statistics naming this socket
         places = dict.fromkeys((by_name[1], usual_directory("")))
         found = next(
             ((name, place) for place in places for name in _instances(place) if _is_at(name, place, named)),
@@ -100,21 +94,21 @@ def locate(args: argparse.Namespace) -> tuple[str, str]:
 
 
 def _named_socket(args: argparse.Namespace) -> str:
-    """Return the socket that the options name; empty where they name none."""
+    """Return the socket that the options name; empty if they name none."""
     found = endpoint(args)
     return found if found is not None else ""
 
 
 def _is_at(name: str, directory: str, socket: str) -> bool:
-    """Whether there are statistics of a daemon, and it has this socket (any, if empty)."""
+    """Whether the statistics ``name`` exist and their daemon listens at ``socket`` (at any, if empty)."""
     other = _endpoint_of(name, directory)
     return other != "" and (not socket or os.path.realpath(other) == os.path.realpath(socket))
 
 
 def _endpoint_of(name: str, directory: str) -> str:
-    """Read a daemon's socket from its statistics; empty where there are none, or none for this user.
+    """Read a daemon's socket from its statistics; empty if they are missing or unreadable.
 
-    That of one in another container, whose paths mean others here, is the one that the name stands for.
+    Also empty for a daemon in another container, whose paths are not valid here.
     """
     from shmmap.statistics.identity import pid_namespace
     from shmmap.statistics.reader import read_statistics
@@ -129,7 +123,7 @@ def _endpoint_of(name: str, directory: str) -> str:
 
 
 def _asked(args: argparse.Namespace, socket: str) -> tuple[str, str] | None:
-    """Ask the daemon at a socket for its instance and directory; None where it does not say."""
+    """Ask the daemon at a socket for its instance and directory; None if it does not reply."""
     from shmmap.client.discovery import is_served
 
     if not is_served(socket):
@@ -146,12 +140,12 @@ def _asked(args: argparse.Namespace, socket: str) -> tuple[str, str] | None:
 
 
 def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
-    """Read the daemon's statistics segment: a stopped daemon does not matter.
+    """Read the daemon's statistics segment, which needs no reply from the daemon.
 
     Raises
     ------
     NoSocket
-        There is no such segment: the daemon was never started, or was stopped.
+        The segment does not exist: the daemon was never started, or was stopped.
     """
     from shmmap.statistics.reader import read_statistics
 
@@ -169,12 +163,12 @@ def snapshot(args: argparse.Namespace) -> tuple[Snapshot, DaemonIdentity]:
 
 
 def has_lost_socket(found: Snapshot) -> bool:
-    """Whether clients cannot find the socket of a daemon that lives: another program removed it."""
+    """Whether another program removed the socket of a running daemon, so that clients cannot find it."""
     from shmmap.statistics.identity import pid_namespace
 
     if found.identity is None or found.counters.get("sockets_missing", 0):
         return found.identity is not None
-    if found.identity.pid_namespace != pid_namespace():  # its paths may mean others here
+    if found.identity.pid_namespace != pid_namespace():  # paths of another container are not valid here
         return False
     try:
         os.lstat(found.identity.endpoint)
@@ -202,14 +196,14 @@ def _instances(directory: str) -> list[str]:
 
 
 def connect(args: argparse.Namespace, name: str = "shmmap") -> Client:
-    """Connect to the daemon, and give up sooner than programs do: a person waits for the verb.
+    """Connect to the daemon with a shorter timeout than programs use, since a person is waiting.
 
     Parameters
     ----------
     args
-        With what `shmmap.cli.options.add_daemon_options` added.
+        Parsed options, those of `shmmap.cli.options.add_daemon_options` among them.
     name
-        How the session appears in ``shmmap clients``.
+        Name of the session in ``shmmap clients``.
     """
     import shmmap
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the programs ``shmmap`` and ``shmmapd`` start: every verb, and what becomes of errors."""
+"""Entry points of ``shmmap`` and ``shmmapd``: all verbs, parsing, and errors as exit codes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ GROUPS: Final = {
     },
     "live maps": {"live": "live.add_parser"},
 }
-"""Functions that add a verb, in the order of the help, for which all are imported; else only the one used."""
+"""Functions that add the verbs, in the order of ``--help``; only the verb in use is imported."""
 VERBS: Final = {verb: place for verbs in GROUPS.values() for verb, place in verbs.items()}
 _HEADINGS: Final = {next(iter(verbs)): heading for heading, verbs in GROUPS.items()}
 
@@ -96,7 +96,7 @@ class _GroupedHelp(argparse.RawDescriptionHelpFormatter):
 
 
 def verb_first(words: Sequence[str]) -> list[str]:
-    """Write ``--endpoint PATH status`` as ``status --endpoint PATH``: the verbs own all options."""
+    """Write ``--endpoint PATH status`` as ``status --endpoint PATH``, since options belong to the verbs."""
     end = 0
     while end < len(words) and words[end].startswith("--") and words[end] not in _OWN_OPTIONS:
         takes_value = words[end] not in _FLAGS and "=" not in words[end]
@@ -107,9 +107,9 @@ def verb_first(words: Sequence[str]) -> list[str]:
 
 
 def build_parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """Return the parser; the namespace it gives has ``run``, the verb's function.
+    """Return the parser; its namespace has ``run``, the function of the verb.
 
-    Given the words to parse, it knows only the verb they begin with, if there is such a verb.
+    If ``words`` begin with a verb, the parser has that verb alone, so that the others need not be imported.
     """
     parser = Parser(
         prog="shmmap",
@@ -133,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv
-        Words after the program's name; those of this process by default.
+        Words after the program's name; by default the arguments of this process.
     """
     words = join_negative_values(verb_first(sys.argv[1:] if argv is None else argv), NUMBER_OPTIONS)
 
@@ -150,5 +150,5 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def serve_main() -> int:
-    """Run ``shmmapd``, which is ``shmmap serve``."""
+    """Run ``shmmapd``, the same as ``shmmap serve``."""
     return main(["serve", *sys.argv[1:]])

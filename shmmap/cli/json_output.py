@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several verbs print as JSON, and the schemas of all: imported for ``--json`` alone."""
+"""JSON output that several verbs share, and the schemas of all verbs; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Fields: TypeAlias = Annotated[
 
 
 def hexed(number: int) -> str:
-    """Return 64 bits as they are written for people and programs."""
+    """Return a 64-bit number as 16 hexadecimal digits."""
     return f"{number:016x}"
 
 
@@ -56,7 +56,7 @@ class Failure(msgspec.Struct):
 
 
 class Holder(msgspec.Struct):
-    """A user of memory; session 0 and pid 0: a process that did not use the client library."""
+    """A process that holds memory; session 0 and pid 0: a process that did not use the client library."""
 
     session: Hex
     pid: int
@@ -69,7 +69,7 @@ class Holder(msgspec.Struct):
 
     @classmethod
     def of(cls, row: rows.Holder) -> Holder:
-        """Return what is known of a holder."""
+        """Return the JSON form of a holder's row."""
         return cls(
             hexed(row.session),
             row.pid,
@@ -83,7 +83,7 @@ class Holder(msgspec.Struct):
 
 
 class Client(msgspec.Struct):
-    """A client; ``cells`` and ``bytes`` were given to it and not returned."""
+    """A client; ``cells`` and ``bytes`` are those that it holds."""
 
     session: Hex
     pid: Annotated[int, msgspec.Meta(description="as the kernel says; 0: unknown")]
@@ -108,7 +108,7 @@ class Client(msgspec.Struct):
 
     @classmethod
     def of(cls, row: rows.ClientRow, now_monotonic_ns: int, *, mapped: bool = False) -> Client:
-        """Return what is known of a client, with what it has ``mapped`` if the row says that."""
+        """Return the JSON form of a client's row, with its mapped bytes if ``mapped``."""
         found = cls(
             hexed(row.session),
             row.pid,
@@ -131,7 +131,7 @@ class Client(msgspec.Struct):
 
 
 class Segment(msgspec.Struct):
-    """A layer of a cell in shared memory; a zombie is retired, but still in use."""
+    """A layer of a cell in shared memory; a zombie is a retired segment that clients still map."""
 
     id: str
     version: Hex
@@ -149,7 +149,7 @@ class Segment(msgspec.Struct):
 
     @classmethod
     def of(cls, row: rows.CellRow, now_monotonic_ns: int, *, id_prefix: str, instance: str) -> Segment:
-        """Return what the statistics say of a segment."""
+        """Return the JSON form of a segment's statistics row, whose names may be shortened."""
         found = cls.whole(row, now_monotonic_ns)
         if not row.id.startswith("…"):
             found.id = id_prefix + row.id
@@ -159,7 +159,7 @@ class Segment(msgspec.Struct):
 
     @classmethod
     def whole(cls, row: rows.CellRow, now_monotonic_ns: int) -> Segment:
-        """Return what a row says that has whole names."""
+        """Return the JSON form of a row whose names are complete."""
         idle_s = row.idle_s(now_monotonic_ns)
         return cls(
             row.id,
@@ -210,18 +210,18 @@ class LiveMap(msgspec.Struct):
 
     @classmethod
     def of(cls, row: rows.LiveMapRow) -> LiveMap:
-        """Return all that a row says."""
+        """Return the JSON form of a live map's row."""
         return msgspec.convert(row, cls, from_attributes=True)
 
 
 def output_kinds(output: str) -> list[Any]:
-    """Return the kinds of what a verb prints.
+    """Return the types of a verb's JSON output.
 
     Parameters
     ----------
     output
-        Names of structs below `shmmap.cli.verbs`, or of functions that return them, such as
-        ``"look.cells.Listed"``, with blanks between.
+        Names, separated by blanks, of structs below `shmmap.cli.verbs` or of functions that return structs,
+        such as ``"look.cells.Listed"``.
     """
     kinds = []
     for name in output.split():
@@ -232,7 +232,7 @@ def output_kinds(output: str) -> list[Any]:
 
 
 def json_schema(output: str) -> dict[str, Any]:
-    """Return the schema of what a verb prints; ``output`` as in `output_kinds`."""
+    """Return the schema of a verb's JSON output; ``output`` as in `output_kinds`."""
     schemas, definitions = msgspec.json.schema_components(output_kinds(output))
     (head, *others) = schemas
     whole = {"anyOf": [head, *others]} if others else head
@@ -240,13 +240,13 @@ def json_schema(output: str) -> dict[str, Any]:
 
 
 def more_of(kind: type, **others: type) -> type[msgspec.Struct]:
-    """Return a new struct type: the fields of a dataclass, struct or named tuple, then the given ones."""
+    """Return a new struct type with the fields of a dataclass, struct or named tuple, and further fields."""
     fields = {name: hint for name, hint in get_type_hints(kind).items() if name in _names(kind)}
     return msgspec.defstruct(kind.__name__, list({**fields, **others}.items()))
 
 
 def with_more(made: Any, **others: Any) -> msgspec.Struct:
-    """Return all that was ``made`` says, and more."""
+    """Return a struct with all fields of ``made``, and further ones."""
     kind = more_of(type(made), **{name: type(value) for name, value in others.items()})
     return kind(**{name: getattr(made, name) for name in _names(type(made))}, **others)
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several verbs share, and how their values are read."""
+"""Options that several verbs share, and parsers of their values."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import re
-from _thread import TIMEOUT_MAX  # of `threading`, which takes 2 ms to import
+from _thread import TIMEOUT_MAX  # constant of `threading`, which takes 2 ms to import
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -26,12 +26,12 @@ __all__ = [
     "size_bytes",
 ]
 
-# argparse offers no public name for this type
+# argparse has no public name for this type
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def numbers(text: str, names: str) -> list[float]:
-    """Read ``"-5,3,40"`` as the numbers that ``names`` (``"X,Y,R"``) announces."""
+    """Parse ``"-5,3,40"`` as numbers, one for each of ``names`` (``"X,Y,R"``)."""
     parts = text.split(",")
     wanted = names.split(",")
     try:
@@ -44,7 +44,7 @@ def numbers(text: str, names: str) -> list[float]:
 
 
 def seconds(text: str) -> float:
-    """Read a duration in seconds, not negative and no longer than threads can wait."""
+    """Parse a duration in seconds: not negative, and no longer than a thread can wait."""
     try:
         value = float(text)
     except ValueError:
@@ -55,7 +55,7 @@ def seconds(text: str) -> float:
 
 
 def at_least(lowest: int) -> Callable[[str], int]:
-    """Return an argparse type: a whole number, not below ``lowest``."""
+    """Return an argparse type for whole numbers not below ``lowest``."""
 
     def parse(text: str) -> int:
         if not re.fullmatch(r"[+-]?\d{1,18}", text) or int(text) < lowest:
@@ -66,7 +66,7 @@ def at_least(lowest: int) -> Callable[[str], int]:
 
 
 def size_bytes(text: str) -> int:
-    """Read a size such as ``512M``, bytes."""
+    """Parse a size such as ``512M``; return bytes."""
     from shmmap.daemon.config_table import parse_bytes
 
     try:
@@ -76,11 +76,11 @@ def size_bytes(text: str) -> int:
 
 
 class _Prose(str):
-    """Text whose lines are paragraphs: each is filled, and those after the first hang."""
+    """Text whose lines are paragraphs: each is wrapped, those after the first with a hanging indent."""
 
 
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Fills prose and single lines to the width; of other texts it folds the long lines only."""
+    """Wraps prose and single lines to the terminal's width; of other texts only lines that are too long."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = argparse.HelpFormatter._fill_text
@@ -92,9 +92,9 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _folded(text: str, width: int) -> str:
-    """Fold lines that are too long; those with an indent (JSON, commands) hang, others are sentences.
+    """Fold lines that are too long: indented ones (JSON, commands) hang, others are filled as sentences.
 
-    A sentence that continues in the next line is filled with it.
+    A sentence that continues on the next line is joined with that line.
     """
     import textwrap
 
@@ -132,11 +132,11 @@ def add_verb(
     output: str = "",
     epilog: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a verb that ``run`` carries out.
+    """Add the parser of a verb that ``run`` carries out.
 
-    The lines of ``description`` are paragraphs; ``epilog`` stands below the options as written, with long
-    lines folded.  What ``--json`` prints is described by ``json``, a text, or ``output``, names of structs
-    as `shmmap.cli.json_output.output_kinds` takes them.
+    The lines of ``description`` are paragraphs.  ``epilog`` follows the options as written, with long lines
+    folded.  The output of ``--json`` is described by the text ``json``, or by ``output``: names of structs as
+    in `shmmap.cli.json_output.output_kinds`.
     """
     if json:
         epilog = f"JSON (fields may be added, none is removed):\n{json}"
@@ -154,7 +154,7 @@ def add_verb(
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``, and ``--json-schema`` where the verb names the structs that it prints."""
+    """Add ``--json``, and ``--json-schema`` if the verb names the structs that it prints."""
     parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     if output := parser.get_default("json_output"):
         parser.add_argument(
@@ -168,7 +168,7 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 
 
 class _PrintSchema(argparse.Action):
-    """Prints the schema and ends, whatever else is given, as ``--help`` does."""
+    """Prints the schema and exits, whatever else is given, as ``--help`` does."""
 
     def __call__(
         self,
@@ -186,7 +186,7 @@ class _PrintSchema(argparse.Action):
 
 
 def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
-    """Add what finds a daemon's statistics segment, and ``--json`` unless the verb has none."""
+    """Add the options that find a daemon's statistics segment, and ``--json`` unless the verb has none."""
     group = parser.add_argument_group("which daemon to use")
     group.add_argument(
         "--instance", metavar="NAME", help="name of the daemon among several (default: default)"
@@ -204,7 +204,7 @@ def add_statistics_options(parser: argparse.ArgumentParser, *, json: bool = True
 
 
 def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) -> None:
-    """Add what finds a daemon and bounds how long it is asked, and ``--json`` unless the verb has none."""
+    """Add the options that find a daemon and bound its replies, and ``--json`` unless the verb has none."""
     add_statistics_options(parser, json=json)
     parser.add_argument(
         "--timeout",
@@ -215,17 +215,17 @@ def add_daemon_options(parser: argparse.ArgumentParser, *, json: bool = True) ->
 
 
 def add_layer_option(parser: argparse.ArgumentParser, help: str) -> None:  # noqa: A002
-    """Add ``--layer``; given several times, all count."""
+    """Add ``--layer``, which may be given several times."""
     parser.add_argument("--layer", metavar="SPEC", nargs="+", action="extend", default=[], help=help)
 
 
 def layers_from(args: argparse.Namespace) -> list[str]:
-    """Return the layers that were named, else ``points``."""
+    """Return the layers that the options name; ``points`` by default."""
     return args.layer or ["points"]
 
 
 def add_unit_options(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
-    """Add ``--unit`` and ``--vertical-unit`` of clouds that are no metres."""
+    """Add ``--unit`` and ``--vertical-unit``, for clouds whose coordinates are not in metres."""
     choices = ("auto", "m", "ft", "us-ft")
     parser.add_argument(
         "--unit",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every program of the package does alike: how it complains, and what becomes of its errors."""
+"""What all programs of the package share: error messages, exit codes, interrupts, output files."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ __all__ = [
 ]
 
 
-_EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as shells report it
+_EXIT_INTERRUPTED: Final = 130  # 128 + SIGINT, as in a shell
 
-_EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE
+_EXIT_BROKEN_PIPE: Final = 141  # 128 + SIGPIPE, as in a shell
 
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _LATER_S: Final = 0.005
-"""After this time a callback that a signal has interrupted has usually ended."""
+"""Seconds after which a callback that a signal has interrupted has usually ended."""
 _AGAIN_S: Final = 0.02
-"""Time until the next try, if the callback had not ended yet."""
+"""Seconds until the next try, if the callback has not ended yet."""
 _NEGATIVE_NUMBERS: Final = re.compile(r"-[\d.][\d.eE+,\-]*|-inf(,.*)?")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that complains as the rest of the program does: what is wrong, then a hint."""
+    """Argument parser whose error messages look like the program's others: the problem, then a hint."""
 
     def __init__(self, **settings: Any) -> None:
-        # an abbreviation that works today would break with tomorrow's options
+        # an abbreviation may become ambiguous when options are added
         super().__init__(**settings, allow_abbrev=False)
         self._words: list[str] = []
 
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse; each verb refuses the words that it does not know, so that the hint names its help."""
+        """Parse; each verb rejects its own unknown words, so that the hint names the help of that verb."""
         self._words = list(sys.argv[1:] if args is None else args)
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
@@ -73,29 +73,29 @@ class Parser(argparse.ArgumentParser):
         super()._check_value(action, value)
 
     def _refuse(self, message: str, word: str, known: Iterable[str] | None = None) -> NoReturn:
-        import difflib  # 6 ms, for mistakes alone
+        import difflib  # takes 6 ms to import: only for mistakes
 
         near = difflib.get_close_matches(word, known or self._option_string_actions, n=1)
         self.error(f"{message}; did you mean {near[0]}?" if near else message)
 
     def error(self, message: str) -> NoReturn:
-        """Complain about the command line and exit; name a misspelt option first."""
+        """Report a mistake on the command line and exit; a misspelt option is reported first."""
         words, self._words = self._words, []
         options = (word for word in words if word.startswith("--") and len(word) > len("--"))
         unknown = [word for word in options if word.split("=")[0] not in self._option_string_actions]
         missing = message.endswith("required") or message.startswith(
             "the following arguments are required: -"
         )
-        if unknown and missing:  # a misspelt option is why another one is missing
+        if unknown and missing:  # a required option may be missing only because it is misspelt
             self._refuse_unknown(unknown)
         complain(self.prog, message, f"{self.prog} --help")
         sys.exit(2)
 
 
 def join_negative_values(words: Sequence[str], options: Container[str] | None = None) -> list[str]:
-    """Write ``--circle -5,3,40`` as ``--circle=-5,3,40``, behind these options or else behind all.
+    """Write ``--circle -5,3,40`` as ``--circle=-5,3,40``, for ``options``; if there are none, for all options.
 
-    argparse takes a word that starts with a minus for an option unless it is a single number.
+    Otherwise argparse reads a word that starts with a minus as an option, unless the word is one number.
     """
     joined: list[str] = []
     for word in words:
@@ -110,7 +110,7 @@ def join_negative_values(words: Sequence[str], options: Container[str] | None = 
 
 
 def exit_code_of(name: str, run: Callable[[], int]) -> int:
-    """Run a program to its end and return its exit code; its errors are printed on stderr."""
+    """Run a program and return its exit code; print its errors on stderr."""
     _open_what_is_closed()
     keep_interrupts()
     try:
@@ -148,16 +148,17 @@ def exit_code_of(name: str, run: Callable[[], int]) -> int:
 
 
 def _forget_interrupt() -> None:
-    """Let the exit code count.
+    """Clear CPython's record of an interrupt, so that the exit code counts.
 
-    CPython remembers that `exec` of a text was interrupted, as dataclasses use it while modules are imported,
-    and ends ``python -m`` by SIGINT instead, although the interrupt was caught; the next `exec` forgets it.
+    CPython records that an interrupt reached `exec` of a text, which dataclasses use during imports.  At exit
+    ``python -m`` would then end by SIGINT although the interrupt was caught.  Another `exec` clears the
+    record.
     """
     exec("")  # noqa: S102
 
 
 def _is_of_interrupt(error: BaseException) -> bool:
-    """Whether an error comes of cleaning up after an interrupt, which came in the middle of a call."""
+    """Whether an error arose during cleanup after an interrupt in the middle of a call."""
     context: BaseException | None = error
     while context is not None and not isinstance(context, KeyboardInterrupt):
         context = context.__context__
@@ -165,20 +166,20 @@ def _is_of_interrupt(error: BaseException) -> bool:
 
 
 def _open_what_is_closed() -> None:
-    """Let what is printed go nowhere if stdout or stderr was closed when this process was started."""
+    """Redirect to the null device stdout and stderr that were closed when this process was started."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
 
 
 def _drop_output() -> None:
-    """Let what stdout still holds go nowhere: the interpreter flushes it once more at exit."""
+    """Discard what stdout still buffers, since the interpreter flushes it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def complain(name: str, message: str, hint: str = "") -> None:
-    """Say on stderr what is wrong, and what can be done about it."""
-    from shmmap.cli.screens.output import print_line  # 5 ms, for complaints alone
+    """Print an error and what can be done about it on stderr."""
+    from shmmap.cli.screens.output import print_line  # takes 5 ms to import: only for error messages
 
     print_line(f"{name}: {message}", file=sys.stderr)
     if hint:
@@ -191,19 +192,20 @@ def add_allow_empty(parser: argparse.ArgumentParser) -> None:
 
 
 def nothing_found(args: argparse.Namespace, message: str, hint: str = "", *, name: str = "shmmap") -> int:
-    """Report once that nothing was found, and return the exit code: 1, or 0 with ``--allow-empty``.
+    """Report that nothing was found; return the exit code: 1, or 0 with ``--allow-empty``.
 
-    It is 1 because a script would otherwise take an empty output for a result.
+    The code is 1 by default so that a script does not take empty output for a result.
     """
     complain(name, message, hint)
     return 0 if args.allow_empty else 1
 
 
 def keep_interrupts() -> None:
-    """Signal again, in this process, the ends that Python ignores (`KeyboardInterrupt`, `SystemExit`).
+    """Repeat interrupts and exits that Python would ignore (`KeyboardInterrupt`, `SystemExit`).
 
-    In a weak reference's callback or a finalizer Python prints "Exception ignored in", and goes on: of those
-    sent while modules are imported, one in ten (https://github.com/python/cpython/issues/95959).
+    Raised in a weak reference's callback or in a finalizer, they only make Python print "Exception ignored
+    in". This happens to one in ten interrupts during imports
+    (https://github.com/python/cpython/issues/95959).
     """
     before = sys.unraisablehook
 
@@ -218,7 +220,7 @@ def keep_interrupts() -> None:
                 frame = frame.f_back
             if frame is None:
                 signal.raise_signal(number)
-            else:  # in here Python would ignore it for good
+            else:  # raised here, it would be lost
                 signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
 
         signal.signal(signal.SIGALRM, again)
@@ -228,19 +230,19 @@ def keep_interrupts() -> None:
 
 
 def output_file(text: str) -> Path:
-    """Read the name of a file to write, and find out before the work begins that it can be.
+    """Parse the name of an output file; check before the work begins that it can be written.
 
     Raises
     ------
     CannotWrite
-        There is no such directory, or it or the file may not be written to.
+        The directory does not exist, or the directory or the file is not writable.
     """
     path = Path(text)
     with writing_errors(str(path)):
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         try:
-            os.stat(os.path.join(path.parent, "."))  # a directory, and there
+            os.stat(os.path.join(path.parent, "."))  # a directory, which exists
         except OSError as error:
             error.filename = text  # the name that the caller knows
             raise
@@ -250,6 +252,6 @@ def output_file(text: str) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file; what keeps it from being written is `CannotWrite`."""
+    """Write a text file; raise `CannotWrite` if that fails."""
     with writing_errors(str(path)):
         path.write_text(text, encoding="utf-8")

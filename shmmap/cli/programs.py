@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What other programs may take from ``shmmap``'s command line, so that theirs is answered in the same way.
+"""Names of the command line for other programs, so that their options and messages look alike.
 
-The rest of `shmmap.cli` may change at any time; these names, their parameters and what they do stay.
+These names, their parameters and their behaviour are stable; the rest of `shmmap.cli` may change at any time.
 
 `Parser`
-    An `argparse.ArgumentParser` that complains as ``shmmap`` does and knows no abbreviations.
+    An `argparse.ArgumentParser` with the error messages of ``shmmap``, and without abbreviations.
 `add_verb`
-    A verb's parser; texts of several lines are shown as they are written.
+    Add a verb's parser; texts of several lines are printed as written.
 `add_daemon_options`, `add_json_option`
-    ``--instance --endpoint --runtime-dir --shm-dir --timeout``: which daemon; ``--json``.
+    Add ``--instance --endpoint --runtime-dir --shm-dir --timeout``, which select a daemon; add ``--json``.
 `connect`
-    A `shmmap.Client` of the daemon that those options, or ``SHMMAP_*`` variables, name.
+    Return a `shmmap.Client` of the daemon selected by those options or by ``SHMMAP_*`` variables.
 `at_least`, `seconds`, `output_file`
-    Types of options: whole numbers, durations, files to be written (refused at once where they cannot be).
+    Types of options: whole numbers, durations, output files (refused at once if not writable).
 `write_text`, `writing_errors`
-    Write a file; `shmmap.errors.CannotWrite` where it cannot be.
+    Write a file; raise `shmmap.errors.CannotWrite` if that fails.
 `print_json`, `print_line`, `printable`
-    One JSON document; a line of text, and text, with nothing in it that a terminal would obey.
+    Print a JSON document or a line, or return text, with control codes for terminals escaped.
 `complain`
-    Says on stderr what is wrong, and a hint.
+    Print an error and a hint on stderr.
 `add_allow_empty`, `nothing_found`
-    ``--allow-empty``; says that nothing was found, and returns the exit code.
+    Add ``--allow-empty``; report that nothing was found and return the exit code.
 `join_negative_values`
-    Words in which ``--pose -5,3`` is one option, for `argparse`.
+    Return the words of a command line with ``--pose -5,3`` joined to one word, for `argparse`.
 `exit_code_of`
-    Run a program: errors go to stderr, with a hint, and become exit codes.
+    Run a program; print errors with a hint on stderr and return the exit code.
 """
 
 from __future__ import annotations

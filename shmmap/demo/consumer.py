@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One process that follows a vehicle and computes on the map around it.
+"""A process that follows a vehicle and computes on the map around it.
 
-``python -m shmmap.demo.consumer shared ENDPOINT RADIUS TASK`` follows through a `MapWindow`;
-``... private MAP RADIUS TASK`` reads the same PCD files into its own memory, as a program does without shared
-memory.  All else is the same.  The first line of stdin is the route, a list of poses; it is answered with an
-empty line.  Each line after it is a `Step`, and is answered with a `StepReport`, all in JSON.
+``python -m shmmap.demo.consumer shared ENDPOINT RADIUS TASK`` follows with a `MapWindow`; ``... private MAP
+RADIUS TASK`` reads the same PCD files into its own memory, as a program does without shared memory.  The rest
+is the same.  The first line of stdin is the route, a list of poses; the reply is an empty line.  Each further
+line is a `Step`, and the reply a `StepReport`, all in JSON.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ __all__ = ["TASKS", "Pose", "Step", "StepReport", "main"]
 Points: TypeAlias = NDArray[Any]
 
 _TIMEOUT_S: Final = 30.0
-_COUNTED_METRES: Final = 20.0  # around the vehicle: the points that a control loop reads
-_UPDATE_METRES: Final = 20.0  # how far a vehicle drives before it needs other cells, as in Autoware
+_COUNTED_METRES: Final = 20.0  # radius around the vehicle of the points that a control loop reads
+_UPDATE_METRES: Final = 20.0  # distance after which a vehicle needs other cells, as in Autoware
 
 
 class Pose(msgspec.Struct, frozen=True):
-    """Where the vehicle is: metres in the map frame, heading in radians counter-clockwise from x."""
+    """Pose of the vehicle: metres in the map frame, heading in radians counter-clockwise from x."""
 
     x: float
     y: float
@@ -40,15 +40,15 @@ class Pose(msgspec.Struct, frozen=True):
 
 
 class Step(msgspec.Struct, frozen=True):
-    """The next pose.
+    """A pose to move to, and whether to wait for its cells.
 
     Attributes
     ----------
     pose
-        Of the vehicle.
+        Pose of the vehicle.
     drive_on
-        Whether to compute on the cells that are there, as a control loop must, instead of waiting until none
-        is missing.
+        Whether to compute on the cells available, as a control loop must, instead of waiting for missing
+        ones.
     """
 
     pose: Pose
@@ -56,24 +56,24 @@ class Step(msgspec.Struct, frozen=True):
 
 
 class StepReport(msgspec.Struct, frozen=True):
-    """What one consumer did at one pose.
+    """Results of one consumer at one pose.
 
     Attributes
     ----------
     answer
-        Result of its task, as a sentence.
+        Result of the task, as a sentence.
     follow_s
-        How long a control loop would have waited for the map.
+        Seconds that a control loop would have waited for the map.
     complete_s
-        How long until all new cells were there.
+        Seconds until all new cells were available.
     cells, points, bytes
-        What it holds; bytes of all columns.
+        Cells that the consumer holds, their points, and bytes of all columns.
     current
-        Whether it had all cells that it needed; with `Step.drive_on`, for the pose before.
+        Whether the consumer had all cells needed; with `Step.drive_on`, those for the previous pose.
     counted
-        Points that its control loop has read so far at poses with `Step.drive_on`.
+        Points that the control loop has read so far, at poses with `Step.drive_on`.
     paused_s
-        Time since the answer before.
+        Seconds since the previous reply.
     """
 
     answer: str
@@ -88,7 +88,7 @@ class StepReport(msgspec.Struct, frozen=True):
 
 
 class _Cloud(msgspec.Struct, frozen=True):
-    """One cell as a task sees it.
+    """One cell as input of a task.
 
     ``xyz`` is (N, 3), metres, map frame; ``nbytes`` counts all columns; ``top`` is the highest z.
     """
@@ -100,32 +100,32 @@ class _Cloud(msgspec.Struct, frozen=True):
 
 
 def _survey(box: tuple[float, float, float, float], columns: Iterable[Points], xyz: Points) -> _Cloud:
-    """Look at every point once, as a program does that builds a structure of its own from a cell."""
+    """Visit every point once, like a program that builds its own structure from a cell."""
     return _Cloud(box, xyz, sum(column.nbytes for column in columns), float(xyz[:, 2].max(initial=-math.inf)))
 
 
 class _MapAround:
-    """The cells around a vehicle, by id; one whose `follow` waits for them needs no other method."""
+    """The cells around a vehicle, by id; a subclass whose `follow` waits needs no other method."""
 
     clouds: dict[str, _Cloud]
 
     def follow(self, pose: Pose) -> None:
-        """Go to a pose: what a control loop calls."""
+        """Move to a pose; called from a control loop."""
         raise NotImplementedError
 
     def take(self) -> None:
-        """Let ``clouds`` be the cells that are there."""
+        """Update ``clouds`` to the cells available now."""
 
     def wait(self) -> None:
-        """Wait until all that the last pose needs is there."""
+        """Wait until all cells for the last pose are available."""
 
     def current(self) -> bool:
-        """Whether all that the last pose needs is there."""
+        """Whether all cells for the last pose are available."""
         return True
 
 
 class _SharedMap(_MapAround):
-    """Follows through shmmap: the points stay where the daemon put them."""
+    """Follows with shmmap, without copying points."""
 
     def __init__(self, endpoint: str, radius: float, route: Sequence[Pose]) -> None:
         import shmmap
@@ -141,7 +141,7 @@ class _SharedMap(_MapAround):
         self._window.move_to(pose.x, pose.y, heading=pose.heading, route=self._route)
 
     def take(self) -> None:
-        """Look at the cells that the window holds."""
+        """Take the cells that the window holds."""
         before = self.clouds
         self.clouds = {
             cell.id: before.get(cell.id) or _survey(cell.box, cell.columns.values(), cell.xyz)
@@ -149,7 +149,7 @@ class _SharedMap(_MapAround):
         }
 
     def wait(self) -> None:
-        """Wait for the window's thread."""
+        """Wait for the window's thread to finish."""
         deadline_s = time.monotonic() + _TIMEOUT_S
         while not self._window.wait_until_current(1.0):
             if self._window.error is not None:
@@ -158,12 +158,12 @@ class _SharedMap(_MapAround):
                 raise NoAnswer(f"the window is not complete after {_TIMEOUT_S:g} s")
 
     def current(self) -> bool:
-        """Whether the window's thread is done with the last pose."""
+        """Whether the window's thread has finished the last pose."""
         return self._window.wait_until_current(0.0)
 
 
 class _PrivateMap(_MapAround):
-    """Follows by reading files: every process that does so has its own copy."""
+    """Follows by reading files, so that every process has a copy of its own."""
 
     def __init__(self, map_path: str, radius: float, route: Sequence[Pose]) -> None:
         from shmmap.origin.map_directory import open_map
@@ -175,7 +175,7 @@ class _PrivateMap(_MapAround):
         self._asked: Pose | None = None
 
     def follow(self, pose: Pose) -> None:
-        """Drop what is out of reach and read what is new, where the vehicle has come far enough for that."""
+        """If the vehicle has moved far enough, drop cells out of reach and read new ones."""
         from shmmap.formats.cloud import read_pcd
 
         asked = self._asked
@@ -227,11 +227,11 @@ TASKS: Final[dict[str, Callable[[Iterable[_Cloud], Pose], str]]] = {
     "mapping": _density,
     "perception": _highest,
 }
-"""What a consumer may compute at every pose: a sentence about the map around the vehicle."""
+"""Tasks of a consumer: each returns a sentence about the map around the vehicle."""
 
 
 def main(argv: list[str]) -> int:
-    """Answer poses until stdin ends."""
+    """Reply to poses until stdin ends."""
     kind, source, radius, task = argv
     route = msgspec.json.decode(sys.stdin.buffer.readline(), type=list[Pose])
     around: _MapAround = (_SharedMap if kind == "shared" else _PrivateMap)(source, float(radius), route)

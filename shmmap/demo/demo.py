@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration: a town, a vehicle, many processes on one copy of the map, and on private copies.
+"""Run the demonstration: a vehicle in a town, and many processes with a shared map or private copies.
 
-Everything is real: files on disk, a daemon process that is killed and comes back, consumer processes, memory
-and processor time as the kernel counts them, a program that localizes.  It leaves nothing behind.
+Nothing is simulated but town and sensor: files on disk, a daemon process that is killed and restarted,
+consumer processes, memory and processor time as counted by the kernel, a localization program.  Everything is
+removed at the end.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ from shmmap.testing.daemon_process import DaemonProcess
 __all__ = ["DemoResult", "Round", "run_demo"]
 
 _PREFETCH_SHARE: Final = "0.02"
-"""The drive is faster than any vehicle: as far ahead as that needs, all of the town would be fetched."""
+"""The drive is faster than any vehicle; prefetching for its speed would load the whole town."""
 
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """The same drive of several processes on one shared copy, and with a private copy in each."""
+    """The same drive of several processes on one shared copy, and with private copies."""
 
     consumers: int
     shared: DriveResult
@@ -60,20 +61,20 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """Everything the demonstration measured.
+    """All measurements of the demonstration.
 
     Attributes
     ----------
     radius
-        Of every process's window, metres.
+        Radius of every process's window, metres.
     rounds
-        With ever more processes.
+        One round for each number of processes, ascending.
     resident
         The cells in shared memory at the end of the last round.
     outage
-        Of the daemon of the last round.
+        Outage of the daemon in the last round.
     localization
-        None where a package is missing, see ``missing``.
+        Result of the localization; None if the package ``missing`` is not installed.
     """
 
     radius: float
@@ -86,7 +87,7 @@ class DemoResult:
 
     @property
     def one_more_bytes(self) -> tuple[float, float]:
-        """Memory that each further process needs, from the first round to the last: shared, private."""
+        """Memory that each further process needs: with the shared map, and with private copies."""
         first, last = self.rounds[0], self.rounds[-1]
         more = last.consumers - first.consumers
         return (
@@ -96,12 +97,12 @@ class DemoResult:
 
 
 def run_demo(settings: DemoSettings, progress: Progress, *, map_dir: str | None = None) -> DemoResult:
-    """Build, drive, measure, clean up.
+    """Build the map, drive, measure, and clean up.
 
     Parameters
     ----------
     map_dir
-        Where the map is built and stays; by default in a temporary directory that is removed.
+        Directory in which the map is built and kept; by default a temporary one.
 
     Raises
     ------

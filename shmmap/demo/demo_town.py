@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration's town: how large it may be on this machine, built as a divided map, and drawn."""
+"""The demonstration's town: fit its size to this machine, build it as a divided map, and draw it."""
 
 from __future__ import annotations
 
@@ -26,40 +26,41 @@ from shmmap.simulation.town_surfaces import BLOCK_METRES
 __all__ = ["DemoSettings", "HeightImage", "TownMap", "build_town", "fit", "free_bytes"]
 
 _POINT_BYTES: Final = 16  # x, y, z and intensity as float32
-_POINTS_PER_GROUND_POINT: Final = 1.65  # roofs, walls and leaves add to the ground
+_POINTS_PER_GROUND_POINT: Final = 1.65  # surface per ground area: roofs, walls and leaves count, too
 _CELL_METRES: Final = 20.0
 _SMALLEST_DENSITY: Final = 2.0
-_FILL: Final = 0.8  # of what is free, at most
+_FILL: Final = 0.8  # share of the free memory, at most
 _STATISTICS_BYTES: Final = 256 << 10
-_CELL_OVERHEAD_BYTES: Final = 12 << 10  # its header, and columns rounded up to pages
-_SPARE: Final = 1.25  # budget over window
-_PROCESS_BYTES: Final = 30 << 20  # of a consumer without its points
+_CELL_OVERHEAD_BYTES: Final = 12 << 10  # bytes of its header, and of columns rounded up to pages
+_SPARE: Final = 1.25  # ratio of budget to window
+_PROCESS_BYTES: Final = 30 << 20  # bytes of a consumer without its points
 
 
 @dataclass(frozen=True, slots=True)
 class DemoSettings:
-    """What is built and driven.
+    """Settings of town and drive.
 
     Attributes
     ----------
     blocks
         Size of the town in blocks of 80 m.
     density
-        Points per square metre of ground; less where shared memory is scarce.
+        Points per square metre of ground; reduced if shared memory is scarce.
     radius
-        Of every process's window, metres.
+        Radius of every process's window, metres.
     length, step
-        Of the drive that is measured, metres.
+        Length of the measured drive, and distance between its poses, metres.
     onward
-        How far the last drive continues, a metre at a time, while the daemon is killed and starts again.
+        Distance that the last drive continues, a metre at a time, while the daemon is killed and restarted,
+        metres.
     localized
-        Length of the drive of the localization, metres.
+        Length of the localized drive, metres.
     pace_s
-        Least time per step.
+        Minimum seconds per step.
     counts
-        How many processes drive together, one drive after the other, ascending.
+        Number of processes in each drive, ascending.
     seed
-        Which town.
+        Random seed of the town.
     """
 
     blocks: tuple[int, int] = (5, 4)
@@ -76,7 +77,7 @@ class DemoSettings:
 
 @dataclass(frozen=True, slots=True)
 class TownMap:
-    """The map on disk, a picture of it, and the route through it, which goes on with ``onward``."""
+    """The map on disk, a picture of it, and the route through it, which ``onward`` continues."""
 
     path: str
     cells: int
@@ -91,17 +92,17 @@ class TownMap:
 
 
 def free_bytes(directory: str) -> int:
-    """Return how much more fits on a file system."""
+    """Return the free bytes on a file system."""
     state = os.statvfs(directory)
     return state.f_bavail * state.f_frsize
 
 
 def free_memory_bytes() -> int:
-    """Return how much memory processes can still have, a container's limit respected."""
+    """Return the memory that processes can still allocate, within a container's limit."""
     fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
     free = int(fields["MemAvailable"].split()[0]) << 10
-    group = Path("/sys/fs/cgroup")  # in a container: its own
-    with contextlib.suppress(OSError, ValueError):  # no limit is the word "max", or no file
+    group = Path("/sys/fs/cgroup")  # inside a container, the container's own
+    with contextlib.suppress(OSError, ValueError):  # "max", or no file: no limit
         limit = int((group / "memory.max").read_text(encoding="ascii"))
         free = min(free, limit - int((group / "memory.current").read_text(encoding="ascii")))
     return free
@@ -110,29 +111,29 @@ def free_memory_bytes() -> int:
 def fit(
     settings: DemoSettings, *, shm_bytes: int, disk_bytes: int, memory_bytes: int, copies: int
 ) -> tuple[DemoSettings, int]:
-    """Choose a budget of shared memory, and thin the town out where there is little room.
+    """Choose a budget of shared memory, and reduce the town's density if memory or disk is scarce.
 
-    The budget holds the largest window and a little more, so that cells stay for a while and are evicted
-    in the end.  A container has 64 MB of shared memory by default.
+    The budget is a little larger than the largest window, so that cells stay for a while before eviction.  A
+    container has 64 MB of shared memory by default.
 
     Parameters
     ----------
     shm_bytes, disk_bytes, memory_bytes
-        What is free.
+        Free bytes of each.
     copies
-        Private copies of the window that have to fit in memory at once, each in its own process.
+        Private copies of the window that must fit in memory at once, each in its own process.
 
     Returns
     -------
     settings
-        With the density that fits.
+        Settings with a density that fits.
     budget_bytes
-        For the daemon.
+        Budget of the daemon.
 
     Raises
     ------
     ConfigError
-        There is too little room for any town.
+        Memory or disk is too small for any town.
     """
     per_metre2 = _POINTS_PER_GROUND_POINT * _POINT_BYTES
     window_metres2 = math.pi * (settings.radius + _CELL_METRES / 2) ** 2
@@ -192,13 +193,13 @@ def _cell_box(file: Path) -> tuple[float, float, float, float]:
 Ground: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[Any]]
 
 _NOTHING: Final = 0  # palette entry of pixels without a point
-_GROUND_LEVELS: Final = 16  # entries for the ground, dark asphalt to light paint
-_HEIGHT_LEVELS: Final = 100  # entries each for plants and for buildings, low to high
-_GROUND_METRES: Final = 0.3  # what is lower belongs to the ground
+_GROUND_LEVELS: Final = 16  # palette entries for the ground, from dark asphalt to light paint
+_HEIGHT_LEVELS: Final = 100  # palette entries each for plants and for buildings, from low to high
+_GROUND_METRES: Final = 0.3  # metres; lower points belong to the ground
 _LOW_METRES, _HIGH_METRES = 0.3, 25.0
 _PLANT_INTENSITY: Final = 52.0  # the town's leaves reflect more than its roofs
 
-# where along the scale (0 to 1), and the colour there; between two of them it is mixed
+# position on the scale (0 to 1) and its colour; colours in between are interpolated
 _GROUND_COLOURS: Final = (
     (0.0, (176, 176, 178)),
     (0.25, (214, 211, 205)),
@@ -220,7 +221,7 @@ class HeightImage:
     Parameters
     ----------
     box
-        What the image shows: (min_x, min_y, max_x, max_y), metres, map frame.
+        Area of the image: (min_x, min_y, max_x, max_y), metres, map frame.
     pixel
         Side of a pixel, metres.
     """
@@ -249,12 +250,12 @@ class HeightImage:
         Parameters
         ----------
         ground
-            Height of the ground at (x, y), arrays of metres.
+            Function that returns the height of the ground at (x, y), arrays of metres.
         """
         x = self.box[0] + (np.arange(self._columns) + 0.5) * self._pixel
         y = self.box[3] - (np.arange(self._rows) + 0.5) * self._pixel
         above = self._top - ground(np.tile(x, self._rows), np.repeat(y, self._columns))
-        # a square root gives the heights of hedges as many colours as those of towers
+        # a square root spreads low heights (hedges) over as many colours as high ones (towers)
         scale = np.sqrt(np.clip((above - _LOW_METRES) / (_HIGH_METRES - _LOW_METRES), 0.0, 1.0))
         height = (scale * (_HEIGHT_LEVELS - 1)).astype(np.uint8)
         shade = (np.clip(self._intensity / 128.0, 0.0, 1.0) * (_GROUND_LEVELS - 1)).astype(np.uint8)

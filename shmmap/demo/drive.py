@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives of several processes that follow one vehicle, on one shared map or each with a private copy.
+"""Drives of several processes that follow one vehicle, with one shared map or with private copies.
 
-The last drive goes on while the daemon is killed and starts again.
+The last drive continues while the daemon is killed and restarted.
 """
 
 from __future__ import annotations
@@ -28,33 +28,33 @@ from shmmap.testing.daemon_process import DaemonProcess
 __all__ = ["DriveResult", "Fleet", "OutageResult", "drive", "drive_through_outage", "statistics_now"]
 
 _TIMEOUT_S: Final = 60.0
-_SHOWN: Final = 8  # consumers on a spectator's screen
+_SHOWN: Final = 8  # consumers shown on the screen
 _POLL_S: Final = 0.02
-_BEFORE: Final = 5  # poses with the daemon, to begin with
-_ALONE: Final = 12  # poses before it is started again
-_PACE_S: Final = 0.1  # between poses: a control loop at 10 Hz
+_BEFORE: Final = 5  # poses before the daemon is killed
+_ALONE: Final = 12  # poses before the daemon is restarted
+_PACE_S: Final = 0.1  # seconds between poses: a control loop at 10 Hz
 
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """One drive of several processes.
+    """Results of one drive of several processes.
 
     Attributes
     ----------
     consumers, processes
-        Processes that follow the vehicle, and these with the daemon and its workers.
+        Number of processes that follow the vehicle, and the same with daemon and workers included.
     cells, points, map_bytes
-        What one consumer holds at the end; bytes of its columns.
+        Cells that one consumer holds at the end, their points, and bytes of their columns.
     start_s
-        From the first pose until all have their first window.
+        Seconds from the first pose until all consumers have their first window.
     follow_max_s
-        How long a control loop waited for the map after that at most.
+        Longest time that a control loop waited for the map after that, seconds.
     cpu_s
-        Processor time of all processes since they were started, user and system.
+        User and system time of all processes since their start, seconds.
     daemon_start_cpu_s
-        The part of it that the daemon used before the drive; 0 without a daemon.
+        Part of ``cpu_s`` that the daemon used before the drive; 0 without a daemon.
     process_bytes, private_bytes
-        Memory of the processes at the end without shared memory; pages that one process alone maps.
+        Memory of the processes at the end, without shared memory; and pages that only one process maps.
     shm_bytes
         Shared memory in use at the end, mapped or not, as the file system counts it.
     total_bytes
@@ -78,18 +78,18 @@ class DriveResult:
 
 @dataclass(frozen=True, slots=True)
 class OutageResult:
-    """What the consumers did while there was no daemon.
+    """Results of the consumers while no daemon ran.
 
     Attributes
     ----------
     down_s
         From SIGKILL until the daemon was ready again.
     poses, counted
-        Poses that all consumers answered in this time, and points of the map that each read.
+        Poses that all consumers processed in this time, and points of the map that each of them read.
     longest_pause_s
-        Longest time between two answers of a control loop until all was as before, with the pace of poses.
+        Longest time between two replies of a control loop until full recovery, including the pace of poses.
     segments, adopted
-        In shared memory before SIGKILL, and taken over by the next daemon.
+        Segments in shared memory before SIGKILL, and those that the next daemon adopted.
     """
 
     down_s: float
@@ -101,27 +101,27 @@ class OutageResult:
 
 
 class Fleet:
-    """Processes of `shmmap.demo.consumer`, which take their tasks in turn.
+    """Processes of `shmmap.demo.consumer`, which receive their tasks in rotation.
 
     Parameters
     ----------
     source
-        The daemon of a shared map, or the directory of a map of which each reads a private copy.
+        The daemon of a shared map, or the directory of a map that each process reads privately.
     radius
-        Of every consumer's window, metres.
+        Radius of every consumer's window, metres.
     consumers
-        How many.
+        Number of consumers.
     route
-        The poses to come.
+        The poses of the drive.
     work
-        Directory for what they write to stderr.
+        Directory for the consumers' stderr.
 
     Attributes
     ----------
     daemon
-        That of a shared map, else None.
+        Daemon of a shared map, else None.
 
-    Used as a context manager: all consumers are ready on entry, and gone on exit.
+    Used as a context manager, all consumers are ready on entry, and have ended on exit.
 
     Raises
     ------
@@ -158,21 +158,21 @@ class Fleet:
 
     @property
     def pids(self) -> list[int]:
-        """Process ids, in the order of the tasks."""
+        """Process ids, in the order of the consumers."""
         return [program.pid for program in self._programs]
 
     def move_to(self, pose: Pose, progress: Progress, *, drive_on: bool = False) -> list[StepReport]:
-        """Send all to a pose, wait for their answers, show and return them in the order of the tasks.
+        """Send a pose to all, wait for the replies, and show and return them in the order of the consumers.
 
         Parameters
         ----------
         drive_on
-            Whether they compute on the cells they have, instead of waiting until none is missing.
+            Whether consumers compute on the cells they have, instead of waiting for missing ones.
         """
         answers = self._ask(Step(pose, drive_on))
         reports = [msgspec.json.decode(answer, type=StepReport) for answer in answers]
         lines = self._consumer_lines(reports)
-        if self.daemon is not None and not drive_on:  # the daemon is not killed
+        if self.daemon is not None and not drive_on:  # this drive does not kill the daemon
             counters = read_statistics(self.daemon.instance, self.daemon.shm_dir).counters
             used_bytes = counters["bytes_resident"] + counters["bytes_zombie"]
             lines.append(
@@ -189,7 +189,7 @@ class Fleet:
         return [program.read_line(_TIMEOUT_S) for program in self._programs]
 
     def _consumer_lines(self, reports: Sequence[StepReport]) -> list[str]:
-        """Return a line for each consumer, as far as a screen has room for them."""
+        """Return a line for each consumer, as many as fit on the screen."""
         lines = []
         for task, report in list(zip(self._tasks, reports, strict=True))[:_SHOWN]:
             did = f"{report.counted / 1e6:.1f} M points read" if report.counted else ""
@@ -201,7 +201,7 @@ class Fleet:
 
 
 def drive(fleet: Fleet, route: Sequence[Pose], pace_s: float, progress: Progress) -> DriveResult:
-    """Follow the route with all consumers, in step, at least ``pace_s`` seconds per pose."""
+    """Follow the route with all consumers in step, at least ``pace_s`` seconds per pose."""
     daemon = fleet.daemon
     start_cpu_s = cpu_seconds(descendants(daemon.pid)) if daemon else 0.0
     reports: list[StepReport] = []
@@ -243,21 +243,21 @@ def drive_through_outage(
     *,
     pace_s: float = _PACE_S,
 ) -> OutageResult:
-    """Drive on, kill the daemon, drive on, start it again, drive on until all is as before and to the end.
+    """Kill the daemon during a drive, restart it, and drive on to full recovery and the route's end.
 
     Parameters
     ----------
     route
-        If it is too short the vehicle waits at its end.
+        Poses of the drive; if they are too few the vehicle waits at the last.
     pace_s
-        Least time per pose, seconds.
+        Minimum time per pose, seconds.
 
     Raises
     ------
     InternalError
-        The daemon does not start again.
+        The daemon fails to restart.
     NoAnswer
-        A consumer has not all its cells a minute after SIGKILL.
+        A consumer still lacks cells a minute after SIGKILL.
     """
     reports: list[StepReport] = []
     poses = itertools.chain(route, itertools.repeat(route[-1]))
@@ -265,7 +265,7 @@ def drive_through_outage(
     due_s = time.perf_counter()
 
     def step() -> None:
-        """Send all to the next pose when it is due; they answer with the cells they have."""
+        """Send the next pose when it is due; consumers reply with the cells they have."""
         nonlocal reports, driven, due_s, longest_pause_s
         time.sleep(max(due_s - time.perf_counter(), 0.0))
         due_s = max(due_s, time.perf_counter() - pace_s) + pace_s
@@ -289,7 +289,7 @@ def drive_through_outage(
         if time.perf_counter() - killed_s > _TIMEOUT_S:
             raise NoAnswer(f"the daemon is not ready again after {_TIMEOUT_S:g} s")
     down_s, poses_alone, after = time.perf_counter() - killed_s, driven - _BEFORE, reports
-    step()  # the first report after it is about a pose before it
+    step()  # the first report after the restart is about an earlier pose
     step()
     while not all(report.current for report in reports):
         if time.perf_counter() - killed_s > down_s + _TIMEOUT_S:
@@ -310,7 +310,7 @@ def drive_through_outage(
 
 
 def statistics_now(daemon: DaemonProcess) -> Snapshot:
-    """Read a daemon's statistics as they are now or later: it writes them four times a second.
+    """Read statistics that a daemon writes after this call; it writes them four times a second.
 
     Unlike the request `Stats` this costs the daemon no processor time.
     """

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive that is mapped into a live map with too little memory, while daemon and mapping program are killed.
+"""Map a drive into a live map with too little memory, and kill daemon and mapping program meanwhile.
 
-The route is a round through the town, and a part of it once more: chunks are evicted, and come back.  In the
-end the map's files are compared with a map without bounds of the same scans.
+The route is a loop through the town, and a part of it again, so that chunks are evicted and loaded again. At
+the end the map's files are compared with a map of the same scans that has no memory limit.
 
-``python -m shmmap.demo.live_drive ENDPOINT NAME SCANS`` is the program that maps.  It first prints the number
-of the scan that the live map NAME needs next.  For each line of stdin, the number of a scan, it adds
-``SCANS/<number>.npz`` to the map and prints how many scans are in it.  It ends after stdin, when all are in
-the map.
+``python -m shmmap.demo.live_drive ENDPOINT NAME SCANS`` is the mapping program.  It first prints the number
+of the next scan that the live map NAME needs.  Each line of stdin is the number of a scan: the program adds
+``SCANS/<number>.npz`` to the map and prints the map's number of scans. After the end of stdin it exits once
+all scans are in the map.
 """
 
 from __future__ import annotations
@@ -59,27 +59,27 @@ radius = 2
 linger_s = 0.5
 """
 FILTER: Final = ScanFilter(min_range=1.0, max_range=20.0, min_z=-8.0, max_z=12.0)
-"""Which points of the demonstration's scans count."""
-_TIMEOUT_S: Final = 300.0  # for a compiler on a slow machine
-_WITHOUT_DAEMON: Final = 2  # scans that come while there is none
+"""Filter of the points in the demonstration's scans."""
+_TIMEOUT_S: Final = 300.0  # seconds for a compiler on a slow machine
+_WITHOUT_DAEMON: Final = 2  # scans that arrive while no daemon runs
 
 
 @dataclass(frozen=True, slots=True)
 class LiveDriveSettings:
-    """What is driven and mapped.
+    """Settings of drive and map.
 
     Attributes
     ----------
     blocks, seed
-        Of the town; one of 3 x 3 blocks has a round of 320 m.
+        Size and random seed of the town; a loop in a town of 3 x 3 blocks is 320 m long.
     length, step
-        Of the drive, and between scans, metres.
+        Length of the drive, and distance between scans, metres.
     lidar, density
         The sensor, and points per square metre of the surfaces that it sees.
     resolution
         Edge of a voxel, metres.
     budget_bytes
-        Memory that chunks may take.
+        Memory budget of chunks.
     """
 
     blocks: tuple[int, int] = (3, 3)
@@ -94,31 +94,31 @@ class LiveDriveSettings:
 
 @dataclass(slots=True)
 class LiveDriveResult:
-    """What was mapped, killed and compared.
+    """Results of the mapping, the kills and the comparison.
 
     Attributes
     ----------
     scans, points, length_m
-        Of the drive.
+        Size of the drive.
     mapping_s
-        Time from the first scan to the last, with both kills.
+        Seconds from the first scan to the last, with both kills.
     mapper_killed_at, mapper_resumed_at
         Scan after which the mapping program was killed, and the first one of its next run.
     daemon_killed_at, daemon_down_s, daemon_chunks
-        Scan after which the daemon was killed, seconds until it was back, and chunks that it then found in
-        memory.
+        Scan after which the daemon was killed, seconds until it was ready again, and chunks that it then
+        found in memory.
     evicted, came_back
-        How often a chunk left memory, and how often one came into memory again.
+        How often a chunk was evicted from memory, and how often one was loaded again.
     budget_bytes, max_bytes
-        Memory that chunks may take, and the most that those in service took.
+        Memory budget of chunks, and peak memory of the chunks in use.
     active, active_bytes
         Known voxels in memory at the end of the drive, and memory of their chunks.
     chunks, file_bytes
-        Of the map on disk.
+        Size of the map on disk.
     voxels, differing
-        Voxels of the map on disk and of the one without bounds, and those among them that differ.
+        Voxels known in the map on disk or in the map without memory limit, and the number that differ.
     picture_svg
-        The map at the end of the drive, before all of it was saved.
+        Picture of the map at the end of the drive, before all of it was saved.
     """
 
     scans: int
@@ -144,7 +144,7 @@ class LiveDriveResult:
 
 
 def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDriveResult:
-    """Drive, map, kill, compare, clean up.
+    """Map a drive, kill daemon and program, compare the result, clean up.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDrive
         )
         budgets = ["--budget", "16M", "--live-budget", str(settings.budget_bytes)]
         daemon = stack.push(DaemonProcess("", "--config", str(config), *budgets, command=with_us()))
-        daemon.launch()  # it starts while scans are made
+        daemon.launch()  # the daemon starts while scans are made
         path, unbounded, result = _take_scans(settings, work, progress)
         daemon.wait_ready(_TIMEOUT_S)
         live = stack.enter_context(shmmap.connect(daemon.endpoint, name="demo")).live(_MAP)
@@ -172,7 +172,7 @@ def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDrive
         mapper = stack.enter_context(Program("mapping program", "shmmap.demo.live_drive", words, work))
         _map(daemon, mapper, _Watch(live, result), progress)
         progress.stage("Saving the map, comparing it with one without bounds", 3)
-        live.move_to(*path[-1])  # the vehicle stays where it is, its program ends
+        live.move_to(*path[-1])  # the mapping program exits, the vehicle's pose stays
         mapper.end_input()
         mapper.finish(_TIMEOUT_S)
         usage = live.status()
@@ -192,7 +192,7 @@ def run_live_drive(settings: LiveDriveSettings, progress: Progress) -> LiveDrive
 def _take_scans(
     settings: LiveDriveSettings, work: Path, progress: Progress
 ) -> tuple[list[tuple[float, float, float]], UnboundedMap, LiveDriveResult]:
-    """Write the scans to ``work``; returns where the sensor was, the map without bounds, and the result."""
+    """Write the scans to ``work``; return the sensor's poses, the unbounded map, and the result."""
     drive = LidarDrive(
         Town(seed=settings.seed, blocks=settings.blocks),
         settings.length,
@@ -215,7 +215,7 @@ def _take_scans(
 
 
 class _Watch:
-    """Counts chunks that leave memory, and that come back into it."""
+    """Counts chunks that are evicted from memory, and those loaded again."""
 
     def __init__(self, live: LiveMap, result: LiveDriveResult) -> None:
         self.result = result
@@ -224,7 +224,7 @@ class _Watch:
         self._on_disk: set[ChunkKey] = set()
 
     def look(self) -> str:
-        """Look at all chunks in which a voxel is known; returns how many are where."""
+        """Update the counts from all chunks with known voxels; return them as text."""
         known = [row for row in self._live.chunks(saved=True) if row.active]
         on_disk = {row.key for row in known if row.state == "saved"}
         in_memory = {row.key for row in known} - on_disk
@@ -239,7 +239,7 @@ class _Watch:
 
 
 def _map(daemon: DaemonProcess, mapper: Program, watch: _Watch, progress: Progress) -> None:
-    """Map scan after scan; both are killed right after a scan was sent, which may be in the map or not."""
+    """Map all scans; kill program and daemon right after a scan was sent, which may be in the map or not."""
     result, scans = watch.result, watch.result.scans
     progress.stage("Mapping it, with memory for a part of the map", scans)
     began_s = time.perf_counter()
@@ -266,7 +266,7 @@ def _map(daemon: DaemonProcess, mapper: Program, watch: _Watch, progress: Progre
                 mapper.write_line(str(without_daemon))
             daemon.start(_TIMEOUT_S)
             result.daemon_down_s = time.perf_counter() - killed_s
-            # that it took over; some may have been evicted since
+            # adopted by the daemon; some may have been evicted since
             found = re.findall(r" live map in memory .* chunks=(\d+)", daemon.log)
             result.daemon_chunks = int(found[-1]) if found else 0
             progress.event(f"It is back; it found {result.daemon_chunks} chunks in memory")
@@ -280,7 +280,7 @@ def _map(daemon: DaemonProcess, mapper: Program, watch: _Watch, progress: Progre
 
 
 def _draw(endpoint: str, path: list[tuple[float, float, float]], work: Path) -> str:
-    """Draw the whole map as ``shmmap-rolling`` does."""
+    """Draw the whole map, as ``shmmap-rolling`` does."""
     picture, path_file = work / "live.svg", work / "path.json"
     path_file.write_text(json.dumps(path), encoding="utf-8")
     words = ["--endpoint", endpoint, "--live", _MAP, "--path", str(path_file), "--picture", str(picture)]
@@ -292,14 +292,14 @@ def _draw(endpoint: str, path: list[tuple[float, float, float]], work: Path) -> 
 
 
 class Comparison(NamedTuple):
-    """A live map beside the unbounded one.
+    """Comparison of a live map with the unbounded one.
 
     Attributes
     ----------
     voxels
-        That are known in one of the two, or in both.
+        Voxels known in at least one of the maps.
     differing
-        Of these, how many are not the same.
+        Number of these voxels that differ.
     """
 
     voxels: int
@@ -307,14 +307,14 @@ class Comparison(NamedTuple):
 
 
 class UnboundedMap:
-    """Remembers what every scan said of every chunk.
+    """Map without memory limit: stores the hits and misses of every scan in every chunk.
 
     Parameters
     ----------
     resolution
         Edge of a voxel, metres.
     scan_filter
-        Which points count.
+        Filter of the points.
     """
 
     def __init__(self, resolution: float, scan_filter: ScanFilter) -> None:
@@ -326,7 +326,7 @@ class UnboundedMap:
         )
 
     def add(self, points: NDArray[np.floating], pose: NDArray[np.floating]) -> None:
-        """Take in a scan: (N, 3) metres in the sensor's frame, and T_map_sensor."""
+        """Add a scan: points (N, 3), metres, sensor frame, and T_map_sensor."""
         marks, _ = self._marker.mark(points, pose)
         starts = marks.starts.tolist()
         for at, (key, hits) in enumerate(zip(marks.chunks, marks.hits.tolist(), strict=True)):
@@ -334,7 +334,7 @@ class UnboundedMap:
             self._said[key].append((marks.words[part].copy(), marks.bits[part].copy(), hits))
 
     def chunk(self, key: ChunkKey, occupancy: Occupancy) -> NDArray[np.int16]:
-        """Log-odds of a chunk's voxels by their places, thousandths: scan after scan, from nothing."""
+        """Return log-odds (thousandths) of a chunk's voxels by place, added up over all scans."""
         hit, miss, low, high = occupancy.steps
         found = np.zeros((WORDS, 64), np.int16)
         for words, bits, hits in self._said.get(key, ()):
@@ -346,12 +346,12 @@ class UnboundedMap:
         return found.reshape(CHUNK_VOXELS)
 
     def compare(self, path: str) -> Comparison:
-        """Compare with the files of a live map in a directory, voxel for voxel.
+        """Compare with the files of a live map, voxel by voxel.
 
         Raises
         ------
         MapMissing, MapDataError
-            There is none, or a file of it cannot be read.
+            The directory has no live map, or a file of the map cannot be read.
         """
         voxels = differing = 0
         nothing = np.zeros(CHUNK_VOXELS, np.int16)
@@ -366,7 +366,7 @@ class UnboundedMap:
 
 
 def main(argv: list[str]) -> int:
-    """Map until stdin ends."""
+    """Add scans to the live map until stdin ends."""
     import shmmap
 
     endpoint, name, scans = argv

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One program on the map: ``shmmap-ndt follow`` localizes simulated scans, whose true poses are known.
+"""Localize simulated scans with known poses in the map, by the program ``shmmap-ndt follow``.
 
 ``python -m shmmap.demo.localization OUT SEED BLOCKS_X BLOCKS_Y LENGTH`` makes the scans: it writes
-``scans/*.npz``, ``truth.txt`` and ``odometry.txt`` (both in the TUM format) to the directory OUT.  In the end
-it compiles the kernels of layers, which the first daemon would do during a measurement.
+``scans/*.npz``, ``truth.txt`` and ``odometry.txt`` (both in the TUM format) to the directory OUT.  Then it
+compiles the kernels of layers, so that no daemon compiles during a measurement.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ __all__ = ["LocalizationResult", "localize", "main", "missing_package", "prepare
 
 _PROGRAM: Final = "shmmap_clients.ndt_scan_matcher"
 _WINDOW_METRES: Final = 80.0
-_SEEN_METRES: Final = 45.0  # by the LiDAR
+_SEEN_METRES: Final = 45.0  # range of the LiDAR
 _SURFACE_DENSITY: Final = 15.0
-_TIMEOUT_S: Final = 300.0  # for a compiler on a slow machine
+_TIMEOUT_S: Final = 300.0  # seconds for a compiler on a slow machine
 
 
 @dataclass(frozen=True, slots=True)
 class LocalizationResult:
-    """What the program found.
+    """Results of the localization program.
 
     Attributes
     ----------
     scans, trustworthy
-        Localized scans, and those among them that the program itself trusts.
+        Localized scans, and how many of them the program marks as trustworthy.
     error_m, error_max_m
-        Distance of the found positions from the true ones: mean and largest, metres.
+        Distance between estimated and true positions: mean and largest, metres.
     first_pose_s
-        From starting the daemon, and then the program, until the first scan's pose was known.
+        Seconds from the start of the daemon, and then of the program, to the first scan's pose.
     """
 
     scans: int
@@ -60,12 +60,12 @@ class LocalizationResult:
 
 
 def missing_package() -> str:
-    """Return the package that the localization needs and that is not installed; empty if there is none."""
+    """Return the name of a package that the localization needs but is not installed; empty if complete."""
     return "" if importlib.util.find_spec("numba") is not None else "numba"
 
 
 def prepare(settings: DemoSettings, work: Path, stack: contextlib.ExitStack) -> list[Program]:
-    """Start to make scans and to compile kernels; the processes end with ``stack`` at the latest."""
+    """Start processes that make scans and compile kernels; they are killed with ``stack`` at the latest."""
     words = [str(work), str(settings.seed), *map(str, settings.blocks), str(settings.localized)]
     makers = [
         Program("simulated scans", "shmmap.demo.localization", words, work),
@@ -75,26 +75,26 @@ def prepare(settings: DemoSettings, work: Path, stack: contextlib.ExitStack) -> 
 
 
 def wait_prepared(makers: Sequence[Program]) -> None:
-    """Wait for the scans and the kernels: what runs during a measurement would be in it.
+    """Wait for the scans and the kernels, so that their making does not disturb a measurement.
 
     Raises
     ------
     InternalError
-        They could not be made.
+        Scans or kernels could not be made.
     """
     for maker in makers:
         maker.finish(_TIMEOUT_S)
 
 
 def localize(map_path: str, options: Sequence[str], work: Path, progress: Progress) -> LocalizationResult:
-    """Localize all scans, on a new daemon that has nothing in memory.
+    """Localize all scans with a new daemon whose cache is empty.
 
     Parameters
     ----------
     map_path, options
-        Of the daemon.
+        Map and options of the daemon.
     work
-        Directory of what was prepared.
+        Directory of the prepared scans.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def localize(map_path: str, options: Sequence[str], work: Path, progress: Progre
 
 
 def main(argv: list[str]) -> int:
-    """Simulate, write, compile."""
+    """Simulate scans, write them, and compile kernels."""
     import numpy as np
 
     from shmmap.layers.build import compile_kernels
@@ -172,7 +172,7 @@ def main(argv: list[str]) -> int:
 
 
 def _write_poses(path: Path, poses: Iterable[tuple[float, NDArray[np.float64]]]) -> None:
-    """Write ``t x y z qx qy qz qw`` of poses that turn about z alone."""
+    """Write poses with rotation about z only, as lines ``t x y z qx qy qz qw``."""
     lines = []
     for stamp_s, T in poses:
         heading = math.atan2(T[1, 0], T[0, 0])

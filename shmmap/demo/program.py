@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Programs beside a demonstration: run and never left behind, measured, and shown to a spectator.
+"""Run the programs of a demonstration, measure them, show progress, and leave none running.
 
-Memory and processor time are what the kernel counts.  *PSS* (proportional set size) divides every shared page
-among the processes that map it, so that the PSS of several processes may be summed.  A page of shared memory
-that no process maps right now is in no process's PSS, although it is in memory.  From
-``/proc/PID/smaps_rollup`` and ``/proc/PID/stat``.
+The kernel counts memory and processor time (``/proc/PID/smaps_rollup`` and ``/proc/PID/stat``).  *PSS*
+(proportional set size) divides every shared page among the processes that map it, so that the PSS of several
+processes can be summed.  A page of shared memory that no process maps is in memory, but in no process's PSS.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ from shmmap.testing.daemon_process import wait_readable, without_settings
 
 __all__ = ["ProcessMemory", "Program", "Progress", "cpu_seconds", "descendants", "process_memory"]
 
-_LAST_WORDS: Final = 2000  # characters
-_USER: Final = 11  # utime, stime, cutime, cstime follow one another: proc(5), counted after the command
+_LAST_WORDS: Final = 2000  # characters of stderr
+_USER: Final = 11  # utime, stime, cutime, cstime: their place in proc(5), counted after the command
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 
 class Progress:
-    """Shows nothing; the command line has classes that do."""
+    """Progress that shows nothing; the command line has subclasses that do."""
 
     def stage(self, text: str, total: int) -> None:
         """Begin a stage of ``total`` steps."""
@@ -41,33 +40,34 @@ class Progress:
         """Count a step of the stage; ``lines`` describe the state after it."""
 
     def event(self, text: str) -> None:
-        """Show what has just happened."""
+        """Show an event."""
 
 
 class Program:
-    """``python -m MODULE WORD...`` with pipes to its stdin and from its stdout.
+    """A process ``python -m MODULE WORD...`` with pipes to its stdin and from its stdout.
 
     Parameters
     ----------
     name
-        Its name in error messages.
+        Name in error messages.
     module, words
         Module and command line.
     work
-        Directory for its stderr.
+        Directory for the program's stderr.
 
     Attributes
     ----------
     exit_code
-        As `finish` found it.
+        Exit code, set by `finish`.
 
-    Used as a context manager it is started on entry; on exit it is killed with all that it has started, if
-    it still runs.  A Ctrl-C does not reach it.
+    Used as a context manager, the program is started on entry.  On exit it is killed with all its
+    descendants, if it still runs.  Ctrl-C does not reach it.
 
     Raises
     ------
     InternalError
-        From methods: it ended too early, or took longer than it may; the message holds its last words.
+        From methods: the program ended too early, or took too long; the message contains the end of its
+        stderr.
     """
 
     def __init__(self, name: str, module: str, words: Sequence[str], work: Path) -> None:
@@ -93,18 +93,18 @@ class Program:
 
     @property
     def pid(self) -> int:
-        """Its process id.
+        """Process id of the program.
 
         Raises
         ------
         InternalError
-            It does not run.
+            The program does not run.
         """
         return self._started.pid
 
     @property
     def running(self) -> bool:
-        """Whether it was started and has not ended."""
+        """Whether the program was started and has not ended."""
         return self._process is not None and self._process.poll() is None
 
     @property
@@ -114,7 +114,7 @@ class Program:
         return self._process
 
     def start(self) -> None:
-        """Start it; again, when it has ended."""
+        """Start the program, or start it again after it has ended."""
         self._unread = b""
         with open(self._err, "wb") as err, interrupts_later():
             self._process = subprocess.Popen(
@@ -127,7 +127,7 @@ class Program:
             )
 
     def write_line(self, line: str | bytes) -> None:
-        """Write a line to its stdin."""
+        """Write a line to the program's stdin."""
         stdin = self._started.stdin
         assert stdin is not None  # noqa: S101  it is a pipe
         try:
@@ -137,19 +137,19 @@ class Program:
             raise self._ended_early() from None
 
     def end_input(self) -> None:
-        """Close its stdin."""
+        """Close the program's stdin."""
         stdin = self._started.stdin
         assert stdin is not None  # noqa: S101  it is a pipe
         stdin.close()
 
     def read_line(self, timeout_s: float) -> str:
-        """Return the next line of its stdout."""
+        """Return the next line of the program's stdout."""
         for line in self.lines(timeout_s):
             return line
         raise self._ended_early()
 
     def lines(self, timeout_s: float) -> Iterator[str]:
-        """Yield the lines of its stdout until it ends, each at most ``timeout_s`` after the one before."""
+        """Yield the lines of stdout until the program ends, with at most ``timeout_s`` between two lines."""
         stdout = self._started.stdout
         assert stdout is not None  # noqa: S101  it is a pipe
         while True:
@@ -164,12 +164,12 @@ class Program:
             yield line.decode()
 
     def finish(self, timeout_s: float, *, fails: bool = False) -> str:
-        """Wait for its end; returns what it has written to stdout and was not read.
+        """Wait for the program to end; return the unread rest of its stdout.
 
         Parameters
         ----------
         timeout_s
-            Longest time between two lines, and from the last one until its end.
+            Longest time between two lines, and from the last line to the end.
         fails
             Whether an exit code other than 0 is allowed.
         """
@@ -186,7 +186,7 @@ class Program:
         return text
 
     def kill(self) -> None:
-        """End it, and all that it has started, with SIGKILL."""
+        """Kill the program and all its descendants with SIGKILL."""
         with interrupts_later():
             if self._process is not None:
                 with contextlib.suppress(ProcessLookupError):
@@ -195,7 +195,7 @@ class Program:
                 self._close_pipes()
 
     def last_words(self) -> str:
-        """Return the end of its stderr."""
+        """Return the end of the program's stderr."""
         return self._err.read_text(encoding="utf-8", errors="replace")[-_LAST_WORDS:].strip()
 
     def _close_pipes(self) -> None:
@@ -216,9 +216,9 @@ class ProcessMemory:
     Attributes
     ----------
     own_bytes
-        Proportional set size without shared memory: interpreter, libraries (its share of them), heap.
+        Proportional set size without shared memory: interpreter, share of libraries, heap.
     private_bytes
-        Pages that no other process maps.
+        Bytes in pages that no other process maps.
     """
 
     own_bytes: int
@@ -231,9 +231,9 @@ def process_memory(pid: int) -> ProcessMemory:
     Raises
     ------
     ProcessLookupError, FileNotFoundError
-        It is gone.
+        The process has ended.
     PermissionError
-        It belongs to another user.
+        The process belongs to another user.
     """
     fields: dict[str, int] = {}
     for line in Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()[1:]:
@@ -251,7 +251,7 @@ def cpu_seconds(pids: Iterable[int]) -> float:
     Raises
     ------
     ProcessLookupError, FileNotFoundError
-        One of them is gone.
+        One of the processes has ended.
     """
     ticks = 0
     for pid in pids:
@@ -260,7 +260,7 @@ def cpu_seconds(pids: Iterable[int]) -> float:
 
 
 def descendants(pid: int) -> list[int]:
-    """Return ``pid`` and every living process below it, ascending."""
+    """Return ``pid`` and the ids of all its living descendants, ascending."""
     children: dict[int, list[int]] = {}
     for entry in filter(str.isdigit, os.listdir("/proc")):
         try:
@@ -278,6 +278,6 @@ def descendants(pid: int) -> list[int]:
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the fields after the command, which may hold blanks and brackets."""
+    """Return the fields of ``stat`` after the command, which may contain blanks and brackets."""
     stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     return stat[stat.rindex(")") + 2 :].split()

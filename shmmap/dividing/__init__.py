@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds of any size into maps of square cells, and back."""
+"""Divide clouds of any size into maps of square cells, and merge them back."""

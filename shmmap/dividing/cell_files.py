@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The PCD files of a map being divided: rows are appended, headers written last.
+"""The PCD files of a map being divided: rows are appended, headers are written last.
 
-A file begins with room for its header, so that rows go to their final place at once and are written
-one time only.  Where rows go is decided in the order of the blocks, and written in any order: rows keep
-their order within a cell, though blocks are worked on in parallel.
+A file begins with room for its header, so that each row is written once, at its final place.  Places are
+assigned in the order of the blocks, and filled in any order.  So rows keep their order within a cell although
+blocks are processed in parallel.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ _ALIGNMENT: Final = 64
 _SPARE_DESCRIPTORS: Final = 128
 _MAX_POINTS: Final = (1 << 32) - 1
 
-_Slot = tuple[int, str, int]  # (descriptor or -1, path, offset): where the next rows of a cell go
+_Slot = tuple[int, str, int]  # (descriptor or -1, path, offset): place of a cell's next rows
 
 
 class CellFiles:
-    """Files of cells, by the index of the cell.
+    """Files of cells by cell index (ix, iy).
 
     Parameters
     ----------
     directory
-        Where the files are.
+        Directory of the files.
     row
         Packed type of a point.
     name
-        File name of a cell.
+        Function that returns the file name of a cell.
 
     Attributes
     ----------
     counts
-        Rows of each cell, those under way included.
+        Rows of each cell, including those being written.
     """
 
     def __init__(self, directory: str, row: np.dtype[np.void], name: Callable[[int, int], str]) -> None:
@@ -62,16 +62,16 @@ class CellFiles:
         self._max_open = max(16, soft - _SPARE_DESCRIPTORS)
 
     def path(self, where: tuple[int, int]) -> str:
-        """Path of a cell's file."""
+        """Return the path of a cell's file."""
         return os.path.join(self.directory, self.name(*where))
 
     def reserve(self, where: tuple[int, int], rows: int) -> _Slot:
-        """Make room for ``rows`` after what the cell has.
+        """Reserve places for ``rows`` further rows of a cell.
 
         Raises
         ------
         BadRequest
-            The cell would have more points than a PCD file can.
+            The cell would exceed the maximum number of points of a PCD file.
         """
         have = self.counts.get(where, 0)
         if have + rows > _MAX_POINTS:
@@ -86,19 +86,19 @@ class CellFiles:
         return fd, path, self.header_bytes + have * self.row.itemsize
 
     def finish(self) -> None:
-        """Write every header; no rows may be under way."""
+        """Write every header; no rows may still be in writing."""
         for where, count in self.counts.items():
             header = pcd_header(self._fields, count, "binary", header_bytes=self.header_bytes)
             write_at((self._descriptors.get(where, -1), self.path(where), 0), header)
         self.close()
 
     def restore(self, counts: Iterable[tuple[int, int, int]]) -> None:
-        """Return to a state seen before: (ix, iy, rows) of every cell; what is beyond goes away.
+        """Return to an earlier state, (ix, iy, rows) of every cell; later rows are removed.
 
         Raises
         ------
         OSError
-            A file is missing or shorter than it was.
+            A file is missing or shorter than in that state.
         """
         self.counts = {(ix, iy): rows for ix, iy, rows in counts}
         known = {self.name(*where) for where in self.counts}
@@ -113,7 +113,7 @@ class CellFiles:
             os.truncate(path, size)
 
     def read(self, where: tuple[int, int]) -> NDArray[np.void]:
-        """All rows of a cell."""
+        """Return all rows of a cell."""
         rows = np.empty(self.counts[where], self.row)
         with open(self.path(where), "rb", buffering=0) as file:
             file.seek(self.header_bytes)
@@ -133,7 +133,7 @@ class CellFiles:
 
 
 def write_at(slot: _Slot, data: Any) -> None:
-    """Write ``data`` where ``slot`` says."""
+    """Write ``data`` at the place ``slot``."""
     fd, path, offset = slot
     own = fd < 0
     if own:
@@ -149,13 +149,13 @@ def write_at(slot: _Slot, data: Any) -> None:
 
 
 def raise_open_files_limit() -> None:
-    """Raise the limit of open files as far as allowed: a map has more cells than the usual 1024."""
+    """Raise the limit of open files as far as allowed: maps have more cells than the usual limit of 1024."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def pcd_fields(row: np.dtype[np.void]) -> list[tuple[str, np.dtype[Any], int]]:
-    """Return name, dtype and count of each field of a row, as a PCD header has them."""
+    """Return name, dtype and count of each field of a row, in the form of a PCD header."""
     return [(name, row[name].base, int(np.prod(row[name].shape, dtype=int))) for name in row.names or ()]
 
 

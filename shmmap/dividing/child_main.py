@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that divides a cloud for the daemon: ``python -m shmmap.dividing.child_main``.
+"""Entry point of the process that divides a cloud for the daemon (``python -m shmmap.dividing.child_main``).
 
-It reports in packets of JSON: ``{"stage", "done", "total"}`` once a second, and ``{"error", "message",
-"hint"}`` before it ends with that error.  It dies with the daemon; the next one continues where it stopped.
+It sends packets of JSON: ``{"stage", "done", "total"}`` once a second, and ``{"error", "message", "hint"}``
+before it exits with an error.  It is killed when the daemon dies; the next such process resumes its work.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from shmmap.processes.start_child import channel_to_parent
 
 __all__ = ["main"]
 
-_NICENESS: Final = 10  # clients of the daemon go first
+_NICENESS: Final = 10  # clients of the daemon have priority
 _REPORT_EVERY_S: Final = 1.0
 
 
 class _Channel:
-    """Progress and errors as packets for the daemon."""
+    """Sends progress and errors as packets to the daemon."""
 
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel
@@ -56,11 +56,11 @@ class _Channel:
 
 
 def _frame_before(out: str) -> tuple[float, float, float] | None:
-    """Return what the cloud's division in service was moved by; None where there is none."""
+    """Return the offset that the served division of the cloud added to its points; None if there is none."""
     try:
         report = read_report(os.path.join(os.path.dirname(out), LINK_NAME))
     except MapDataError:
-        return None  # of another version: divided again
+        return None  # written by another version: the cloud is divided again
     if report is None:
         return None
     x, y, z = (0.0 - float(part) for part in report["origin"])
@@ -68,10 +68,10 @@ def _frame_before(out: str) -> tuple[float, float, float] | None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT UNIT VERTICAL_UNIT``; returns the error's exit code."""
+    """Run with ``CHANNEL_FD PARENT_PID CLOUD OUT UNIT VERTICAL_UNIT``; return the error's exit code."""
     channel = _Channel(channel_to_parent(arguments))
     os.nice(_NICENESS)
-    # as `shmmap divide` does it, so that both give the same map; changed clouds keep the frame clients know
+    # the settings of `shmmap divide`, for an equal map; a changed cloud keeps the frame of its last division
     settings = DivideSettings(
         resume=True, frame_before=_frame_before(arguments[3]), unit=arguments[4], vertical_unit=arguments[5]
     )

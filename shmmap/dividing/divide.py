@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Divides clouds of any size into a map of square cells, in bounded memory."""
+"""Divide clouds of any size into a map of square cells, in bounded memory."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ def divide(
     Parameters
     ----------
     inputs
-        Files, or directories of files, of any format that is read; all together become one map.
+        Files in any supported format, or directories of them; together they become one map.
     out_dir
         The map directory: ``pointcloud_map.pcd/<prefix>_<x>_<y>.pcd`` and the metadata for Autoware.
 
     Raises
     ------
     BadRequest, MapMissing
-        A setting makes no sense, an input is not there, or the output may not lie there.
+        A setting is invalid, an input is missing, or the output's place is not allowed.
     MapDataError
-        An input is not what it claims to be.
+        An input contradicts its header or format.
     CannotWrite
         The disk is full or not writable.
     InstanceBusy
@@ -81,13 +81,13 @@ def divide(
     raise_open_files_limit()
     with contextlib.ExitStack() as stack:
         space = stack.enter_context(Workspace(out))
-        # from here on an error of the system is about writing: sources turn theirs into MapDataError
+        # sources convert OSErrors of reading to MapDataError, so the rest are about writing
         stack.enter_context(writing_errors(out))
         return _Run(space, files, settings, lattice, progress, stack).run()
 
 
 class _Run:
-    """One run of `divide`, from its first look at the inputs to the map's appearance."""
+    """One run of `divide`, from opening the inputs to publishing the map."""
 
     def __init__(
         self,
@@ -131,10 +131,10 @@ class _Run:
     def run(self) -> DividedMap:
         """Divide and publish the map; return what was made."""
         settings, space = self._settings, self._space
-        if self._state is None:  # else much of it exists
+        if self._state is None:  # a resumed run has already written much of it
             needed = self._points * self._row.itemsize
             if settings.encoding != "binary":
-                needed *= 2  # cells as they were read, and in their final form
+                needed *= 2  # cells as they were read, and in their final encoding
             check_space("the map", needed, space.path, place=f" in {os.path.dirname(space.out)}")
         final = space.directory("map/" + _CELLS)
         self._buckets = self._bucket_lattice() if settings.leaf else self._lattice
@@ -168,7 +168,7 @@ class _Run:
     # --- parts ----------------------------------------------------------------------------------
 
     def _cell_files(self, directory: str, name: Callable[[int, int], str]) -> CellFiles:
-        """Files that are closed however the run ends."""
+        """Return cell files that are closed when the run ends in any way."""
         files = CellFiles(directory, self._row, name)
         self._stack.callback(files.close)
         return files
@@ -196,7 +196,7 @@ class _Run:
         return stream
 
     def _restore(self, state: dict[str, Any], job: dict[str, Any], stream: _Stream, files: CellFiles) -> bool:
-        """Return to ``state``; False if it is another job's, or the files are not those it speaks of."""
+        """Restore ``state``; return False if it belongs to another job, or does not match the files."""
         if state.get("job") != job:
             return False
         try:
@@ -227,7 +227,7 @@ class _Run:
         return stage
 
     def _bucket_lattice(self) -> CellLattice:
-        """Squares of whole voxels, about as large as a cell, so that no voxel is cut by a border."""
+        """Return squares about as large as a cell, made of whole voxels, so that no border cuts a voxel."""
         leaf = CellLattice.of(self._settings.leaf, self._settings.origin)
         voxels = max(1, round(self._settings.cell_size / self._settings.leaf))
         bucket = CellLattice(leaf.step * voxels, leaf.origin_x, leaf.origin_y, leaf.scale)
@@ -237,7 +237,7 @@ class _Run:
         return self._lattice.file_name(self._settings.prefix, ix, iy)
 
     def _job(self) -> dict[str, Any]:
-        """Return what must be the same for a run to be resumed; as JSON would give it back."""
+        """Return all that must be equal for a run to be resumed, in the form that JSON restores."""
         settings = self._settings
         job = {
             "files": [asdict(file) for file in self._files],
@@ -300,14 +300,14 @@ def _empty_directory(path: str) -> None:
 
 
 class _Stream:
-    """All inputs as one stream of rows into a `Partition`, with a place to continue from.
+    """All inputs as one stream of rows into a `Partition`, resumable from a position.
 
     Attributes
     ----------
     position
-        Points read, of all sources together.
+        Points read from all sources together.
     kept, dropped, extremes
-        As in `Partition`, those of an interrupted run included.
+        As in `Partition`, including those of an interrupted run.
     """
 
     def __init__(self, sources: Sequence[Source], layout: RowLayout) -> None:
@@ -318,7 +318,7 @@ class _Stream:
         self.extremes = np.array([[np.inf] * 3, [-np.inf] * 3])
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Return to where ``save`` was called; the state has passed through JSON."""
+        """Restore a state that was passed to ``save`` and has been through JSON."""
         self.position = state["position"]
         self.kept, self.dropped = state["kept"], state["dropped"]
         if self.kept:
@@ -332,7 +332,7 @@ class _Stream:
         save: Callable[[dict[str, Any]], None],
         every_s: float,
     ) -> None:
-        """Read everything from the present position on; call ``save`` with the state every ``every_s``."""
+        """Read all from the current position on; call ``save`` with the state every ``every_s`` seconds."""
         progress.stage("dividing", sum(source.points for source in self._sources))
         progress.advance(self.position)
         before = self.kept, self.dropped, self.extremes
@@ -390,12 +390,12 @@ def _check_cells(
     row: Any,
     progress: Progress,
 ) -> None:
-    """Read the cells back: the files are those of ``counts``, have as many points, and all in their cell.
+    """Read the cells back; check files, numbers of points, and that each point is in its cell.
 
     Raises
     ------
     MapDataError
-        Something is not as it was written: a defect of the disk, of the memory, or of shmmap.
+        The files differ from what was written: a defect of the disk, of the memory, or of shmmap.
     """
     progress.stage("checking", sum(counts.values()))
     wanted = {name(*where): where for where in counts}

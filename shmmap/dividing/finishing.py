@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Second passes over what was divided: points of a voxel into one, and cells into their encoding."""
+"""Second passes over divided points: reduce each voxel to one point, encode cells."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from shmmap.formats.pcd.writer import write_pcd
 __all__ = ["reduce_voxels", "thin_out", "write_encoded"]
 
 _BYTES_PER_POINT: Final = 96
-"""What reducing takes for each point, beside two copies of the points."""
+"""Memory per point that reducing takes, besides two copies of the points."""
 
 _MAX_KEYS: Final = (1 << 63) - 1
-_PACKED_COLOURS: Final = frozenset({"rgb", "rgba"})  # PCL keeps four bytes in a float32
-_AMOUNTS: Final = frozenset({"intensity", "red", "green", "blue", "nir"})  # integers that have a mean
+_PACKED_COLOURS: Final = frozenset({"rgb", "rgba"})  # PCL stores four bytes in a float32
+_AMOUNTS: Final = frozenset({"intensity", "red", "green", "blue", "nir"})  # integers with a mean
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -43,10 +43,10 @@ def thin_out(
     memory_bytes: int,
     progress: Progress,
 ) -> None:
-    """Reduce the points of each bucket by `reduce_voxels` and append them to the cells they fall into.
+    """Reduce the points of each bucket by `reduce_voxels`, and append the results to their cells.
 
-    No voxel is in two buckets, so the result is that of the whole cloud at once, whatever the cell size;
-    a centroid goes to the cell that contains it.
+    No voxel is in two buckets, so the result equals that of the whole cloud at once, whatever the cell size.
+    A centroid is appended to the cell that contains it.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def thin_out(
 def write_encoded(
     stage: CellFiles, final: str, encoding: str, memory_bytes: int, progress: Progress
 ) -> CellFiles:
-    """Write the cells of ``stage`` to the directory ``final`` in ``encoding``; return what was written.
+    """Write the cells of ``stage`` to the directory ``final`` in ``encoding``; return them.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _check_fits(files: CellFiles, bytes_per_point: int, memory_bytes: int) -> No
 def _in_order(
     function: Callable[[_Item], _Result], items: Iterable[_Item]
 ) -> Iterator[tuple[_Item, _Result]]:
-    """Yield (item, result) in the order of the items, a few of them worked on at a time."""
+    """Yield (item, result) in the order of the items, processing a few of them in parallel."""
     threads = worker_count()
     waiting: deque[tuple[_Item, Future[_Result]]] = deque()
     with ThreadPoolExecutor(threads, thread_name_prefix="finish") as pool:
@@ -127,9 +127,9 @@ def _in_order(
 def reduce_voxels(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.void]:
     """Return one row for each voxel that has points, in the order of x, y, z of the voxels.
 
-    The coordinates are the centroid, summed in float64.  Float fields are means too; integers that say
-    how much (intensity, colours) are rounded means; all others (labels, rings, packed colours) are those
-    of the voxel's first point, so that they stay values that occur.
+    The coordinates are the centroid, summed in float64.  Float fields are means, too; integer amounts
+    (intensity, colours) are rounded means.  All other fields (labels, rings, packed colours) are copied from
+    the voxel's first point, so that only values of the cloud occur.
 
     Parameters
     ----------
@@ -141,8 +141,8 @@ def reduce_voxels(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.voi
     Raises
     ------
     BadRequest
-        A point is too far from the origin of the lattice, or the points too far from each other, for voxels
-        to be numbered.
+        A point is too far from the origin of the lattice, or points are too far from each other, to number
+        the voxels.
     """
     if not len(rows):
         return rows
@@ -165,7 +165,7 @@ def reduce_voxels(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.voi
 
 
 def _keys(rows: NDArray[np.void], voxels: CellLattice) -> NDArray[np.int64]:
-    """Compute a number for each point's voxel, ascending in x, then y, then z."""
+    """Return a number for each point's voxel, ascending in x, then y, then z."""
     flat = CellLattice(voxels.step, 0, 0, voxels.scale)
     ix, iy, iz = (np.empty(len(rows), np.int32) for _ in AXES)
     extremes = np.zeros((2, 3))

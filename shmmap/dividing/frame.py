@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units and frame of a map: what is not in metres is converted or refused, what float32 cannot hold is moved.
+"""Units and frame of a map: convert to metres or refuse, and move coordinates that float32 cannot hold.
 
-float32 steps by 1 mm from 8192 m on and by 31 mm from 262144 m on.  Autoware, and all else that reads
-maps by PCL, knows float32 only, and reads a float64 cloud as zeros.  So coordinates that came with more
-precision are moved to a frame near them, the same for the whole map; the way back is kept beside it.
+float32 steps by 1 mm from 8192 m on and by 31 mm from 262144 m on.  Autoware and all other programs that read
+maps through PCL support float32 only, and read a float64 cloud as zeros.  So coordinates with more precision
+are moved to a frame near them, the same for the whole map; the translation back is stored beside the map.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 FLOAT32_REACH_M: Final = 16384.0
-"""Below, rounding to float32 moves a coordinate by less than half a millimetre."""
+"""Below this, rounding to float32 moves a coordinate by less than half a millimetre."""
 
 _SCAN_POINTS: Final = 1 << 20
 _ROUNDING: Final = 1.001  # bounds in headers are rounded
@@ -52,13 +52,13 @@ class Frame:
     Attributes
     ----------
     move
-        Added to each point of the inputs, metres.
+        Translation of the inputs' points, metres.
     axis
         Type of x, y and z: float32 or float64.
     notes
-        What a person should know about it.
+        Remarks about the frame for the user.
     reach_m
-        Coordinates beyond lose precision that the inputs have.
+        Beyond this coordinate, precision of the inputs is lost.
     """
 
     move: tuple[float, float, float]
@@ -68,17 +68,17 @@ class Frame:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """Where the origin of the map's frame lies in that of the inputs, metres."""
+        """Origin of the map's frame in the frame of the inputs, metres."""
         x, y, z = (0.0 - part for part in self.move)
         return x, y, z
 
     def check(self, extremes: Extremes) -> None:
-        """Refuse points (2, 3: least, greatest) that lie elsewhere than their files' headers said.
+        """Refuse points (2, 3: least, greatest) outside the bounds that the files' headers claim.
 
         Raises
         ------
         MapDataError
-            float32 lost more of them than was planned.
+            The points lie so far outside that float32 lost more precision than allowed.
         """
         reach = float(np.abs(extremes).max())
         if self.axis.itemsize == 4 and math.isfinite(reach) and reach > self.reach_m * _ROUNDING:
@@ -90,9 +90,9 @@ class Frame:
 
 
 def _source_bounds(sources: Sequence[Source]) -> Bound3:
-    """Bounds of the finite points of all sources: from their headers where they say, else by reading them.
+    """Return the bounds of all finite points, from the headers if possible, else by reading the sources.
 
-    NaN when there is no finite point.
+    NaN if there is no finite point.
     """
     bounds = Bounds()
     for source in sources:
@@ -116,16 +116,16 @@ def choose_frame(
     translation: Translation,
     before: tuple[float, float, float] | None = None,
 ) -> Frame:
-    """Choose the frame of a map made of ``sources``, whose common rows are ``row``.
+    """Choose the frame of a map of ``sources``, whose common row type is ``row``.
 
     Parameters
     ----------
     translation
-        Numbers to add to x, y and z; ``none`` to keep the frame; ``auto`` to move it where the
+        Numbers to add to x, y and z; ``none`` to keep the frame; ``auto`` to move it if the
         inputs are float64 and float32 would lose more than half a millimetre.  An automatic frame
         lies at whole metres and whole cells, so that the cells stay the same squares of ground.
     before
-        With ``auto``, the move to prefer where float32 is precise enough with it.
+        With ``auto``, the translation to prefer if float32 is precise enough with it.
     """
     if row["x"].itemsize == 4 and not isinstance(translation, tuple):
         return Frame(NO_MOVE, np.dtype(np.float32))
@@ -139,7 +139,7 @@ def frame_between(
     translation: Translation,
     before: tuple[float, float, float] | None = None,
 ) -> Frame:
-    """Choose as `choose_frame` does, for points of a type between the least and greatest coordinates."""
+    """Choose the frame as `choose_frame` does, for given bounds and type of coordinates."""
     single, double = np.dtype(np.float32), np.dtype(np.float64)
     low, high = bounds
     if not np.isfinite(low).all():
@@ -162,7 +162,7 @@ def frame_between(
     for number in range(3):
         if max(abs(low[number]), abs(high[number])) >= FLOAT32_REACH_M:
             unit = step if number < 2 else Fraction(1)
-            # exactly, rounded once: a multiple of a size with decimals keeps as few of them
+            # exact, rounded once: a multiple of a decimal size keeps few decimals
             move[number] = 0.0 - float(round((low[number] + high[number]) / 2 / float(unit)) * unit)
     x, y, z = move
     moved = _reach(low, high, (x, y, z))
@@ -204,16 +204,16 @@ _BY_NAME: Final = {"m": METRE, **FEET}
 
 @dataclass(frozen=True, slots=True)
 class InputUnits:
-    """What the inputs have in common.
+    """Common units and coordinate system of the inputs.
 
     Attributes
     ----------
     scales
-        Of each source: metres per unit in the plane and in height.
+        Metres per unit of each source, in the plane and in height.
     crs
-        Name of their coordinate system; empty where they say none.
+        Name of the inputs' coordinate system; empty if they name none.
     notes
-        What a person should know.
+        Remarks about the units for the user.
     """
 
     scales: tuple[tuple[float, float], ...]
@@ -222,25 +222,25 @@ class InputUnits:
 
     @property
     def unit_m(self) -> tuple[float, float]:
-        """The scale of all sources; 1 where they differ."""
+        """Metres per unit of all sources; 1 if they differ."""
         return self.scales[0] if len(set(self.scales)) == 1 else NO_SCALE
 
 
 def choose_units(sources: Sequence[Source], unit: str, vertical_unit: str) -> InputUnits:
-    """Choose how coordinates become metres.
+    """Choose the conversion of coordinates to metres.
 
     Parameters
     ----------
     unit
-        Of x and y, one of `UNITS`, and of z where neither ``vertical_unit`` nor the file says another.
-        Empty: metres; a file that says otherwise is refused.
+        Unit of x and y, one of `UNITS`; also of z unless ``vertical_unit`` or the file names another.  Empty:
+        metres, and a file that names another unit is refused.
     vertical_unit
-        Of z, likewise.
+        Unit of z, likewise.
 
     Raises
     ------
     BadRequest
-        There is no such unit.
+        The unit is not one of `UNITS`.
     MapDataError
         ``not_metres``, with the factor; or ``different_systems``.
     """
@@ -290,7 +290,7 @@ def _not_metres(path: str, plane: LengthUnit, height: LengthUnit) -> MapDataErro
 
 
 def _common_system(sources: Sequence[Source], notes: list[str]) -> str:
-    """Return the name of the inputs' system; refuses systems of different codes."""
+    """Return the name of the inputs' coordinate system; refuse inputs whose codes differ."""
     systems = {source.crs.label: source for source in sources if source.crs is not None and source.crs.label}
     codes: dict[int, Source] = {}
     for source in systems.values():

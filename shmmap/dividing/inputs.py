@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which files are meant, and whether an output may lie where it is to lie."""
+"""Find the input files, and check that the output's place is allowed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MAP_PARTS = frozenset({"pointcloud_map.pcd", METADATA_NAME, REPORT_NAME})
 
 @dataclass(frozen=True, slots=True)
 class InputFile:
-    """A file to read, and its state when it was found: size in bytes, mtime and ctime."""
+    """An input file, and its state when it was found: size in bytes, mtime and ctime."""
 
     path: str
     size: int
@@ -38,7 +38,7 @@ class InputFile:
 
     @classmethod
     def of(cls, path: str) -> InputFile:
-        """Describe a file as it is now."""
+        """Return the current state of a file."""
         try:
             status = os.stat(path)
         except OSError as error:
@@ -47,12 +47,12 @@ class InputFile:
 
 
 def find_inputs(paths: Sequence[str]) -> list[InputFile]:
-    """Return the clouds named by ``paths``; of a directory every cloud in and below it, in path order.
+    """Return the clouds that ``paths`` name: files, and all clouds in and below directories, in path order.
 
     Raises
     ------
     MapMissing
-        There is nothing there, no cloud in a directory, or a directory that cannot be read.
+        A path does not exist, or a directory has no cloud or cannot be read.
     """
     found: dict[str, InputFile] = {}
     for path in map(os.path.abspath, paths):
@@ -75,12 +75,12 @@ def find_inputs(paths: Sequence[str]) -> list[InputFile]:
 
 
 def check_unchanged(files: Sequence[InputFile]) -> None:
-    """Check, after reading, that the inputs are still what was found.
+    """After reading, check that the inputs have not changed since they were found.
 
     Raises
     ------
     MapDataError
-        One was written to meanwhile (cause ``changed``): what was read may be of two states.
+        An input was written to meanwhile (cause ``changed``): the points read may mix two states.
     """
     for file in files:
         if InputFile.of(file.path) != file:
@@ -96,12 +96,12 @@ def _refuse(error: OSError) -> NoReturn:
 
 
 def check_output_place(inputs: Sequence[str], files: Sequence[InputFile], out: str) -> None:
-    """Refuse an output inside an input directory, and inputs that the output would replace.
+    """Refuse an output inside an input directory, or one that would replace an input.
 
     Raises
     ------
     BadRequest
-        See above.
+        The output is refused.
     """
     real = os.path.realpath(out)
     for path in map(os.path.realpath, inputs):
@@ -117,12 +117,12 @@ def check_output_place(inputs: Sequence[str], files: Sequence[InputFile], out: s
 
 
 def check_output_directory(out: str, *, force: bool) -> None:
-    """Refuse to touch what is at ``out``, unless it is a divided map and ``force`` is given.
+    """Refuse to replace anything at ``out`` but a divided map, and that only with ``force``.
 
     Raises
     ------
     BadRequest
-        See above.
+        The output is refused.
     """
     if not os.path.lexists(out):
         return
@@ -142,7 +142,7 @@ def check_output_directory(out: str, *, force: bool) -> None:
 
 
 def check_space(what: str, needed: int, directory: str, *, place: str = "") -> None:
-    """Refuse what cannot fit on the disk of ``directory``, before anything is written.
+    """Refuse an output that cannot fit on the disk of ``directory``, before anything is written.
 
     Raises
     ------

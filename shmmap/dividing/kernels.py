@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inner loops of dividing, compiled: which cell each point is in, and points sorted by cell.
+"""The inner loops of dividing, compiled: find each point's cell, and sort points by cell.
 
-They release the interpreter's lock, so that blocks are worked on in parallel.  Compiled code is kept
-in the cache directory where that can be written; else it is compiled at each start, for a second or two.
+The loops release the interpreter's lock, so that blocks are processed in parallel.  Compiled code is stored
+in the cache directory if that is writable; else compiling takes a second or two at each start.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ NOWHERE: Final = -(1 << 31)
 """Index of a point that is not finite."""
 
 _LIMIT: Final = float((1 << 31) - 2)
-_EXACT: Final = float(1 << 52)  # units of the lattice up to here, and one cell more, are exact in float64
-# Of a cell; nearer to a border the exact corners decide.  Rounding errs by 2**31 * 2**-52 = 5e-7 at most.
+_EXACT: Final = float(1 << 52)  # up to this many units of the lattice, and one cell more, float64 is exact
+# In cells: nearer to a border the exact corners decide. Rounding errs by 2**31 * 2**-52 = 5e-7 at most.
 _NEAR: Final = 1e-5
 
 
 @compiled()
 def _index(value: float, per_metre: float, origin: float, step: int, first: int, scale: int) -> float:
-    """Index of the cell that holds ``value`` on one axis, as a whole float64."""
+    """Return the index of the cell that contains ``value`` on one axis, as an integral float64."""
     quotient = (value - origin) * per_metre  # a division would take twice as long
     index: float = np.floor(quotient)
     part = quotient - index
@@ -59,10 +59,8 @@ def assign_cells(
     lattice
         (size, origin_x, origin_y) in metres; (step, origin_x, origin_y, scale) as integers.
 
-    Returns
-    -------
-    Number of finite points, then least and greatest ix, least and greatest iy of them.  The number is
-    -1 if some point is more than 2**31 cells or 2**52 units of the lattice away.
+    Returns ------- Number of finite points, then their least and greatest ix, and their least and greatest
+    iy.  The number is -1 if some point is more than 2**31 cells or 2**52 units of the lattice away.
     """
     size, origin_x, origin_y, step, first_x, first_y, scale = lattice
     per_metre = 1.0 / size
@@ -115,7 +113,7 @@ def count_cells(
     width: int,
     counts: NDArray[np.int64],
 ) -> None:
-    """Count the points of each cell of a window: place ``(iy - low_y) * width + (ix - low_x)``."""
+    """Count the points in each cell of a window, at index ``(iy - low_y) * width + (ix - low_x)``."""
     for row in range(len(ix)):
         if ix[row] != NOWHERE:
             counts[(np.int64(iy[row]) - low_y) * width + (np.int64(ix[row]) - low_x)] += 1
@@ -132,9 +130,9 @@ def scatter_rows(
     places: NDArray[np.int64],
     out: NDArray[Any],
 ) -> None:
-    """Copy rows (N, words) to ``out``, those of a cell together and in their order.
+    """Copy rows (N, words) to ``out``, grouped by cell; within a cell they keep their order.
 
-    ``places`` holds where each cell's first row goes, and is advanced.
+    ``places`` contains the index in ``out`` of each cell's next row, and is advanced.
     """
     words = rows.shape[1]
     for row in range(len(ix)):

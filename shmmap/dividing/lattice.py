@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lattice of square cells, with corners that are exact decimal numbers.
 
-A cell is half open: ``corner(i) <= x < corner(i + 1)``.  Sizes such as 0.1 m have no exact binary
-form, and ``floor(x / 0.1)`` and ``3 * 0.1`` disagree with the 0.3 that a metadata file says.  So
-corners are kept as integers over a power of ten; their quotient is the very number that reading the
-decimal text gives, and membership is decided against it.
+A cell is half open: ``corner(i) <= x < corner(i + 1)``.  Sizes such as 0.1 m have no exact binary form, and
+``floor(x / 0.1)`` and ``3 * 0.1`` disagree with the text 0.3 in a metadata file.  So corners are kept as
+integers over a power of ten.  The quotient equals the number parsed from the decimal text, and points are
+compared with it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _EXACT: Final = 1 << 53  # beyond, an integer is not exact in float64
 
 @dataclass(frozen=True, slots=True)
 class CellLattice:
-    """Cells of ``step / scale`` metres, one of whose corners is ``(origin_x, origin_y) / scale``.
+    """Cells of ``step / scale`` metres, with one corner at ``(origin_x, origin_y) / scale``.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class CellLattice:
 
     @classmethod
     def of(cls, cell_size: float, origin: tuple[float, float] = (0.0, 0.0)) -> CellLattice:
-        """Lattice of cells of ``cell_size`` metres with a corner at ``origin`` (x, y in metres).
+        """Return the lattice of cells of ``cell_size`` metres with a corner at ``origin`` (x, y in metres).
 
         Raises
         ------
@@ -65,7 +65,7 @@ class CellLattice:
 
     @property
     def numbers(self) -> tuple[float, float, float, int, int, int, int]:
-        """The lattice as `shmmap.dividing.kernels.assign_cells` takes it."""
+        """Numbers of the lattice for `shmmap.dividing.kernels.assign_cells`."""
         return (self.size, *self.origin, self.step, self.origin_x, self.origin_y, self.scale)
 
     @property
@@ -75,34 +75,34 @@ class CellLattice:
 
     @property
     def origin(self) -> tuple[float, float]:
-        """A corner of the lattice, metres."""
+        """A corner of the lattice (x, y), metres."""
         return self.origin_x / self.scale, self.origin_y / self.scale
 
     @property
     def whole(self) -> bool:
-        """Whether every corner is a whole number of metres, as Autoware's loader needs."""
+        """Whether every corner is a whole number of metres, which Autoware's loader requires."""
         return self.step % self.scale == self.origin_x % self.scale == self.origin_y % self.scale == 0
 
     def corner(self, ix: int, iy: int) -> tuple[float, float]:
-        """Lower left corner of a cell, metres: the float64 nearest to its exact decimal value."""
+        """Return a cell's lower left corner, metres: the float64 nearest to its exact decimal value."""
         return (self.origin_x + ix * self.step) / self.scale, (self.origin_y + iy * self.step) / self.scale
 
     def corner_text(self, ix: int, iy: int) -> tuple[str, str]:
-        """Return a cell's corner in decimals, exact; an integer whenever it is whole."""
+        """Return a cell's corner as exact decimal text; an integer if it is whole."""
         return self._text(self.origin_x + ix * self.step), self._text(self.origin_y + iy * self.step)
 
     def file_name(self, prefix: str, ix: int, iy: int) -> str:
-        """Return the name of a cell's file, which says its corner."""
+        """Return the name of a cell's file, which contains its corner."""
         x, y = self.corner_text(ix, iy)
         return f"{prefix}_{x}_{y}.pcd"
 
     @property
     def size_text(self) -> str:
-        """The size in decimals, exact."""
+        """The size as exact decimal text."""
         return self._text(self.step)
 
     def moved(self, x: float, y: float) -> CellLattice:
-        """Return the same squares of ground in a frame whose origin lies at (x, y), metres, of this one."""
+        """Return the same squares of ground in a frame whose origin is at (x, y) metres in this frame."""
         shift = CellLattice.of(1.0, (x, y))
         scale = max(self.scale, shift.scale)
         mine, theirs = scale // self.scale, scale // shift.scale
@@ -114,7 +114,7 @@ class CellLattice:
         )
 
     def common_step(self) -> Fraction:
-        """Smallest whole number of metres that is a whole number of cells, if below 10 km; else a cell."""
+        """Smallest whole number of metres divisible by the cell size; if above 10 km, the cell size."""
         cell = Fraction(self.step, self.scale)
         whole = cell.numerator  # cell * denominator
         return Fraction(whole) if whole < 10_000 else cell

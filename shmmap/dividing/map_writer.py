@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes points that a program makes as a map divided into square cells."""
+"""Write points that a program produces as a map divided into square cells."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _MAX_INDEX: Final = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class WrittenMap:
-    """What a `MapWriter` wrote: the map directory, PCD files, points, and points that were not finite."""
+    """Result of a `MapWriter`: map directory, numbers of files and points, and of points not finite."""
 
     path: str
     cells: int
@@ -41,10 +41,10 @@ class WrittenMap:
 class MapWriter:
     """Divides points into half-open square cells ``[i * size, (i + 1) * size)``, i = floor(x / size).
 
-    Writes ``<out_dir>/pointcloud_map.pcd/<prefix>_<x>_<y>.pcd`` for each cell, x and y being its lower
-    left corner in metres, and ``<out_dir>/pointcloud_map_metadata.yaml``.  Everything is made in a
-    hidden directory beside ``out_dir`` and appears at once by `finish`; a writer that is left without
-    it leaves nothing.  Points keep their order within a cell, every column its dtype and bits.
+    Writes ``<out_dir>/pointcloud_map.pcd/<prefix>_<x>_<y>.pcd`` for each cell, x and y being its lower left
+    corner in metres, and ``<out_dir>/pointcloud_map_metadata.yaml``.  Everything is written to a hidden
+    directory beside ``out_dir``, and `finish` makes it appear at once; without `finish` nothing remains.
+    Points keep their order within a cell, every column its dtype and bits.
 
     Parameters
     ----------
@@ -55,14 +55,14 @@ class MapWriter:
     prefix
         Start of every file name.
     durable
-        Force the files to the disk before the map appears; slower, and pointless for scratch maps.
+        Flush the files to the disk before the map appears: slower, and unnecessary for scratch maps.
 
     Raises
     ------
     BadRequest
-        ``out_dir`` is not empty, or an argument makes no sense.
+        ``out_dir`` is not empty, or an argument is invalid.
     OSError
-        Here and in every method: the disk is full, or not writable.
+        The disk is full or not writable; also raised by every method.
     """
 
     def __init__(
@@ -99,13 +99,13 @@ class MapWriter:
         Parameters
         ----------
         columns
-            Arrays of equal length: ``xyz`` (N, 3) float32 or float64, metres, map frame, and any
-            others, (N,) or (N, k).  Every call brings the same names, dtypes and widths.
+            Arrays of equal length: ``xyz`` (N, 3) float32 or float64, metres, map frame, and any others, (N,)
+            or (N, k).  All calls must have the same names, dtypes and widths.
 
         Raises
         ------
         BadRequest
-            The columns are not as described, or a point is more than 2**30 cells from the map's origin.
+            The columns are invalid, or a point is more than 2**30 cells from the map's origin.
         """
         self._require_open()
         rows = _rows(columns)
@@ -128,7 +128,7 @@ class MapWriter:
             raise BadRequest("a point is more than 2**30 cells from the origin of the map")
         ix, iy = (one.astype(np.int64) for one in index)
         key = (iy - iy.min()) * (np.ptp(ix) + 1) + (ix - ix.min())
-        # numpy sorts 16 bits by their digits, in no time
+        # numpy's radix sort of 16-bit values is fast
         order = np.argsort(key.astype(np.uint16) if key.max() < 1 << 16 else key, kind="stable")
         starts = np.flatnonzero(np.diff(key[order], prepend=-1))
         for start, stop in itertools.pairwise([*starts.tolist(), len(order)]):
@@ -142,7 +142,7 @@ class MapWriter:
         Raises
         ------
         BadRequest
-            No points were added, or ``out_dir`` was filled by another program meanwhile.
+            No points were added, or another program wrote to ``out_dir`` meanwhile.
         """
         space = self._require_open()
         if not self._points or self._files is None:
@@ -156,7 +156,7 @@ class MapWriter:
         return WrittenMap(self._out_dir, len(cells), self._points, self._dropped)
 
     def discard(self) -> None:
-        """Remove what was written, unless it was finished."""
+        """Remove the written files, unless the map is finished."""
         self._space = None
         self._open.close()
 
@@ -167,7 +167,7 @@ class MapWriter:
 
 
 def _rows(columns: Columns) -> NDArray[np.void]:
-    """Points as packed rows, x, y and z first."""
+    """Return points as packed rows, x, y and z first."""
     xyz = columns.get("xyz")
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.char not in "fd":
         raise BadRequest("points need a column xyz of shape (N, 3), float32 or float64")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Divided maps and clouds into one PCD file: the inverse of dividing."""
+"""Merge divided maps and clouds into one PCD file: the inverse of dividing."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from shmmap.origin.map_report import read_report
 __all__ = ["MERGED_ENCODINGS", "MergedCloud", "merge"]
 
 MERGED_ENCODINGS: Final = ("binary", "ascii")
-"""Encodings that can be written without holding all points."""
+"""Encodings that can be written without all points in memory."""
 
 _BLOCK_BYTES: Final = 16 << 20
 _MEMORY_BYTES: Final = 1 << 30
@@ -41,7 +41,7 @@ _Move = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class MergedCloud:
-    """What `merge` wrote; ``origin`` is what it added to the points of each map that has an origin."""
+    """Result of `merge`; ``origin`` is the offset added to the points of each map that has one."""
 
     path: str
     points: int
@@ -63,19 +63,19 @@ def merge(
 ) -> MergedCloud:
     """Write all points of ``inputs`` to one PCD file, which appears complete or not at all.
 
-    Points of a map that `divide` moved go back to where they were, in float64, unless ``keep_frame``;
-    everything else keeps its bits.  Files come in the order of their paths, points in that of the files.
+    Points of a map that `divide` moved are moved back, in float64, unless ``keep_frame``; all other values
+    keep their bits.  Points are in the order of their files, and files in the order of their paths.
 
     Parameters
     ----------
     inputs
-        Divided maps, directories of clouds, and clouds of any format that is read.
+        Divided maps, directories of clouds, and clouds in any supported format.
     out_file
-        A name that ends in .pcd; ``force`` replaces a file that is there.
+        A name that ends in .pcd; ``force`` replaces an existing file.
     encoding
         One of `MERGED_ENCODINGS`.
     common_fields
-        Keep only what all inputs have, where their fields differ.
+        Keep only the common fields if the inputs' fields differ.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def merge(
                     file.path, memory_bytes=memory_left(_MEMORY_BYTES) // 2, scratch_dir=os.path.dirname(out)
                 )
                 stack.callback(source.close)
-                choose_units([source], "", "")  # refuses feet: a PCD file cannot say so
+                choose_units([source], "", "")  # refuses feet, which a PCD file cannot declare
                 opened.append((file, source, moves[path]))
         if not opened:
             raise BadRequest("nothing to merge")
@@ -145,7 +145,7 @@ def _checked_inputs(path: str, out: str) -> list[InputFile]:
 
 
 def _origin_of(path: str) -> _Move:
-    """Return what must be added to the points of an input: the origin of a divided map that has one."""
+    """Return the offset to add to an input's points: the origin of a divided map, else zero."""
     report = read_report(path) if os.path.isdir(path) else None
     x, y, z = report["origin"] if report is not None else NO_MOVE
     return x, y, z

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks of rows into the files of their cells, a few blocks at a time in parallel.
+"""Write blocks of rows to the files of their cells, a few blocks in parallel.
 
-Each block goes through three steps: which cell is each point in, where do the cell's rows go in its
-file, and the rows, sorted by cell, written there.  Only the second is done in the order of the blocks.
+Each block takes three steps: find the cell of each point, reserve places in the cells' files, and write the
+rows, sorted by cell.  Only the second step runs in the order of the blocks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from shmmap.errors import BadRequest
 
 __all__ = ["Partition", "block_points_for", "worker_count"]
 
-_WINDOW_CELLS: Final = 1 << 22  # cells between the extremes of a block that are counted in a plain table
+_WINDOW_CELLS: Final = 1 << 22  # up to this many cells between a block's extremes, a dense table counts
 _MAX_BLOCK_POINTS: Final = 1 << 23
 _MIN_BLOCK_POINTS: Final = 1 << 14
 
@@ -35,12 +35,12 @@ Rows = NDArray[np.void]
 
 
 def worker_count() -> int:
-    """Threads that sort and write; reading has the main thread."""
+    """Return the number of threads that sort and write; the main thread reads."""
     return max(1, min(4, len(os.sched_getaffinity(0))))
 
 
 def block_points_for(memory_bytes: int, row_bytes: int, threads: int) -> int:
-    """Points of a block such that all buffers together take at most ``memory_bytes``."""
+    """Return the points per block with which all buffers together take at most ``memory_bytes``."""
     per_point = (threads + 1) * row_bytes + threads * (row_bytes + 8)
     room = memory_bytes - threads * _WINDOW_CELLS * 16
     return max(_MIN_BLOCK_POINTS, min(_MAX_BLOCK_POINTS, room // per_point))
@@ -52,13 +52,13 @@ class Partition:
     Parameters
     ----------
     files
-        Where the rows go.
+        Files that receive the rows.
     lattice
-        The cells.
+        Lattice of the cells.
     block_points
-        Most rows of a block.
+        Maximum rows per block.
     threads
-        How many blocks are worked on at a time.
+        Number of blocks processed in parallel.
 
     Attributes
     ----------
@@ -98,14 +98,14 @@ class Partition:
         self._pool.shutdown(wait=True, cancel_futures=kind is not None)
 
     def buffer(self) -> Rows:
-        """Return an empty buffer of `block_points` rows, to be filled and given to `submit`."""
+        """Return an empty buffer of `block_points` rows, to be filled and passed to `submit`."""
         while self._running and self._free.empty():
             done, self._running = wait(self._running, return_when=FIRST_COMPLETED)
             self._see(done)
         return self._free.get()
 
     def submit(self, buffer: Rows, count: int) -> None:
-        """Divide the first ``count`` rows of a buffer; raises the errors of blocks before it."""
+        """Divide the first ``count`` rows of a buffer; errors of earlier blocks are raised here."""
         done = {one for one in self._running if one.done()}
         self._running -= done
         self._see(done)
@@ -114,7 +114,7 @@ class Partition:
         self._running.add(self._pool.submit(self._divide, ticket, buffer, count))
 
     def drain(self) -> None:
-        """Wait until everything submitted is written."""
+        """Wait until all submitted rows are written."""
         done, self._running = self._running, set()
         wait(done)
         self._see(done)
@@ -157,7 +157,7 @@ class Partition:
             wheres = np.column_stack((cells % width + low_x, cells // width + low_y))
             places = np.cumsum(counts) - counts
         elif kept:
-            # points far apart: number the cells that have points, in one row
+            # points far apart: number only the cells that contain points
             finite = ix != np.iinfo(np.int32).min
             keys = (iy[finite].astype(np.int64) << 32) + ix[finite]
             found, inverse, numbers = np.unique(keys, return_inverse=True, return_counts=True)
@@ -187,12 +187,12 @@ class Partition:
     def _fail(self, error: BaseException | None = None) -> None:
         with self._turn:
             self._failed = True
-            self._error = self._error or error  # the first is the cause, the others only stopped for it
+            self._error = self._error or error  # the first is the cause, the others its effect
             self._turn.notify_all()
 
     @contextlib.contextmanager
     def _in_order(self, ticket: int) -> Iterator[None]:
-        """Run the part of a block's work that happens in the order of the blocks."""
+        """Run the part of a block's work that must happen in the order of the blocks."""
         with self._turn:
             self._turn.wait_for(lambda: self._failed or self._next == ticket)
             if self._failed:
@@ -204,11 +204,11 @@ class Partition:
 
 
 class _AbandonedError(Exception):
-    """Another block failed; its error is the one that counts."""
+    """Raised in a block that stops because another block failed."""
 
 
 class _Buffers:
-    """What one thread needs for a block."""
+    """The buffers of one thread for a block."""
 
     def __init__(self, points: int, row: np.dtype[np.void]) -> None:
         self.ix = np.empty(points, np.int32)

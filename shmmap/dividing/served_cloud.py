@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A large cloud as a map: divided into the cache first, and again whenever it changes.
+"""Serve a large cloud as a map: divide it into the cache, and again whenever it changes.
 
 ::
 
     <cache>/divided/<name>-<key of the path>/map -> <key of the stamp>
                                              <key of the stamp>/         the divided map
 
-A cloud that did not change is served at once.  Cells are named through the link, so that after a change
-they are new versions of the same cells, not other cells.  A process of its own divides: a hostile file
-costs no daemon, and a stop ends it at once; what was done until then is kept, and continued from.  The cache
-keeps one division of each cloud, and the clouds used last; those that a daemon serves are not touched.
+An unchanged cloud is served at once.  Paths of cells contain the link, so that after a change the cells have
+new versions but the same ids.  A separate process divides, so that a malicious file cannot crash the daemon,
+and stopping ends the work at once; the next run resumes it.  The cache keeps one division per cloud, of the
+clouds used most recently; clouds that a daemon serves are never removed.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from shmmap.processes.start_child import MAX_PACKET_BYTES, how_ended, start_chil
 
 __all__ = ["DividedCloud", "find_origin"]
 
-_RECIPE: Final = "cells of 20 m, frame moved, 2"  # changes whenever the same cloud would be divided otherwise
+_RECIPE: Final = "cells of 20 m, frame moved, 2"  # changes if the same cloud is divided differently
 _KEPT_CLOUDS: Final = 8
 _MORE_TIME_USEC: Final = 60_000_000
-_USE_LOCK: Final = ".use"  # held shared by every daemon that serves the cloud
-_MAKING_LOCK: Final = ".making"  # held by the one that divides it
+_USE_LOCK: Final = ".use"  # shared lock, held by every daemon that serves the cloud
+_MAKING_LOCK: Final = ".making"  # exclusive lock, held by the daemon that divides it
 
 
 def _notify_no_one(*lines: str) -> None:
@@ -59,23 +59,23 @@ def find_origin(
     vertical_unit: str = "",
     notify: Callable[..., None] = _notify_no_one,
 ) -> MapOrigin:
-    """Return the origin of the map at a path, be it a map or a cloud to be divided first.
+    """Return the origin of the map at a path: a map, or a cloud that must be divided first.
 
     Parameters
     ----------
     metadata, strict, cache_dir
-        As in `open_map`; empty ones are looked for, or the user's.
+        As in `open_map`; empty ones are searched for, or default to the user's.
     unit, vertical_unit
-        Of a cloud's coordinates, as in `shmmap.dividing.frame.choose_units`.
+        Units of a cloud's coordinates, as in `shmmap.dividing.frame.choose_units`.
     notify
         Sends ``KEY=value`` lines of progress to the service manager, see `DividedCloud`.
 
     Raises
     ------
     MapMissing
-        There is nothing at the path.
+        The path does not exist.
     BadRequest
-        Units are named for a divided map, which has metres.
+        Units are given for a divided map, which is always in metres.
     """
     path = absolute_path(map_path)
     suffix = os.path.splitext(path)[1].lower()
@@ -93,18 +93,18 @@ def find_origin(
 
 
 class DividedCloud:
-    """The map of one cloud file.
+    """The map made from one cloud file.
 
     Parameters
     ----------
     path
-        The cloud, absolute.
+        Absolute path of the cloud.
     cache_dir
-        Where divided clouds are kept, and indexes of large maps; absolute.
+        Absolute path of the directory for divided clouds, and for indexes of large maps.
     strict
         As in `open_map`.
     units
-        Of the cloud's coordinates, in the plane and in height, as in `find_origin`.
+        Units of the cloud's coordinates, in the plane and in height, as in `find_origin`.
     notify
         Sends ``KEY=value`` lines to the service manager.
     """
@@ -129,12 +129,12 @@ class DividedCloud:
         self._use_lock = -1
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
-        """Divide the cloud unless that is done, and return the catalogue of its cells.
+        """Divide the cloud if needed, and return the catalogue of its cells.
 
         Raises
         ------
         MapMissing, MapDataError, CannotWrite
-            The cloud is not there, cannot be read, or does not fit in the cache.
+            The cloud is missing, cannot be read, or does not fit in the cache.
         """
         try:
             status = os.stat(self.path)
@@ -147,7 +147,7 @@ class DividedCloud:
         try:
             self._hold()
             with self._alone():
-                if not os.path.isdir(out):  # another daemon may have divided it
+                if not os.path.isdir(out):  # another daemon may have divided it meanwhile
                     self._divide(out)
                 _point(link, name)
             self._sweep()
@@ -158,7 +158,7 @@ class DividedCloud:
         catalogue = MapDirectory(link, strict=self._strict, cache_dir=self._cache_dir).load(
             fresh=fresh, before=before
         )
-        with contextlib.suppress(OSError), self._alone():  # what is served now is read until the change
+        with contextlib.suppress(OSError), self._alone():  # the served division is read until the change
             self._remove_others(name)
         report = read_report(out) or {}
         catalogue.problems = (*catalogue.problems, *map(str, report.get("notes", ())))
@@ -197,7 +197,7 @@ class DividedCloud:
     # --- the cache ------------------------------------------------------------------------------
 
     def _hold(self) -> None:
-        """Mark the cloud as served by this process, for as long as it lives."""
+        """Mark the cloud as served by this process until the process ends."""
         if self._use_lock >= 0:
             return
         while True:
@@ -213,17 +213,17 @@ class DividedCloud:
             os.close(fd)  # another daemon has just removed it
 
     def _alone(self) -> contextlib.AbstractContextManager[None]:
-        """Wait until no other daemon is dividing the cloud."""
+        """Wait for the lock without which no daemon divides the cloud."""
         return locked_file(os.path.join(self._directory, _MAKING_LOCK))
 
     def _remove_others(self, present: str) -> None:
-        """Remove divisions of earlier states of the cloud, finished or not."""
+        """Remove divisions of earlier states of the cloud, complete or not."""
         for entry in os.scandir(self._directory):
             if entry.is_dir(follow_symlinks=False) and entry.name != present:
                 shutil.rmtree(entry.path, ignore_errors=True)
 
     def _sweep(self) -> None:
-        """Remove the least recently used clouds beyond those kept, unless a daemon serves them."""
+        """Remove the least recently used clouds above the limit, unless a daemon serves them."""
         used: list[tuple[int, str]] = []
         for entry in os.scandir(self._clouds):
             with contextlib.suppress(OSError):
@@ -240,7 +240,7 @@ class DividedCloud:
 
 
 def _point(link: str, name: str) -> None:
-    """Point ``link`` to ``name``, in one step."""
+    """Make ``link`` refer to ``name``, in one step."""
     if os.path.islink(link) and os.readlink(link) == name:
         return
     interim = f"{link}.{os.getpid()}"

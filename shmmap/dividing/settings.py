@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a map is to be divided: the settings, the memory that is left, and how progress is reported."""
+"""Settings for dividing a map, the remaining memory, and the interface for progress."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class DivideSettings:
-    """How to divide.
+    """Settings for dividing a map.
 
     Attributes
     ----------
@@ -36,34 +36,34 @@ class DivideSettings:
     origin
         A corner of the lattice of cells, metres, in the frame of the inputs.
     translate
-        Added to every point, or ``auto``, or ``none``; see `shmmap.dividing.frame`.
+        Translation of every point, ``auto`` or ``none``; see `shmmap.dividing.frame`.
     frame_before
-        What ``auto`` adds where that leaves float32 precise enough: what an earlier state of the same cloud
-        was moved by, so that its map stays where it is.
+        Translation that ``auto`` prefers if float32 is then precise enough: that of the cloud's earlier
+        state, so that the map keeps its frame.
     unit, vertical_unit
-        Of the inputs' coordinates, in the plane and in height; see `shmmap.dividing.frame`.
+        Units of the inputs' coordinates, in the plane and in height; see `shmmap.dividing.frame`.
     leaf
-        Side of the voxels whose points become one, metres; 0 keeps every point.
+        Side of the voxels that are reduced to one point each, metres; 0 keeps every point.
     prefix
         Start of every file name.
     encoding
-        Of the PCD files: ``binary``, ``binary_compressed`` or ``ascii``.
+        Encoding of the PCD files: ``binary``, ``binary_compressed`` or ``ascii``.
     memory_bytes
-        Most memory that the process may take, code and libraries included.
+        Memory limit of the process, including code and libraries.
     common_fields
-        Keep only what all inputs have, where their fields differ.
+        Keep only the common fields if the inputs' fields differ.
     fields
-        Keep only these, x, y and z among them; empty: all.
+        Fields to keep, including x, y and z; empty: all.
     force
-        Replace a divided map that is there.
+        Replace an existing divided map.
     resume
-        Go on where a killed run with the same inputs and settings stopped.
+        Resume a killed run that had the same inputs and settings.
     check
-        Read everything back and prove that each point is in its cell, before the map appears.
+        Before the map appears, read everything back and check that each point is in its cell.
     durable
-        Force the map to the disk before it appears.
+        Flush the map to the disk before it appears.
     checkpoint_s
-        How often the state to resume from is saved.
+        Seconds between saves of the state to resume from.
     """
 
     cell_size: float = 20.0
@@ -91,7 +91,7 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
     Raises
     ------
     BadRequest
-        A setting makes no sense.
+        A setting is invalid.
     """
     lattice = CellLattice.of(settings.cell_size, settings.origin)
     if settings.leaf:
@@ -100,7 +100,7 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
         CellLattice.of(settings.leaf, settings.origin)
         if settings.leaf > settings.cell_size:
             raise BadRequest(f"voxels of {settings.leaf} m are larger than cells of {settings.cell_size} m")
-    # hidden files are not found as clouds of a directory
+    # hidden files do not count as clouds of a directory
     if "/" in settings.prefix or settings.prefix.startswith(".") or not settings.prefix.isprintable():
         raise BadRequest(f"{settings.prefix!r} cannot start a file name")
     if settings.encoding not in ENCODINGS:
@@ -112,7 +112,7 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
     if isinstance(settings.translate, tuple):
         if not all(map(math.isfinite, settings.translate)):
             raise BadRequest("a translation is three numbers of metres")
-        lattice.moved(*settings.translate[:2])  # refuses what makes no exact corners
+        lattice.moved(*settings.translate[:2])  # refuses sizes without exact corners
     if settings.memory_bytes < MIN_MEMORY_BYTES:
         raise BadRequest(
             f"{settings.memory_bytes:,} bytes of memory are too little",
@@ -122,22 +122,22 @@ def lattice_of(settings: DivideSettings) -> CellLattice:
 
 
 MIN_MEMORY_BYTES: Final = 384 << 20
-"""The smallest limit that makes sense: Python, numpy, numba and its compiler take 200 MiB."""
+"""The smallest useful limit: Python, numpy, numba and its compiler take 200 MiB."""
 
-_SPARE_BYTES: Final = 96 << 20  # what the compiler, the decompressors and the tables of cells come to take
+_SPARE_BYTES: Final = 96 << 20  # for the compiler, the decompressors and the tables of cells
 
 
 def memory_left(limit_bytes: int) -> int:
-    """Bytes that this process may still take under ``limit_bytes``, with some to spare."""
+    """Return the bytes that this process may still take under ``limit_bytes``, less a reserve."""
     with open("/proc/self/statm", "rb") as file:
         resident = int(file.read().split()[1]) * os.sysconf("SC_PAGESIZE")
     return max(32 << 20, limit_bytes - resident - _SPARE_BYTES)
 
 
 def peak_memory_bytes() -> int:
-    """Most memory that this program ever had resident.
+    """Return the peak resident memory of this program.
 
-    From ``VmHWM``: ``ru_maxrss`` would begin with the memory of the process that started it.
+    It is read from ``VmHWM``, since ``ru_maxrss`` includes the peak of the process that started this one.
     """
     with open("/proc/self/status", "rb") as file:
         for line in file:
@@ -147,13 +147,13 @@ def peak_memory_bytes() -> int:
 
 
 class Progress(Protocol):
-    """Follows a run; called from one thread, at least a few times a second."""
+    """Receives a run's progress; called from one thread, at least a few times a second."""
 
     def stage(self, name: str, total: int) -> None:
-        """Begin a stage of ``total`` points; 0 where that is not known."""
+        """Begin a stage of ``total`` points; 0 if unknown."""
 
     def advance(self, points: int) -> None:
-        """Count ``points`` more as done."""
+        """Count ``points`` further points as done."""
 
     def done(self, points: int) -> None:
         """End the run."""

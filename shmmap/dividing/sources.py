@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds as streams of rows of the divided map, in bounded memory, whatever their format."""
+"""Read clouds of any format as streams of the divided map's rows, in bounded memory."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ Columns = Mapping[str, NDArray[Any]] | NDArray[np.void]
 
 @dataclass(frozen=True, slots=True)
 class RowLayout:
-    """Rows of the divided map: packed, one field per PCD field.
+    """Row type of the divided map, packed, one field per PCD field; and the conversion to it.
 
     Attributes
     ----------
     row
         Structured dtype with x, y and z, both float32 or float64, and every other field.
     move
-        Added to each point, metres (x, y, z); summed in float64 and rounded once.
+        Translation of each point, metres (x, y, z); added in float64 and rounded once.
     scale
-        Metres per unit of the source, in the plane and in height; multiplied before.
+        Metres per unit of the source, in the plane and in height; applied before ``move``.
     """
 
     row: np.dtype[np.void]
@@ -59,7 +59,7 @@ class RowLayout:
     scale: tuple[float, float] = NO_SCALE
 
     def takes_as_is(self, row: np.dtype[np.void]) -> bool:
-        """Whether records of type ``row`` are rows of the map already, byte by byte."""
+        """Whether records of type ``row`` are rows of the map already, byte for byte."""
         return row == self.row and self._stays and row.itemsize == self.row.itemsize
 
     @property
@@ -77,7 +77,7 @@ class RowLayout:
                     moved *= self.scale[axis // 2]
                 moved += self.move[axis]
                 values = moved
-            with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs; too large becomes inf
+            with np.errstate(invalid="ignore", over="ignore"):  # signalling NaNs; values too large become inf
                 rows[name] = values
 
 
@@ -88,19 +88,19 @@ def common_rows(
     common_only: bool,
     wanted: Sequence[str] = (),
 ) -> np.dtype[np.void]:
-    """Fields that the rows of all inputs share, in the order of the first; axes in the widest type.
+    """Return the fields common to all inputs, in the order of the first; axes have the widest type.
 
     Parameters
     ----------
     wanted
-        Only these count; empty: all.
+        Fields to consider; empty: all.
 
     Raises
     ------
     BadRequest
-        A field that is wanted is in none of the inputs.
+        A wanted field is in none of the inputs.
     MapDataError
-        The inputs have different fields, and ``common_only`` does not say to leave out what some lack.
+        The inputs have different fields, and ``common_only`` is False.
     """
     if wanted:
         known = dict.fromkeys(name for row in rows for name in row.names or ())
@@ -131,17 +131,17 @@ def common_rows(
 
 
 def with_axes(row: np.dtype[np.void], axis: np.dtype[Any]) -> np.dtype[np.void]:
-    """Return the packed row with x, y and z of another type."""
+    """Return the packed row type with another type for x, y and z."""
     return np.dtype([(name, axis if name in AXES else row[name]) for name in row.names or ()])
 
 
 def field_types(row: np.dtype[np.void]) -> list[tuple[str, str]]:
-    """Return names and dtypes of a row's fields, as reports have them."""
+    """Return names and dtypes of a row's fields, for reports."""
     return [(name, row[name].str) for name in row.names or ()]
 
 
 def word_view(rows: NDArray[np.void]) -> NDArray[Any]:
-    """Return the same memory as (N, words) unsigned integers, as wide as the row's size allows."""
+    """Return a view of rows as (N, words) unsigned integers, as wide as the row's size allows."""
     size = rows.dtype.itemsize
     width = next(width for width in (8, 4, 2, 1) if size % width == 0)
     return rows.view(np.uint8).view(f"<u{width}").reshape(-1, size // width)
@@ -149,7 +149,7 @@ def word_view(rows: NDArray[np.void]) -> NDArray[Any]:
 
 Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-_BLOCK_POINTS: Final = 1 << 16  # of files that must be converted; small enough for the cache
+_BLOCK_POINTS: Final = 1 << 16  # points of files that need conversion; small enough for the processor's cache
 _READER_BLOCK_POINTS: Final = 1 << 18  # a few of LAZ's chunks of 50000 points, so that all cores help
 
 
@@ -161,15 +161,15 @@ class Source(Protocol):
     path
         The file.
     points
-        Points in it, as announced and checked against its size.
+        Number of points, from the header and checked against the file's size.
     row
         Packed type of a point: x, y, z (both float32 or float64) and every other field.
     claimed_bounds
-        (min_xyz, max_xyz) where the file's header says so.
+        (min_xyz, max_xyz) from the file's header; None if it has none.
     crs
-        What the file says of its coordinate system; None where it says nothing.
+        The coordinate system that the file names; None if it names none.
     scale
-        Metres per unit, in the plane and in height, to be set before it is read; 1 at first.
+        Metres per unit, in the plane and in height; 1 until set, which must happen before reading.
     warnings
         Oddities of the file.
     """
@@ -183,10 +183,10 @@ class Source(Protocol):
     warnings: tuple[str, ...]
 
     def begin(self, layout: RowLayout, start: int) -> None:
-        """Go to point ``start``; `read` gives rows of ``layout`` from there on."""
+        """Seek to point ``start``; `read` then returns rows of ``layout``."""
 
     def read(self, rows: NDArray[np.void]) -> int:
-        """Fill ``rows`` with the next points; returns how many, less than asked for only at the end.
+        """Fill ``rows`` with the next points; return their number, smaller than requested only at the end.
 
         Raises
         ------
@@ -204,16 +204,16 @@ def open_source(path: str, *, memory_bytes: int, scratch_dir: str) -> Source:
     Parameters
     ----------
     path
-        The file; its ending says the format.
+        The file, whose ending determines the format.
     memory_bytes
-        What reading it may take.
+        Memory that reading may take.
     scratch_dir
-        Where a compressed PCD file larger than that is expanded, in a file without a name.
+        Directory in which a compressed PCD file larger than that is expanded, as an unnamed file.
 
     Raises
     ------
     MapDataError
-        The file is not what it claims to be.
+        The file contradicts its header or format.
     """
     suffix = cloud_suffix(path)
     if suffix == ".pcd":
@@ -234,10 +234,10 @@ def _changed(path: str) -> MapDataError:
 
 
 class _BinaryPcd:
-    """Binary PCD: records straight from the file.
+    """Binary PCD, whose records are read directly.
 
-    Like the other sources it has the file open only while it is read: a map has more cells than a
-    process may have open files.
+    Like other sources it keeps the file open only while reading: a map has more cells than a process may have
+    open files.
     """
 
     claimed_bounds: Bound3 | None = None
@@ -306,7 +306,7 @@ class _BinaryPcd:
 
 
 class _Stream(ABC):
-    """What is common to formats that come as blocks of columns."""
+    """Base of sources whose formats yield blocks of columns."""
 
     claimed_bounds: Bound3 | None = None
     crs: CoordinateSystem | None = None
@@ -324,7 +324,7 @@ class _Stream(ABC):
 
     @abstractmethod
     def _blocks(self, start: int) -> Iterator[Mapping[str, NDArray[Any]]]:
-        """Give the columns of one block of points after the other, from point ``start`` on."""
+        """Yield the columns of one block of points after another, from point ``start`` on."""
 
     def begin(self, layout: RowLayout, start: int) -> None:
         self.close()
@@ -354,13 +354,13 @@ class _Stream(ABC):
     def close(self) -> None:
         close = getattr(self._iterator, "close", None)
         if close is not None:
-            close()  # a generator that holds a file open
+            close()  # closes the file that the generator has open
         self._iterator = iter(())
         self._block = {}
 
 
 class _StreamedPcd(_Stream):
-    """PCD in ascii or binary_compressed, or with coordinates that are integers."""
+    """PCD in ascii or binary_compressed, or with integer coordinates."""
 
     def __init__(self, reader: PcdReader, memory_bytes: int, scratch_dir: str) -> None:
         super().__init__(reader.path, reader.header.points, reader.columns)
@@ -387,7 +387,7 @@ class _StreamedPcd(_Stream):
 
 
 class _Blocks(_Stream):
-    """Every other format."""
+    """Source of all formats other than PCD."""
 
     def __init__(self, path: str, suffix: str) -> None:
         self._suffix = suffix
@@ -406,7 +406,7 @@ class _Blocks(_Stream):
 
 
 def _row_of(columns: tuple[ColumnSpec, ...]) -> np.dtype[np.void]:
-    """Packed row of a table whose first column is ``xyz``."""
+    """Return the packed row type of a table whose first column is ``xyz``."""
     axis = np.dtype("<f8" if columns[0].dtype.itemsize == 8 else "<f4")
     others = [
         (spec.name, spec.dtype, (spec.components,)) if spec.components > 1 else (spec.name, spec.dtype)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an output is made before it appears, and what a killed run can continue from.
+"""The directory in which an output is made before it appears, and the state of a run to resume.
 
-The directory lies beside the output, hidden.  Its state file says how far the run came; it is replaced
-in one step and only after the rows it speaks of were handed to the kernel.  What a killed process wrote
-is still there, what a machine lost with its power is not: so a state counts only in the same boot.
+The directory lies beside the output, hidden.  Its state file records the run's progress.  It is replaced in
+one step, after the rows that it counts were passed to the kernel.  Such rows survive a killed process but not
+a power loss, so a state is valid only until the machine restarts.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ __all__ = ["Workspace"]
 
 _STATE: Final = "state.json"
 _LOCK: Final = "lock"
-_RENAME_EXCHANGE: Final = 2  # linux/fs.h
-_AT_FDCWD: Final = -100  # fcntl.h
+_RENAME_EXCHANGE: Final = 2  # from linux/fs.h
+_AT_FDCWD: Final = -100  # from fcntl.h
 
 
 class Workspace:
@@ -35,16 +35,16 @@ class Workspace:
     Parameters
     ----------
     doing
-        What is done there: a part of its name.
+        Kind of work, as part of the directory's name.
     keep_failed
-        A run that failed, not only one that was interrupted, can be resumed.
+        Also failed runs can be resumed, not only interrupted ones.
 
     Attributes
     ----------
     path
         The directory.
     content
-        The directory in it that becomes ``out``.
+        The subdirectory that becomes ``out``.
     """
 
     def __init__(self, out: str, doing: str = "dividing", *, keep_failed: bool = False) -> None:
@@ -72,7 +72,7 @@ class Workspace:
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(fd), os.stat(path)):
                     return fd
-            os.close(fd)  # the run that held it has just removed it
+            os.close(fd)  # the previous holder has just removed the directory
 
     def __enter__(self) -> Workspace:
         return self
@@ -80,14 +80,14 @@ class Workspace:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # an interrupted run can be resumed; one that failed at its input would fail again
+        # an interrupted run can be resumed; a run that failed at its input would fail again
         failed = isinstance(error, Exception) and not self._keep_failed
         if error is None or failed or self.state() is None:
             self.remove()
         os.close(self._lock)
 
     def state(self) -> dict[str, Any] | None:
-        """Read what `save` wrote last since the machine started; None where there is nothing to resume."""
+        """Return the state saved last since the machine started; None if no run can be resumed."""
         try:
             state = json.loads(Path(self.path, _STATE).read_bytes())
         except (OSError, ValueError):
@@ -95,13 +95,13 @@ class Workspace:
         return state if isinstance(state, dict) and state.get("boot") == _boot_id() else None
 
     def save(self, state: dict[str, Any]) -> None:
-        """Save how far the run came."""
+        """Save the progress of the run."""
         interim = Path(self.path, _STATE + ".new")
         interim.write_text(json.dumps({**state, "boot": _boot_id()}))
         interim.replace(Path(self.path, _STATE))
 
     def empty(self) -> None:
-        """Remove everything but the lock."""
+        """Remove everything but the lock file."""
         for name in os.listdir(self.path):
             path = os.path.join(self.path, name)
             if os.path.isdir(path):
@@ -110,21 +110,21 @@ class Workspace:
                 os.unlink(path)
 
     def directory(self, name: str) -> str:
-        """Return the path of a directory in the workspace, made if it is not there."""
+        """Return the path of a directory in the workspace, creating it if missing."""
         path = os.path.join(self.path, name)
         os.makedirs(path, exist_ok=True)
         return path
 
     def publish(self, *, replace: bool, durable: bool) -> None:
-        """Rename `content` to ``out``, in one step; with ``replace`` in the place of what is there."""
+        """Rename `content` to ``out``, in one step; with ``replace`` in exchange for an existing map."""
         if durable:
             _flush_file_system(self.path)
-        # from here on the workspace may hold the map that was replaced, which no run may resume from
+        # the workspace may soon contain the replaced map, from which no run may resume
         Path(self.path, _STATE).unlink(missing_ok=True)
         if replace and os.path.isdir(self.out) and os.listdir(self.out):
             _exchange(self.content, self.out, aside=os.path.join(self.path, "replaced"))
         else:
-            os.rename(self.content, self.out)  # replaces an empty directory, fails on any other
+            os.rename(self.content, self.out)  # replaces an empty directory, and fails on any other
         if durable:
             flush_directory(os.path.dirname(self.out))
 
@@ -135,7 +135,7 @@ class Workspace:
 
 
 def _flush_file_system(path: str) -> None:
-    """Force everything to the disk: one call, where an fsync for each of thousands of files takes minutes."""
+    """Flush the file system to the disk: one call, since fsync of thousands of files takes minutes."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         if ctypes.CDLL(None, use_errno=True).syncfs(fd):
@@ -151,7 +151,7 @@ def _exchange(one: str, other: str, *, aside: str) -> None:
         _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
     ):
         return
-    # file systems without it: for an instant there is no map, but never half of one
+    # file systems without an exchange: for an instant there is no map, but never half of one
     os.rename(other, aside)
     os.rename(one, other)
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What on a machine would hinder the daemon or its clients: facts, judged, each with what to do."""
+"""Find what on a machine hinders the daemon or its clients, and advise what to do."""

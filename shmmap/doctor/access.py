@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Access: the group, the socket, bridges to ROS 2, and the daemon itself to the map's directory."""
+"""Check access: the group, the socket, bridges to ROS 2, and the daemon's access to the map's directory."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ __all__ = [
 
 ANSWER_S: Final = 2.0
 LOOKED_AT: Final = 256
-"""Files of a map whose permissions are looked at: those of one map are rarely different."""
+"""Files of a map whose permissions are checked; those of one map rarely differ."""
 _UNITS: Final = "/etc/systemd/system"
 
 
 def group_name(gid: int) -> str:
-    """Return what a group is called."""
+    """Return the name of a group."""
     try:
         return grp.getgrgid(gid).gr_name
     except KeyError:
@@ -56,7 +56,7 @@ def group_name(gid: int) -> str:
 
 
 def groups_of(uid: int) -> set[int]:
-    """Return the groups of an account as its next login has them."""
+    """Return the groups that an account will have at its next login."""
     try:
         entry = pwd.getpwuid(uid)
     except KeyError:
@@ -106,7 +106,7 @@ def check_group(diagnosis: Diagnosis) -> Finding:
 
 
 def check_socket(diagnosis: Diagnosis) -> Finding:
-    """Check that the daemon answers, and say which accounts may connect."""
+    """Check that the daemon answers, and report which accounts may connect."""
     from shmmap.client.discovery import check_socket as connect
 
     name, path = "socket", diagnosis.socket
@@ -134,7 +134,7 @@ def check_socket(diagnosis: Diagnosis) -> Finding:
 
 
 def _closed_place(diagnosis: Diagnosis) -> str:
-    """Why a daemon could not have its socket in the directory in /tmp; empty where it can, or needs none."""
+    """Return why the daemon would refuse its socket directory in /tmp; empty if it accepts or needs none."""
     place = fallback_runtime_dir()
     try:
         chosen = os.path.dirname(diagnosis.config.socket())
@@ -153,7 +153,7 @@ def _access(path: str) -> str:
 
 
 def check_map_access(diagnosis: Diagnosis) -> Finding:
-    """Check that the daemon can read the map, wherever it lies."""
+    """Check that the daemon can read the map, whether a directory or a URL."""
     name, path = "map", diagnosis.map_path
     if not path and (diagnosis.config.live or (diagnosis.seen is not None and diagnosis.seen.live)):
         return ok(name, "none is served: the daemon keeps live maps alone")
@@ -208,7 +208,7 @@ def check_map_access(diagnosis: Diagnosis) -> Finding:
 
 
 def drop_ins(diagnosis: Diagnosis) -> str:
-    """Return what was added to the service's unit."""
+    """Return the drop-in files of the service's unit."""
     directory = diagnosis.machine.path(f"{_UNITS}/shmmapd.service.d")
     try:
         return "\n".join(one.read_text(errors="replace") for one in sorted(directory.glob("*.conf")))
@@ -235,7 +235,7 @@ def _hidden_from_service(diagnosis: Diagnosis, path: str) -> bool:
 
 
 def _closed_to(uid: int, path: str, *, parents: bool) -> str:
-    """First directory or file on the path to ``path`` that an account may not pass or read; or empty."""
+    """Return the first directory or file up to ``path`` that an account cannot access; empty if none."""
     if uid == 0:
         return ""
     groups = groups_of(uid)
@@ -263,14 +263,14 @@ _BRIDGE_ADVICE: Final = "start these nodes with RMW_IMPLEMENTATION=rmw_cyclonedd
 _MAX_BYTES: Final = 1 << 16
 _NAMED: Final = 3
 _LOCKED: Final = 0
-"""A byte of the file that the bridge has locked: all of it."""
+"""Offset at which the file is locked; the bridge locks the whole file."""
 
 
 def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
-    """Check that bridges to ROS 2 run, and that every node that asks one can be answered.
+    """Check that bridges to ROS 2 run, and that every node that asks a bridge can get a reply.
 
-    A bridge reports in a file beside the daemon's socket, ``INSTANCE.ros-bridge-DOMAIN.json``, and holds a
-    lock on that file while it runs.
+    A bridge writes its status to a file beside the daemon's socket, ``INSTANCE.ros-bridge-DOMAIN.json``, and
+    holds a lock on that file while it runs.
     """
     name = "ROS bridge"
     bridges = [one for path in _files(diagnosis) if (one := _read_status(diagnosis, path)) is not None]
@@ -299,7 +299,7 @@ def check_ros_bridge(diagnosis: Diagnosis) -> Finding:
 
 
 def _files(diagnosis: Diagnosis) -> list[str]:
-    """Files of bridges of this instance, where a bridge looks for a place."""
+    """Return the status files of this instance's bridges, from the directories that bridges use."""
     places = dict.fromkeys((os.path.dirname(diagnosis.socket), *runtime_dirs()))
     pattern = f"{glob.escape(diagnosis.config.instance)}.ros-bridge-*.json"
     root = len(str(diagnosis.machine.path("/")).rstrip("/"))
@@ -311,7 +311,7 @@ def _files(diagnosis: Diagnosis) -> list[str]:
 
 
 def _read_status(diagnosis: Diagnosis, path: str) -> dict[str, Any] | None:
-    """Read a bridge's file; None if the bridge does not run, or the file is not a bridge's."""
+    """Read a bridge's status; None if the bridge does not run, or the file is not a bridge's."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
         fd = os.open(diagnosis.machine.path(path), flags)

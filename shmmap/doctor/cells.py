@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells: which cannot be loaded, is there memory for them, are they there before moving clients need them."""
+"""Check cells: whether they load, fit in memory, and are prefetched before moving clients need them."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ __all__ = ["check_cache", "check_cells", "check_prefetching"]
 
 ANSWER_S: Final = 2.0
 SHORT: Final = ("out of memory", "of memory that a loader may use")
-"""What loads say that failed for lack of memory."""
+"""Texts in messages of loads that failed for lack of memory."""
 NAMED: Final = 3
-"""Cells that are named, with their causes."""
+"""Failed cells that are listed with their causes, at most."""
 MAX_MISS_SHARE: Final = 0.02
-"""Part of the cells asked for that moving clients may wait for: where they turn is not known."""
+"""Tolerated share of cells that moving clients wait for, since the points where they turn are unknown."""
 
 
 def check_cells(diagnosis: Diagnosis) -> Finding:
-    """Check that every cell that was asked for can be loaded."""
+    """Check that every requested cell can be loaded."""
     name = "cells"
     if not diagnosis.alive or diagnosis.seen is None:
         return skip(name, "no daemon runs")
@@ -60,18 +60,18 @@ def check_cells(diagnosis: Diagnosis) -> Finding:
 
 
 def _cause(cell: str, layer: str, message: str) -> str:
-    """Describe a failure in a line; messages begin with the path of the file, which ends as the cell's id."""
+    """Describe a failure in a line; its message begins with the file's path, whose end is the cell's id."""
     before, found, cause = message.partition(f"{cell}: ")
     return f"{cell} ({layer}): {cause if found and before.startswith('/') else message}"
 
 
 def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
-    """Return message by cell and layer: what failed and was not loaded since, as far as the daemon recalls.
+    """Return the messages by cell and layer of failed loads that have not succeeded since, as far as known.
 
     Raises
     ------
     ShmmapError
-        The daemon does not answer, or not this user.
+        The daemon does not answer, or refuses this user.
     """
     from shmmap.client.event_stream import EventStream
     from shmmap.protocol.events import Changed, Failed, Loaded
@@ -92,7 +92,7 @@ def _failing(diagnosis: Diagnosis) -> dict[tuple[str, str], str]:
 
 
 def check_cache(diagnosis: Diagnosis) -> Finding:
-    """Is the budget enough for what clients ask for?  The verdict of ``status``."""
+    """Check that the budget is large enough for the clients, by the same rule as ``status``."""
     name = "cache size"
     if not diagnosis.alive:
         return skip(name, "no daemon runs")
@@ -103,7 +103,7 @@ def check_cache(diagnosis: Diagnosis) -> Finding:
 
 
 def check_prefetching(diagnosis: Diagnosis) -> Finding:
-    """Do moving clients find their cells in memory?  Judged by the counters of the last ten minutes."""
+    """Check that moving clients find their cells in memory, by the counters of the last ten minutes."""
     name = "prefetching"
     if not diagnosis.alive:
         return skip(name, "no daemon runs")

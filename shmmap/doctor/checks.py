@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Examine an instance of the daemon and its machine, and carry out all checks."""
+"""Examine a machine and an instance of the daemon on it, and run all checks."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from shmmap.statistics.reader import read_statistics
 
 __all__ = ["CHECKS", "diagnose", "examine"]
 
-CHECKS: Final[tuple[Callable[[Diagnosis], Finding], ...]] = (  # in the order in which they are read
+CHECKS: Final[tuple[Callable[[Diagnosis], Finding], ...]] = (  # in the order of the output
     check_daemon,
     check_socket,
     check_group,
@@ -74,7 +74,7 @@ CHECKS: Final[tuple[Callable[[Diagnosis], Finding], ...]] = (  # in the order in
 
 
 def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> Diagnosis:
-    """Look at the machine and at what the instance's daemon reports."""
+    """Collect facts about the machine and the instance's daemon."""
     if config.shm_dir == DEFAULT_SHM_DIR:
         config = dataclasses.replace(config, shm_dir=usual_directory(config.instance))
     try:
@@ -94,7 +94,7 @@ def examine(config: DaemonConfig, file: str, machine: Machine | None = None) -> 
 
 
 def diagnose(diagnosis: Diagnosis) -> list[Finding]:
-    """Carry out every check."""
+    """Run all checks."""
     return [check(diagnosis) for check in CHECKS]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daemon: does it run, could it read the map, what outlives it, does the kernel give what it needs."""
+"""Check the daemon: whether it runs, has read the map, leaves memory behind, and has the kernel's support."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 SYSTEM_UIDS: Final = 999
-"""logind spares the accounts below (SYS_UID_MAX, as Debian, Ubuntu, Fedora and systemd itself have it)."""
+"""logind spares accounts up to this id (SYS_UID_MAX of Debian, Ubuntu, Fedora and systemd)."""
 
 _SEGMENT: Final = re.compile(r"shmmap\.([A-Za-z0-9_-]{1,64})\.[0-9a-f]{16}(?:\.zombie)?")
 _CHUNK: Final = re.compile(r"shmmap-live\.([A-Za-z0-9_-]{1,64})\.[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+")
@@ -89,7 +89,7 @@ def check_daemon(diagnosis: Diagnosis) -> Finding:
 
 
 def check_leftovers(diagnosis: Diagnosis) -> Finding:
-    """Check for memory in segments that no daemon looks after."""
+    """Check for memory in segments that belong to no running daemon."""
     name = "leftovers"
     found: dict[str, tuple[int, int]] = {}
     with_chunks: set[str] = set()
@@ -110,7 +110,7 @@ def check_leftovers(diagnosis: Diagnosis) -> Finding:
     listening = diagnosis.listening if orphans else set()
     silent = ""
     for path in sorted(listening):
-        if path.removesuffix(".sock") + ".events.sock" in listening:  # a daemon, whatever its files
+        if path.removesuffix(".sock") + ".events.sock" in listening:  # any daemon, even without statistics
             answer = answering_at(path)
             silent = silent if answer else path
             for instance in answer:
@@ -143,18 +143,18 @@ def check_leftovers(diagnosis: Diagnosis) -> Finding:
 def _has_daemon(diagnosis: Diagnosis, instance: str) -> bool:
     if instance == diagnosis.config.instance:
         return diagnosis.alive or diagnosis.seen is None or diagnosis.answering > 0
-    places = {diagnosis.shm_dir, usual_directory(instance)}  # live maps may be elsewhere than cells
+    places = {diagnosis.shm_dir, usual_directory(instance)}  # live maps may be apart from cells
     try:
         states = [read_statistics(instance, place).state for place in places]
         return any(state not in ("dead", "absent") for state in states)
     except (ShmmapError, OSError):
-        return True  # not ours to judge
+        return True  # files of another account are not judged
 
 
 def _logind_setting(machine: Machine, key: str) -> str:
-    """Value of a key of logind.conf(5): drop-ins come after the file, in the order of their names."""
+    """Return a value of logind.conf(5); drop-ins override the file, in the order of their names."""
     drop_ins: dict[str, str] = {}
-    for place in ("/usr/lib", "/usr/local/lib", "/run", "/etc"):  # a later one hides an equal name
+    for place in ("/usr/lib", "/usr/local/lib", "/run", "/etc"):  # a later directory hides equal names
         directory = f"{place}/systemd/logind.conf.d"
         drop_ins |= {path.name: f"{directory}/{path.name}" for path in machine.path(directory).glob("*.conf")}
     texts = [machine.text("/etc/systemd/logind.conf")]
@@ -186,7 +186,7 @@ def check_logind(diagnosis: Diagnosis) -> Finding:
 
 
 def check_reload(diagnosis: Diagnosis) -> Finding:
-    """Check that the map could be read the last time."""
+    """Check that the last attempt to read the map succeeded."""
     name = "reload"
     if not diagnosis.alive:
         return skip(name, "no daemon runs")
@@ -213,7 +213,7 @@ _LIMIT: Final = re.compile(r"^Max open files\s+(\S+)\s+(\S+)", re.MULTILINE)
 
 
 def check_pins(diagnosis: Diagnosis) -> Finding:
-    """Check that the kernel reports whether any process maps a segment."""
+    """Check that the kernel can report whether any process maps a segment."""
     name = "leases"
     try:
         directory = ShmDirectory(diagnosis.shm_dir)
@@ -242,7 +242,7 @@ def check_pins(diagnosis: Diagnosis) -> Finding:
 
 
 def check_descriptors(diagnosis: Diagnosis) -> Finding:
-    """Check how many clients the limit of open files allows."""
+    """Check how many clients the limit on open files allows."""
     limits = _LIMIT.search(diagnosis.machine.text(f"/proc/{diagnosis.pid}/limits")) if diagnosis.pid else None
     hard = limits[2] if limits else str(resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     whose = f"of the daemon (pid {diagnosis.pid})" if limits else "here"

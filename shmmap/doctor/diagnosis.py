@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the checks look at: a machine, the daemon's settings on it, and what its daemon reports."""
+"""The input of the checks: a machine, the daemon's settings on it, and the daemon's reports."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ __all__ = ["Diagnosis", "Machine", "answering_at"]
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Files of the machine; a test's machine lies in a directory."""
+    """The files of a machine; in tests the machine is a directory."""
 
     root: Path = Path("/")
 
     def path(self, name: str) -> Path:
-        """Where an absolute name of the machine is found."""
+        """Return the actual path of an absolute path of the machine."""
         return self.root / name.lstrip("/")
 
     def text(self, name: str) -> str:
-        """Content of a file; empty when there is none or it cannot be read."""
+        """Return the text of a file; empty if it is missing or unreadable."""
         try:
             return self.path(name).read_text(encoding="utf-8", errors="replace")
         except OSError:
@@ -40,23 +40,23 @@ class Machine:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """A machine and an instance of the daemon, as the account ``uid`` sees them."""
+    """A machine and an instance of the daemon, as seen by the account ``uid``."""
 
     machine: Machine
     config: DaemonConfig
     file: str
-    """The file that the settings are from; empty: none."""
+    """Configuration file of the settings; empty: none."""
     socket: str
     seen: Snapshot | None
-    """The daemon's statistics; None where they cannot be read, and ``unreadable`` says why."""
+    """Statistics of the daemon; None if they are unreadable, which ``unreadable`` explains."""
     unreadable: str = ""
     uid: int = field(default_factory=os.geteuid)
     answering: int = 0
-    """Process of a daemon of this instance that answers although it has no statistics; 0: none."""
+    """Process id of a daemon that answers for this instance but has no statistics; 0: none."""
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """The living daemon's counters; empty where none lives."""
+        """Counters of the running daemon; empty if none runs."""
         return self.seen.counters if self.seen is not None and self.alive else {}
 
     @property
@@ -65,14 +65,14 @@ class Diagnosis:
 
     @property
     def alive(self) -> bool:
-        """Whether the daemon's process lives."""
+        """Whether the daemon's process exists."""
         return self.seen is not None and self.seen.state in ("healthy", "starting", "stopped", "hung")
 
     @property
     def awaits_first_client(self) -> bool:
-        """Whether no daemon lives, and another process (the service manager) listens for it.
+        """Whether no daemon runs and another process (the service manager) listens on its socket.
 
-        Connecting would start it, and a diagnosis must not do that.
+        Connecting would start the daemon, which a diagnosis must not do.
         """
         if self.alive or self.seen is None or self.answering:
             return False
@@ -80,36 +80,36 @@ class Diagnosis:
 
     @property
     def listening(self) -> set[str]:
-        """Paths of all sockets at which a process listens."""
+        """Paths of all sockets on which a process listens."""
         rows = (line.split(maxsplit=7) for line in self.machine.text("/proc/net/unix").splitlines())
         return {row[7] for row in rows if len(row) == 8 and row[7][0] == "/" and int(row[3], 16) & _LISTENS}
 
     @property
     def shm_dir(self) -> str:
-        """Where the segments are."""
+        """Directory of the segments."""
         identity = self._identity
         return (identity.shm_dir if identity else "") or self.config.shm_dir
 
     @property
     def map_path(self) -> str:
-        """The map that is served, or would be."""
+        """Path of the map that is served, or is configured."""
         identity = self._identity
         return (identity.map_path if identity else "") or self.config.map_path
 
     @property
     def budget_bytes(self) -> int:
-        """The budget in force; the configured one (0: chosen at start) where no daemon runs."""
+        """Budget in force; without a running daemon the configured one (0: chosen at start)."""
         return self.counters.get("budget_bytes", 0) if self.alive else self.config.budget_bytes
 
     @property
     def pid(self) -> int:
-        """The daemon's process, 0 where none lives or it is in another pid namespace."""
+        """Process id of the daemon; 0 if none runs or it is in another pid namespace."""
         pid = self._identity.pid if self._identity else 0
         return pid if pid and self.machine.path(f"/proc/{pid}").exists() else 0
 
     @cached_property
     def environment(self) -> dict[str, str] | None:
-        """The daemon's environment; None where none lives, or this account may not see it."""
+        """Environment of the daemon; None if none runs, or this account may not read it."""
         if not self.pid:
             return None
         try:
@@ -121,10 +121,10 @@ class Diagnosis:
 
     @cached_property
     def store(self) -> StoreAnswer:
-        """What the store of a published map answers, asked once."""
+        """Reply of a published map's store, requested once."""
         question = StoreQuestion(
             self.map_path,
-            self.config.insecure_http or self.alive,  # a daemon that serves it was allowed to
+            self.config.insecure_http or self.alive,  # the running daemon has accepted the URL
             self.config.instance_credentials,
             self.counters.get("published_version", 0),
         )
@@ -132,12 +132,12 @@ class Diagnosis:
 
     @property
     def is_service(self) -> bool:
-        """Whether the settings are those of the installed service."""
+        """Whether the settings belong to the installed service."""
         return self.file.startswith("/etc/") and self.machine.path(_UNIT).exists()
 
     @property
     def runs_as(self) -> int:
-        """Account of the daemon: the running one's, else the installed service's, else ``uid``."""
+        """Account of the running daemon, else of the installed service, else ``uid``."""
         if self.pid:
             return self.machine.path(f"/proc/{self.pid}").stat().st_uid
         if self.is_service:
@@ -154,7 +154,7 @@ _LISTENS: Final = 1 << 16  # __SO_ACCEPTCON of linux/net.h
 
 
 def answering_at(path: str) -> dict[str, int]:
-    """Ask the process that listens at a socket: the process of the daemon there, by its instance."""
+    """Connect to a socket; return the daemon's process id by instance name."""
     from shmmap.client.client import connect
     from shmmap.client.discovery import is_served
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live maps: what is wrong with them, have they room on the disk, which readers take much."""
+"""Check live maps: damage, space on the disk, and readers that use many resources."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ __all__ = ["check_live_disk", "check_live_maps", "check_live_memory"]
 
 ANSWER_S: Final = 2.0
 NAMED: Final = 3
-"""Things and readers that are named."""
+"""Problems and readers that are listed, at most."""
 OPEN: Final = 8
-"""Files of chunks that a reader may have open: it opens one at a time, and maps none."""
+"""Chunk files that a reader may have open: it opens one at a time, and maps none."""
 BUSY: Final = 500
-"""Thousandths of a processor that are much for one reader's requests."""
+"""Share of a processor, in thousandths, above which one reader's requests are reported."""
 ROOM_BYTES: Final = 64 << 20
-"""Less free disk space than this is little, whatever the budget."""
-_MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # with a group of mappers, and without
+"""Free disk space below this is reported, whatever the budget."""
+_MARKS_MODE: Final = {True: 0o1770, False: 0o700}  # by whether mappers have a group
 
 
 def _rows(diagnosis: Diagnosis) -> list[LiveMapRow]:
@@ -40,7 +40,7 @@ def _rows(diagnosis: Diagnosis) -> list[LiveMapRow]:
 
 
 def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
-    """All that the daemon says of its live maps, paths and damaged files; empty where it does not answer."""
+    """Return the daemon's report on its live maps; empty if it does not answer."""
     from shmmap.client.client import connect
 
     if diagnosis.seen is None or diagnosis.seen.state != "healthy" or not _rows(diagnosis):
@@ -54,11 +54,11 @@ def _reported(diagnosis: Diagnosis) -> tuple[LiveMapRow, ...]:
         return ()
 
 
-# --- what is wrong ------------------------------------------------------------------------------------
+# --- damage --------------------------------------------------------------------------------------------
 
 
 def check_live_maps(diagnosis: Diagnosis) -> Finding:
-    """Check that every chunk can be loaded and saved, and none is lost."""
+    """Check that every chunk can be loaded and saved, and that none is lost."""
     name, rows = "live maps", _rows(diagnosis)
     if not rows:
         running = "this daemon keeps none" if diagnosis.alive else "no daemon runs"
@@ -93,7 +93,7 @@ def check_live_maps(diagnosis: Diagnosis) -> Finding:
 
 
 def check_live_disk(diagnosis: Diagnosis) -> Finding:
-    """Check that the daemon can write where live maps are kept, and that there is room."""
+    """Check that the daemon can write to the directories of live maps, and that their disks have space."""
     name = "live disk"
     places = _places(diagnosis)
     if not places:
@@ -129,7 +129,7 @@ def check_live_disk(diagnosis: Diagnosis) -> Finding:
 
 
 def _places(diagnosis: Diagnosis) -> dict[str, str]:
-    """Directory by map: as the daemon says, else as it is set up; empty where there can be none."""
+    """Return the directory of each map, from the daemon or else the settings; empty if there are none."""
     if reported := _reported(diagnosis):
         return {row.name: row.path for row in reported}
     instance = diagnosis.config.instance
@@ -145,7 +145,7 @@ def _places(diagnosis: Diagnosis) -> dict[str, str]:
 
 
 def _existing(diagnosis: Diagnosis, path: str) -> str:
-    """Return the path, or the nearest directory above that is there: the daemon makes the rest."""
+    """Return the path, or its nearest existing parent, below which the daemon creates the rest."""
     while path != "/":
         try:
             os.stat(diagnosis.machine.path(path))
@@ -156,14 +156,14 @@ def _existing(diagnosis: Diagnosis, path: str) -> str:
 
 
 def _not_writable(diagnosis: Diagnosis, path: str, place: str, *, read_only: bool) -> str:
-    """Why the daemon cannot write to ``path``, of which there is ``place``; empty if it can."""
+    """Return why the daemon cannot write to ``path``, given the existing ``place``; empty if it can."""
     uid = diagnosis.runs_as
     if read_only:
         return f"the file system of {place} is read-only"
     if diagnosis.is_service and not diagnosis.alive:
         own = f"{SERVICE_STATE}/{diagnosis.config.instance}"
         if _is_in(path, own) and not _is_in(place, own):
-            return ""  # systemd makes it
+            return ""  # systemd creates it
         shown = re.findall(r"^(?:ReadWritePaths|BindPaths)=(.*)$", drop_ins(diagnosis), re.MULTILINE)
         writable = [own, *(word.strip('"-+').split(":")[0] for word in " ".join(shown).split())]
         if not any(_is_in(place, one) for one in writable):
@@ -183,7 +183,7 @@ def _is_in(path: str, directory: str) -> bool:
 
 
 def check_live_memory(diagnosis: Diagnosis) -> Finding:
-    """Check that the place of chunks is in order, and that no reader takes much."""
+    """Check the directory of chunks in memory, and that no reader uses many resources."""
     name, rows = "live memory", _rows(diagnosis)
     if not rows and not diagnosis.config.live:
         return skip(name, "no live map is set up")
@@ -215,7 +215,7 @@ def check_live_memory(diagnosis: Diagnosis) -> Finding:
 
 
 def _live_shm_dir(diagnosis: Diagnosis) -> str:
-    """Where the chunks are: as set, else with the cells, unless those are on huge pages."""
+    """Return the directory of chunks in memory: as set, else that of the cells unless on huge pages."""
     if diagnosis.config.live_shm_dir:
         return diagnosis.config.live_shm_dir
     return DEFAULT_SHM_DIR if _huge_pages(diagnosis, diagnosis.shm_dir) else diagnosis.shm_dir
@@ -228,7 +228,7 @@ def _huge_pages(diagnosis: Diagnosis, path: str) -> str:
 
 
 def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:
-    """Say what is wrong with the directory where mappers put their scans."""
+    """Return what is wrong with the directory in which mappers put their scans."""
     marks = f"{path}/shmmap-live.{diagnosis.config.instance}.marks"
     if not _rows(diagnosis):
         return ""
@@ -250,7 +250,7 @@ def _wrong_marks(diagnosis: Diagnosis, path: str) -> str:
 
 
 def _keeping(diagnosis: Diagnosis) -> str:
-    """Which processes have files of chunks mapped, or many open, the greediest first; empty for none."""
+    """Return processes that map chunk files, or have many open, the largest users first; empty if none."""
     start = f"/shmmap-live.{diagnosis.config.instance}."
     chunk = re.compile(re.escape(start) + r"[A-Za-z0-9_-]{1,64}\.-?\d+_-?\d+_-?\d+\.\d+")
     found = []
@@ -258,10 +258,10 @@ def _keeping(diagnosis: Diagnosis) -> str:
     with contextlib.suppress(OSError):
         for entry in os.listdir(processes):
             if not entry.isdecimal() or diagnosis.pid in (0, int(entry), _parent(diagnosis, entry)):
-                continue  # the daemon, and the process that writes the chunks
+                continue  # the daemon, and the process that writes chunks
             mapped = set(chunk.findall(diagnosis.machine.text(f"/proc/{entry}/maps")))
             names = list(mapped)
-            with contextlib.suppress(OSError):  # it has ended, or is another account's
+            with contextlib.suppress(OSError):  # it has ended, or belongs to another account
                 for fd in os.listdir(processes / entry / "fd"):
                     with contextlib.suppress(OSError):
                         names += chunk.findall(os.readlink(processes / entry / "fd" / fd))
@@ -281,7 +281,7 @@ def _parent(diagnosis: Diagnosis, pid: str) -> int:
 
 
 def _busy(diagnosis: Diagnosis) -> str:
-    """Which clients' requests about live maps take much time; empty for none."""
+    """Return clients whose requests about live maps take much time; empty if none."""
     seen = diagnosis.seen.clients if diagnosis.seen is not None else []
     clients = {client.session: client for client in seen}
     texts = []

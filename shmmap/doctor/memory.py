@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared memory (is there enough, what limits it, how large are its pages), and the disk cache."""
+"""Check shared memory (size, limits, page size) and the disk cache."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
     "mount_of",
 ]
 
-CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # what Docker and Podman give /dev/shm
+CONTAINER_DEFAULT_BYTES: Final = 64 << 20  # size that Docker and Podman give /dev/shm
 
 
 class _Mount(NamedTuple):
@@ -37,7 +37,7 @@ class _Mount(NamedTuple):
 
 
 def mount_of(machine: Machine, path: str) -> _Mount:
-    """Return the mount that a path is on."""
+    """Return the mount that contains a path."""
     found = _Mount("/", "unknown", ())
     for line in machine.text("/proc/self/mounts").splitlines():
         _, point, kind, options, *_ = line.split()
@@ -84,7 +84,7 @@ def _enough(budget: int) -> str:
 
 
 def check_container(diagnosis: Diagnosis) -> Finding:
-    """Check that a container sees enough shared memory."""
+    """Check that a container has enough shared memory."""
     name = "container"
     machine = diagnosis.machine
     marks = ("/.dockerenv", "/run/.containerenv")
@@ -108,7 +108,7 @@ def check_container(diagnosis: Diagnosis) -> Finding:
 
 
 def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
-    """Smallest limit from the process's cgroup to the root, 0 for none; and bytes outside tmpfs."""
+    """Return the smallest limit of the process's cgroups (0: none), and their bytes outside tmpfs."""
     limits = []
     private = 0
     for line in machine.text(f"/proc/{pid or 'self'}/cgroup").splitlines():
@@ -133,8 +133,8 @@ def _cgroup_limit(machine: Machine, pid: int) -> tuple[int, int]:
 def check_memory_limit(diagnosis: Diagnosis) -> Finding:
     """Check whether the cgroup's limit would kill the daemon before its budget is full.
 
-    Segments are charged to the group, as the daemon reckons when it chooses its budget; what its processes
-    use beside them is measured while it runs.
+    Segments are charged to the cgroup, as the daemon assumes when it chooses its budget.  Other memory of its
+    processes is measured while the daemon runs.
     """
     name = "memory limit"
     limit, private = _cgroup_limit(diagnosis.machine, diagnosis.pid)
@@ -156,7 +156,7 @@ def check_memory_limit(diagnosis: Diagnosis) -> Finding:
 
 
 def check_huge_pages(diagnosis: Diagnosis) -> Finding:
-    """Check whether segments are on huge pages, and whether that pays on this kernel."""
+    """Check whether segments use huge pages, and whether they help on this kernel."""
     name, machine = "huge pages", diagnosis.machine
     mount = mount_of(machine, diagnosis.shm_dir)
     chosen = next((option for option in mount.options if option.startswith("huge=")), "huge=never")
@@ -190,7 +190,7 @@ _SERVICE_CACHE: Final = "/var/cache/shmmap"
 
 
 def check_disk_cache(diagnosis: Diagnosis) -> Finding:
-    """Check that the cache directory is the daemon's, and that there is room in it."""
+    """Check that the daemon owns the cache directory, and that its disk has space."""
     name, uid = "disk cache", diagnosis.runs_as
     if not diagnosis.config.cache_bytes:
         return skip(name, "nothing is kept: cache_bytes is 0")
@@ -239,5 +239,5 @@ def _why_not_used(diagnosis: Diagnosis, place: str, owner: int) -> str:
     try:
         why = why_not_private(os.lstat(diagnosis.machine.path(objects)), uid)
     except OSError:
-        return ""  # not there yet, or not to be looked at
+        return ""  # missing yet, or not accessible
     return f"{objects} {why}" if why else ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map: link, credentials, clock, versions and signature, as this account sees them."""
+"""Check a published map: link, credentials, clock, versions and signature, as seen by this account."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from shmmap.quantities import format_duration, format_utc
 __all__ = ["check_clock", "check_credentials", "check_link", "check_signature", "check_versions"]
 
 MAX_OFF_S: Final = 60.0
-"""The link cannot explain a minute; a difference of 5 or 15 makes stores refuse signed requests."""
+"""Clock difference that the link's delay cannot explain; at 5 or 15 minutes stores refuse signed requests."""
 FILES: Final = "the map is files"
 _SKEW_S: Final = 300.0
-"""Difference allowed between the clocks of a publisher and of a vehicle, seconds."""
+"""Seconds allowed between the clocks of a publisher and of a vehicle."""
 
 
 def _is_published(diagnosis: Diagnosis) -> bool:
@@ -40,7 +40,7 @@ def _is_published(diagnosis: Diagnosis) -> bool:
 
 
 def check_link(diagnosis: Diagnosis) -> Finding:
-    """Check that the store answers, and how soon."""
+    """Check that the store answers, and how fast."""
     name = "link"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -70,7 +70,7 @@ def check_link(diagnosis: Diagnosis) -> Finding:
 
 
 def check_credentials(diagnosis: Diagnosis) -> Finding:
-    """Check where credentials come from, and that the store takes them."""
+    """Check the source of the credentials, and that the store accepts them."""
     name = "credentials"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -89,7 +89,7 @@ def check_credentials(diagnosis: Diagnosis) -> Finding:
 
 
 def _hidden(diagnosis: Diagnosis) -> str:
-    """Return a note if the daemon's own credentials cannot be seen, else an empty text."""
+    """Return a note if the daemon's own credentials are not visible to this account, else an empty text."""
     if not diagnosis.alive or diagnosis.environment is not None:
         return ""
     account = account_name(diagnosis.runs_as)
@@ -97,7 +97,7 @@ def _hidden(diagnosis: Diagnosis) -> str:
 
 
 def check_clock(diagnosis: Diagnosis) -> Finding:
-    """Check that this machine's clock agrees with the store's."""
+    """Check that this machine's clock agrees with the store's clock."""
     name = "clock"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -116,7 +116,7 @@ def check_clock(diagnosis: Diagnosis) -> Finding:
 
 
 def check_versions(diagnosis: Diagnosis) -> Finding:
-    """Check that the version offered is the one served, and how old it is."""
+    """Check that the newest published version is served, and how old it is."""
     name = "versions"
     if not _is_published(diagnosis):
         return skip(name, FILES)
@@ -144,7 +144,7 @@ def check_versions(diagnosis: Diagnosis) -> Finding:
 
 
 def check_signature(diagnosis: Diagnosis) -> Finding:
-    """Check that the map is verified, and its signature not expired."""
+    """Check that the map's signature is verified, and has not expired."""
     name = "signature"
     if not diagnosis.alive:
         return skip(name, "no daemon runs")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks the store of a published map in a separate process, as the daemon would ask it, within a time limit.
+"""Probe the store of a published map as the daemon does, in a separate process with a time limit.
 
-Only the configured URL is asked, with the daemon's credentials where this account may see where they come
-from.  A credentials file that hangs, or a server that sends a byte a second, can block only that process; it
-is killed, and its last report counts.
+Requests go to the configured URL only, with the daemon's credentials if this account may see their source. A
+credentials file that blocks, or a server that sends a byte a second, can delay only that process.  It is then
+killed, and its last report is used.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shmmap.errors import ConfigError, MapDataError, MapMissing, Offline, Packag
 __all__ = ["ASKED_S", "StoreAnswer", "StoreQuestion", "ask_store"]
 
 ASKED_S: Final = 12.0
-"""How long the process may take, its start included."""
+"""Seconds that the process may take, including its start."""
 _CLOCK_S: Final = 3.0
 _NAMED: Final = ("AWS_", "GOOGLE_", "AZURE_")
 _OTHERS: Final = (
@@ -45,7 +45,7 @@ _OTHERS: Final = (
 
 
 class StoreQuestion(msgspec.Struct):
-    """A store to ask, and the number of the version that is served (0: none)."""
+    """A store to probe, and the number of the version that is served (0: none)."""
 
     url: str
     insecure_http: bool = False
@@ -54,40 +54,40 @@ class StoreQuestion(msgspec.Struct):
 
 
 class StoreAnswer(msgspec.Struct):
-    """What the store answered; times in seconds, Unix time where they are moments."""
+    """Reply of the store; durations in seconds, points in time as Unix time."""
 
     credentials: str = ""
-    """Where credentials come from, never what they are."""
+    """Source of the credentials, never their values."""
     credentials_error: str = ""
     credentials_hint: str = ""
     is_refused: bool = False
-    """The store refuses the credentials."""
+    """Whether the store refuses the credentials."""
     answers: bool = False
-    """Whether anything answers, be it a refusal."""
+    """Whether the store answers at all, even with a refusal."""
     first_s: float | None = None
-    """How long one small object takes over a new connection; ``next_s``: the next one."""
+    """Seconds for one small object over a new connection; ``next_s``: for the next object."""
     next_s: float | None = None
     error: str = ""
     hint: str = ""
     version: int = 0
-    """Number of the version that is offered; 0: not known."""
+    """Number of the newest published version; 0: unknown."""
     created_s: float | None = None
-    """When the offered version was published; ``served_created_s``: when the served one was."""
+    """Publication time of the newest version; ``served_created_s``: of the served one."""
     served_created_s: float | None = None
     clock_s: float | None = None
-    """By how much the store's clock is ahead of this machine's."""
+    """Seconds by which the store's clock is ahead of this machine's."""
     is_late: bool = False
-    """The process was ended because it took too long."""
+    """Whether the process was killed because it took too long."""
 
 
 def ask_store(question: StoreQuestion, environment: Mapping[str, str] | None) -> StoreAnswer:
-    """Ask the store.
+    """Probe the store.
 
     Parameters
     ----------
     environment
-        Of the daemon: only variables that say where its credentials are, or how to reach the store, are used;
-        None: it cannot be seen, and this process's own is used.
+        Environment of the daemon, of which only variables for the credentials or the connection are used;
+        None if unreadable, which uses the environment of this process.
     """
     given = dict(os.environ)
     if environment is not None:
@@ -128,13 +128,13 @@ def _is_of_a_store(name: str) -> bool:
 
 
 def main(words: str) -> None:
-    """Ask, and print after each step what is known: the last line counts."""
+    """Probe, and print all results so far after each step; the last line counts."""
     question, answer = msgspec.json.decode(words, type=StoreQuestion), StoreAnswer()
     for step in (_ask_credentials, _ask_objects, _ask_clock):
         step(question, answer)
         sys.stdout.write(msgspec.json.encode(answer).decode() + "\n")
         sys.stdout.flush()
-    os._exit(0)  # threads that still ask are not waited for
+    os._exit(0)  # do not wait for threads that are still probing
 
 
 def _ask_credentials(question: StoreQuestion, answer: StoreAnswer) -> None:
@@ -190,7 +190,7 @@ def _ask_objects(question: StoreQuestion, answer: StoreAnswer) -> None:
 
 
 def _ask_clock(question: StoreQuestion, answer: StoreAnswer) -> None:
-    """Compare clocks by the ``Date`` of any answer of the server, asked without credentials."""
+    """Compare clocks by the ``Date`` header of any reply, requested without credentials."""
     import urllib.error
     import urllib.request
 
@@ -204,7 +204,7 @@ def _ask_clock(question: StoreQuestion, answer: StoreAnswer) -> None:
         return
 
     class Stay(urllib.request.HTTPRedirectHandler):
-        """Goes nowhere else."""
+        """Refuses redirects."""
 
         def redirect_request(self, *_: Any, **__: Any) -> None:
             return None

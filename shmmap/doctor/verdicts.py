@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings, and what the counters alone say, in the same words for ``status``, ``top`` and ``doctor``.
+"""Findings, and verdicts from the counters alone, in the same words for ``status``, ``top`` and ``doctor``.
 
-Whether the cache is too small, how long the storage has been out of reach, whether the map's signature holds.
+The verdicts: whether the cache is too small, how long the storage has been out of reach, whether the map's
+signature is valid.
 """
 
 from __future__ import annotations
@@ -38,30 +39,30 @@ _SEVERITY: Final[dict[State, int]] = {"ok": 0, "warn": 1, "fail": 2}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was looked at, what was found, and what to do about it."""
+    """One result of a check: subject, fact, and advice."""
 
     name: str
     state: State
-    """``ok``; ``warn`` for what may hurt later; ``fail`` for what hinders now."""
+    """``ok``; ``warn`` for what may cause trouble later; ``fail`` for what causes trouble now."""
     fact: str
     advice: str = ""
-    """Empty where nothing has to be done."""
+    """Advice; empty if nothing needs to be done."""
     skipped: bool = False
-    """Whether it could not be checked, and nothing is wrong with that; ``state`` is ``ok`` then."""
+    """Whether the check does not apply or was not possible, which is no problem; ``state`` is then ``ok``."""
 
 
 def skip(name: str, fact: str) -> Finding:
-    """Return that there was nothing to look at."""
+    """Return a finding that the check does not apply."""
     return Finding(name, "ok", fact, skipped=True)
 
 
 def ok(name: str, fact: str, advice: str = "") -> Finding:
-    """Return a finding that needs nothing; ``advice`` may still point at something better."""
+    """Return a finding without a problem; ``advice`` may still suggest an improvement."""
     return Finding(name, "ok", fact, advice)
 
 
 def warn(name: str, fact: str, advice: str) -> Finding:
-    """Return a finding that may hurt later."""
+    """Return a finding that may cause trouble later."""
     return Finding(name, "warn", fact, advice)
 
 
@@ -77,11 +78,11 @@ def worst(findings: list[Finding]) -> State:
 
 RELOADED_SHARE: Final = 0.05
 RELOADED_COUNT: Final = 10
-"""Fewer loads than this prove nothing, whatever their share."""
+"""With fewer loads than this, no share proves anything."""
 
 
 class Verdict(NamedTuple):
-    """Whether the budget is too small, why, and what to do."""
+    """A judgement of the budget: whether it is too small, why, and what to do."""
 
     too_small: bool
     why: str
@@ -94,9 +95,9 @@ class Verdict(NamedTuple):
 
 
 def cache_verdict(counters: Mapping[str, int]) -> Verdict:
-    """Judge the budget by the last ten minutes: what was refused, and what was loaded again after eviction.
+    """Judge the budget by the last ten minutes: cells refused, and cells loaded again after eviction.
 
-    What was refused for a client's quota says nothing of the budget.
+    Cells refused because of a client's quota do not count.
     """
     refused = counters.get("refused_over_budget_10min", 0)
     evicted = counters.get("evictions_10min", 0)
@@ -136,7 +137,7 @@ def cache_verdict(counters: Mapping[str, int]) -> Verdict:
 
 
 def outage_so_far(counters: Mapping[str, int]) -> str:
-    """Return how long the map's storage is out of reach: ``"less than a second"``, ``"5.0 s"``."""
+    """Return how long the map's storage has been out of reach: ``"less than a second"``, ``"5.0 s"``."""
     outage_s = counters.get("last_outage_ns", 0) * 1e-9
     return "less than a second" if outage_s < 1.0 else format_duration(outage_s)
 
@@ -153,7 +154,7 @@ _ADVICE: Final = {
 
 
 def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
-    """List what is wrong with the signature of the map that is served, and with the version offered.
+    """Return problems with the signature of the served map, and with the newest published version.
 
     Parameters
     ----------
@@ -165,7 +166,7 @@ def trust_problems(counters: Mapping[str, int], now_s: float) -> list[str]:
 
 
 def refused_offer(counters: Mapping[str, int]) -> tuple[str, str]:
-    """Say why the version that the map's origin offers is not taken, and what to do; empty if it is taken."""
+    """Return why the version that the origin offers is refused, and what to do; empty if it is accepted."""
     at = counters.get("published_refusal", 0)
     cause = REFUSALS[at] if at < len(REFUSALS) else REFUSALS[-1]
     if not cause:
@@ -177,7 +178,7 @@ def refused_offer(counters: Mapping[str, int]) -> tuple[str, str]:
 
 
 def signature_lines(counters: Mapping[str, int], now_s: float) -> list[str]:
-    """Until when the map is signed, and the problems with that; empty for a map without either."""
+    """Return lines on how long the signature is valid, and its problems; empty for a map without either."""
     until_s = signature_times(counters)[1]
     problems = trust_problems(counters, now_s)
     if not until_s or signature_expiry(counters, now_s):
@@ -186,14 +187,14 @@ def signature_lines(counters: Mapping[str, int], now_s: float) -> list[str]:
 
 
 def signature_times(counters: Mapping[str, int]) -> tuple[float, float]:
-    """When the map was signed, and until when that is valid, Unix time; 0: it is not signed."""
+    """Return when the map was signed, and until when that is valid, as Unix time; 0: not signed."""
     names = ("published_signed_unix_ns", "published_expires_unix_ns")
     signed_s, until_s = (counters.get(name, 0) * 1e-9 for name in names)
     return signed_s, until_s
 
 
 def signature_expiry(counters: Mapping[str, int], now_s: float) -> str:
-    """Say when the signature expired; empty if it has not.  The clock may be behind the signing time."""
+    """Return when the signature expired, by the later of clock and signing time; empty if it is valid."""
     signed_s, until_s = signature_times(counters)
     if not until_s or until_s > max(now_s, signed_s):
         return ""
@@ -201,5 +202,5 @@ def signature_expiry(counters: Mapping[str, int], now_s: float) -> str:
 
 
 def valid_until(until_s: float) -> str:
-    """Say until when a verified signature is valid."""
+    """Return a text on how long a verified signature is valid."""
     return f"verified, valid until {format_utc(until_s)}"

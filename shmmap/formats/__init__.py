@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File formats, one each: to columns, and back."""
+"""File formats: each module reads files into columns or writes columns to files."""

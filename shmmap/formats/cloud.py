@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds of any format that is read: block by block, whole in memory, or described for `shmmap inspect`."""
+"""Read clouds of any supported format: block by block, whole into memory, or only to describe them."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ __all__ = [
 ]
 
 CLOUD_SUFFIXES: Final = (".pcd", *LAS_SUFFIXES, ".ply", *TEXT_SUFFIXES)
-"""Endings of the files in a directory that are clouds, in lower case."""
+"""File endings, in lower case, that count as clouds in a directory."""
 
 READABLE_SUFFIXES: Final = (*CLOUD_SUFFIXES, *TABLE_SUFFIXES)
-"""Endings of the files that are read where they are named, in lower case."""
+"""File endings, in lower case, that are read if the file is named."""
 
 
 BlockReader: TypeAlias = LasReader | PlyReader | TextReader
-"""A cloud that is no PCD, opened and its header checked."""
+"""A cloud of a format other than PCD, opened and its header checked."""
 
 
 def cloud_suffix(path: str | os.PathLike[str]) -> str:
@@ -49,7 +49,7 @@ def cloud_suffix(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     MapDataError
-        ``unsupported_format``; a file that is not there, or no file, is refused for that.
+        ``unsupported_format``; or ``missing`` and similar causes if there is no such regular file.
     """
     name = os.fspath(path)
     suffix = os.path.splitext(name)[1].lower()
@@ -65,7 +65,7 @@ def cloud_suffix(path: str | os.PathLike[str]) -> str:
 
 
 def open_blocks(path: str, suffix: str) -> BlockReader:
-    """Open a cloud that is no PCD; errors are those of its reader."""
+    """Open a cloud of a format other than PCD; errors are those of its reader."""
     if suffix in LAS_SUFFIXES:
         return LasReader(path)
     return PlyReader(path) if suffix == ".ply" else TextReader(path)
@@ -89,7 +89,7 @@ class PointCloud:
     viewpoint
         Translation x y z in metres, then quaternion w x y z; not applied to the points.
     bounds
-        (min_xyz, max_xyz) of the finite points, float64, metres; NaN when there are none.
+        (min_xyz, max_xyz) of the finite points, float64, metres; NaN if no point is finite.
     warnings
         Oddities of the file.
     """
@@ -109,22 +109,22 @@ class PointCloud:
 
 @dataclass(frozen=True, slots=True)
 class CloudDescription:
-    """What a file holds, without its points.
+    """The contents of a cloud file, without its points.
 
     Attributes
     ----------
     path, format, encoding, version, file_bytes
-        The file; ``encoding`` and ``version`` are empty where the format has none.
+        The file; ``encoding`` and ``version`` are empty if the format has none.
     points, dropped
         Points in the file, and how many of them have an x, y or z that is not finite.
     width, height
-        Of an organised cloud; (points, 1) otherwise.
+        Size of an organised cloud; (points, 1) otherwise.
     columns
-        As `PointCloud.columns` would have them.
+        Columns as in `PointCloud.columns`.
     bounds, viewpoint, warnings
         As in `PointCloud`.
     crs
-        What the file says of its coordinate system; None where it says nothing.
+        The coordinate system that the file names; None if it names none.
     digest
         XXH3-128 of a PCD file's bytes; empty for other formats.
     """
@@ -152,7 +152,7 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
     Raises
     ------
     MapDataError
-        If the file is not what it claims to be; causes in `shmmap.formats.source_file`.
+        The file contradicts its header or format; causes in `shmmap.formats.source_file`.
     """
     with PcdReader(path, keep_non_finite=keep_non_finite) as reader:
         parts = [tuple(column.copy() for column in block) for block in reader.blocks()]
@@ -173,9 +173,9 @@ def read_pcd(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> 
 
 
 def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -> PointCloud:
-    """Read a whole cloud of any format: PCD, PLY and text by our own readers, LAS and LAZ through laspy.
+    """Read a whole cloud of any format: PCD, PLY and text directly, LAS and LAZ through laspy.
 
-    Coordinates are in the file's unit; where that is not the metre, ``warnings`` says so.
+    Coordinates are in the file's unit; ``warnings`` names the unit if it is not the metre.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def read_cloud(path: str | os.PathLike[str], *, keep_non_finite: bool = False) -
 
 
 def describe(path: str | os.PathLike[str]) -> CloudDescription:
-    """Read a file to its end and say what it holds, in bounded memory.
+    """Read a file to its end, in bounded memory, and describe its contents.
 
     Raises
     ------

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file says of its coordinate system (name, units in the plane and in height), and what is said of it.
+"""The coordinate system that a file names (name, units of plane and height), and warnings about it.
 
-Read from WKT (OGC 01-009 and ISO 19162, so WKT 1 and 2) and from GeoTIFF keys (OGC 19-008), as LAS files have
-them.  No projection library: a unit's length stands in the text, and codes of units are few.  Coordinates
-that are no metres are warned of: of longitude and latitude no map can be made, since a whole town would fall
-into one cell.
+LAS files contain it as WKT (OGC 01-009 and ISO 19162, so WKT 1 and 2) or as GeoTIFF keys (OGC 19-008). No
+projection library is needed: WKT contains a unit's length, and unit codes are few.  Coordinates in other
+units than metres get a warning.  Longitude and latitude cannot be made into a map, since a whole town would
+fall into one cell.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-if TYPE_CHECKING:  # the command line reads its options without numpy
+if TYPE_CHECKING:  # the command line parses its options without numpy
     import numpy as np
     from numpy.typing import NDArray
 
@@ -36,7 +36,7 @@ __all__ = [
 
 
 class LengthUnit(NamedTuple):
-    """A unit of length and how many metres it has; 0 where its length is not known."""
+    """A unit of length and its length in metres; 0 if that is unknown."""
 
     name: str
     metres: float
@@ -47,28 +47,28 @@ FEET: Final = {
     "ft": LengthUnit("international foot", 0.3048),
     "us-ft": LengthUnit("US survey foot", 1200 / 3937),
 }
-"""Feet by the names that options have; they differ by 2 mm in a kilometre."""
+"""Feet by the names that options use; the two differ by 2 mm in a kilometre."""
 
 UNITS: Final = ("auto", "m", *FEET)
-"""What options for units may be: ``auto`` is what each file says about itself."""
+"""Values of options for units; ``auto``: the unit that each file names."""
 
-_SAME: Final = 5e-8  # lengths in files are rounded; the two feet differ by 6e-7
+_SAME: Final = 5e-8  # metres; lengths in files are rounded, and the two feet differ by 6e-7
 
 
 @dataclass(frozen=True, slots=True)
 class CoordinateSystem:
-    """What a file says of its coordinate system.
+    """The coordinate system that a file names.
 
     Attributes
     ----------
     name
-        As the file has it, with its EPSG code where that is said.
+        Name in the file, with its EPSG code if the file has one.
     geographic
         Whether x and y are degrees.
     plane, height
-        Units of x and y, and of z; None where nothing is said.
+        Units of x and y, and of z; None if the file does not name them.
     epsg
-        Code of the whole, or of its part in the plane; 0 where there is none.
+        EPSG code of the whole system, or of its horizontal part; 0 if there is none.
     """
 
     name: str = ""
@@ -79,19 +79,19 @@ class CoordinateSystem:
 
     @property
     def units(self) -> tuple[LengthUnit, LengthUnit]:
-        """Units in the plane and in height: metres where nothing is said, heights as the plane."""
+        """Units of plane and height; by default metres in the plane, and the plane's unit for heights."""
         plane = self.plane or METRE
         return plane, self.height or (METRE if self.geographic else plane)
 
     @property
     def label(self) -> str:
-        """The name with its code, for people."""
+        """Name and code, as displayed."""
         code = f"EPSG:{self.epsg}" if self.epsg else ""
         return f"{self.name} ({code})" if self.name and code else self.name or code
 
 
 def _length(name: str, metres: float) -> LengthUnit:
-    """Return the unit of a length, under the name that it is known by."""
+    """Return the unit of a length in metres, under its common name if it has one."""
     for known in (METRE, *FEET.values()):
         if math.isfinite(metres) and abs(metres - known.metres) < _SAME * known.metres:
             return known
@@ -117,7 +117,7 @@ _UNITS: Final = frozenset(("UNIT", "LENGTHUNIT"))
 
 @dataclass(slots=True)
 class _Node:
-    """One bracket of WKT: its keyword, texts and words in it, and brackets in it."""
+    """One WKT bracket: its keyword, and the texts, words and brackets in it."""
 
     keyword: str
     words: list[str] = field(default_factory=list)
@@ -128,13 +128,13 @@ class _Node:
 
 
 def wkt_system(text: str) -> CoordinateSystem | None:
-    """Return what WKT of any kind says; None where it is no WKT of a coordinate system."""
+    """Return the system that WKT of any kind describes; None if the text is not WKT of such a system."""
     roots = _trees(text[:_MAX_TEXT])
     return _system(roots[0] if len(roots) == 1 else _Node("COMPD_CS", [], roots))
 
 
 def _trees(text: str) -> list[_Node]:
-    """Return the outermost brackets: one, or as ESRI writes it a system and its heights."""
+    """Return the outermost brackets: one, or two if ESRI appends a system of heights."""
     roots: list[_Node] = []
     stack: list[_Node] = []
     word, at = "", 0
@@ -197,7 +197,7 @@ def _system(node: _Node) -> CoordinateSystem | None:
 
 
 def _units(node: _Node) -> list[LengthUnit]:
-    """Units of length of a system's axes: of each, where axes say theirs, else of all."""
+    """Return the length units of a system's axes: one per axis if axes name theirs, else one for all."""
     of_axes = [unit for axis in node.all(_AXIS) for unit in axis.all(_UNITS)]
     units = []
     for unit in of_axes or node.all(_UNITS):
@@ -217,7 +217,7 @@ def _epsg(node: _Node) -> int:
 
 
 def _by_name(text: str) -> float:
-    """Metres of a unit that is named in a text; 0 where none is."""
+    """Return the metres of a unit that a text names; 0 if it names none."""
     plain = text.lower().replace("_", " ")
     if re.search(r"us[ -]?(survey )?f(oo|ee)?t|ftus|foot us|feet us|survey f(oo|ee)t", plain):
         return FEET["us-ft"].metres
@@ -248,7 +248,7 @@ _UNIT_CODES: Final = {
     1025: LengthUnit("millimetre", 0.001),
     1033: LengthUnit("centimetre", 0.01),
 }
-# State planes of the United States, whose unit follows from the code: NAD27, NAD83, NAD83(HARN).
+# US state planes, whose unit follows from the code: NAD27, NAD83, NAD83(HARN)
 _STATE_PLANES: Final = (range(2222, 2290), range(2867, 2931), range(32001, 32059))
 _STATE_PLANES_FT: Final = frozenset[int]().union(
     range(2222, 2225),
@@ -263,9 +263,9 @@ _STATE_PLANES_FT: Final = frozenset[int]().union(
 
 
 def geokey_system(directory: bytes, doubles: bytes, text: bytes) -> CoordinateSystem | None:
-    """Return what GeoTIFF keys say: their directory (34735), doubles (34736) and texts (34737).
+    """Return the system in GeoTIFF keys: directory (34735), doubles (34736) and texts (34737).
 
-    None where there is no sound directory.
+    None if there is no valid directory.
     """
     if len(directory) < 8 or len(directory) % 2:
         return None
@@ -319,16 +319,16 @@ GEOGRAPHIC_SYSTEM: Final = (
     " such as UTM"
 )
 
-_MAX_DEGREES: Final = 5.0  # of x and of y; larger clouds are divided by other means
-_FLATNESS: Final = 20.0  # heights are in metres, so such a cloud seems to be far higher than wide
-_OFF_ORIGIN: Final = 1.0  # what small thing stands at the origin may be as slender as that
+_MAX_DEGREES: Final = 5.0  # span in x and y; larger clouds in degrees are not recognised
+_FLATNESS: Final = 20.0  # heights are in metres, so a cloud in degrees seems to be far higher than wide
+_OFF_ORIGIN: Final = 1.0  # a small object near the origin may be as slender as such a cloud
 
 
 def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -> str:
-    """Return a warning where bounds ((3,) each) look like degrees, else an empty text.
+    """Return a warning if bounds ((3,) each) look like degrees, else an empty text.
 
-    They do where x and y are possible as longitude and latitude, span few degrees, and heights span many
-    times as much: a town is 0.05 degrees wide and 50 m high.
+    They do if x and y are valid longitudes and latitudes and span few degrees, while heights span many times
+    as much: a town is 0.05 degrees wide and 50 m high.
     """
     x, y = (max(abs(low), abs(high)) for low, high in zip(lowest[:2], highest[:2], strict=True))
     spans = highest - lowest
@@ -344,7 +344,7 @@ def degrees_warning(lowest: NDArray[np.float64], highest: NDArray[np.float64]) -
 
 
 def unit_warnings(crs: CoordinateSystem | None) -> tuple[str, ...]:
-    """Return what has to be said of a file's units: that they are degrees, or no metres."""
+    """Return warnings about a file's units: degrees, or lengths other than metres."""
     if crs is None:
         return ()
     plane, height = crs.units
@@ -357,14 +357,14 @@ def unit_warnings(crs: CoordinateSystem | None) -> tuple[str, ...]:
 
 
 def units_text(plane: LengthUnit, height: LengthUnit) -> str:
-    """Say units in the plane and in height, each with its length."""
+    """Return text with the units of plane and height, each with its length."""
     if plane == height:
         return f"x, y and z are in {unit_text(plane)}"
     return f"x and y are in {unit_text(plane)}, z in {unit_text(height)}"
 
 
 def unit_text(unit: LengthUnit) -> str:
-    """Name a unit with its length."""
+    """Return a unit's name with its length."""
     if unit == METRE:
         return "metres"
     name = re.sub(r"\bfoot\b", "feet", unit.name)

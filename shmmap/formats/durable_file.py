@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole and survive a power cut, locks on files, and errors of writing."""
+"""Write files that appear complete and survive power loss; lock files; convert errors of writing."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ _HINTS: Final = {
 
 @contextlib.contextmanager
 def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[IO[bytes]]:
-    """Open a file that gets its name only once it is complete and on the disk.
+    """Open a file that gets its name only when it is complete and on the disk.
 
     Parameters
     ----------
     path
-        The name; until then the file has another one in the same directory.
+        Final name; until the end the file has a temporary name in the same directory.
     replace
-        Whether it may take the place of what has that name.
+        Whether the file may replace an existing one.
 
     Raises
     ------
     FileExistsError
-        It may not.
+        A file of that name exists, and ``replace`` is False.
     OSError
-        It cannot be written; nothing is left.
+        The file cannot be written; nothing is left behind.
     """
     directory, name = os.path.split(path)
     interim = os.path.join(directory, f".{name}.{secrets.token_hex(4)}.tmp")
@@ -53,7 +53,7 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
         if replace:
             os.replace(interim, path)
         else:
-            os.link(interim, path)  # unlike a rename this never replaces a file
+            os.link(interim, path)  # unlike a rename, a link never replaces a file
             os.unlink(interim)
     except BaseException as error:
         with contextlib.suppress(OSError):
@@ -66,7 +66,7 @@ def appearing_file(path: str | os.PathLike[str], *, replace: bool = True) -> Ite
 
 @contextlib.contextmanager
 def locked_file(path: str, *, mode: int = 0o600) -> Iterator[None]:
-    """Hold a file's exclusive lock, waiting for it; the file is made with ``mode`` if it is not there."""
+    """Wait for a file's exclusive lock and hold it; a missing file is created with ``mode``."""
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)
@@ -76,7 +76,7 @@ def locked_file(path: str, *, mode: int = 0o600) -> Iterator[None]:
 
 
 def flush_directory(path: str | os.PathLike[str]) -> None:
-    """Force the names in a directory to the disk."""
+    """Flush a directory's entries to the disk."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
@@ -86,11 +86,11 @@ def flush_directory(path: str | os.PathLike[str]) -> None:
 
 @contextlib.contextmanager
 def writing_errors(what: str) -> Iterator[None]:
-    """Turn an OSError into `CannotWrite`, with a hint; ``what`` is the thing to be written."""
+    """Convert OSError to `CannotWrite` with a hint; ``what`` names the thing to be written."""
     try:
         yield
     except ShmmapError:
-        raise  # also one that is an OSError: that the daemon did not answer is nothing about a file
+        raise  # some errors of shmmap are OSErrors, too, but are not about a file
     except OSError as error:
         raise CannotWrite(
             f"cannot write {error.filename or what}: {error.strerror or error}",

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The header of a LAS or LAZ file: its counts against its bytes, its scales, and its coordinate system.
+"""Read and check the header of a LAS or LAZ file: counts against its size, scales, coordinate system.
 
-By the ASPRS LAS specification 1.4 R15.  Read here, before laspy allocates for it, because laspy believes it.
+The format is that of the ASPRS LAS specification 1.4 R15.  The header is checked here because laspy trusts it
+and allocates memory for what it claims.
 """
 
 from __future__ import annotations
@@ -20,18 +21,16 @@ from shmmap.formats.source_file import open_regular, refusal
 __all__ = ["LasHeader", "read_las_header"]
 
 _SIGNATURE: Final = b"LASF"
-_HEADER_BYTES: Final = 375  # of LAS 1.4; of 1.0 to 1.2 it has
-_SHORTEST_BYTES: Final = 227
+_HEADER_BYTES: Final = 375  # LAS 1.4
+_SHORTEST_BYTES: Final = 227  # LAS 1.0 to 1.2
 _START: Final = struct.Struct("<HII")  # at 94: header bytes, offset to points, records
 _POINTS: Final = struct.Struct("<BHI")  # at 104: format, record bytes, points (legacy count)
 _LEGACY_AT: Final = 107
 _SCALES: Final = struct.Struct("<6d")  # at 131: scales, offsets
-_LONG: Final = struct.Struct(
-    "<QQIQ"
-)  # at 227, from 1.4 on: waveforms, extended records, their number, points
+_LONG: Final = struct.Struct("<QQIQ")  # at 227, since 1.4: waveforms, extended records and count, points
 _LONG_AT: Final = 247
 _LAZ_BIT: Final = 0x80
-_WKT_BIT: Final = 0x10  # of the global encoding
+_WKT_BIT: Final = 0x10  # flag of the global encoding
 _RECORD: Final = struct.Struct("<2x16sHH32x")
 _EXTENDED: Final = struct.Struct("<2x16sHQ32x")
 _PROJECTION: Final = b"LASF_Projection"
@@ -40,27 +39,27 @@ _LASZIP: Final = (b"laszip encoded", 22204)
 _MAX_RECORDS: Final = 10_000
 _MAX_RECORD_BYTES: Final = 1 << 20
 _VARIABLE_CHUNKS: Final = 0xFFFFFFFF
-_LEGACY_FORMATS: Final = 6  # point formats below have the legacy count, too
+_LEGACY_FORMATS: Final = 6  # point formats below this have the legacy count, too
 
 
 @dataclass(frozen=True, slots=True)
 class LasHeader:
-    """What the header says, after all checks.
+    """Contents of a header, after all checks.
 
     Attributes
     ----------
     points
-        Points that count: those that the header announces.
+        Number of points in the header.
     compressed
         Whether it is LAZ.
     laszip
-        Content of the record that says how it is compressed; empty where there is none.
+        Content of the LASzip record, which describes the compression; empty if there is none.
     point_format, record_bytes
-        Of a point, uncompressed.
+        Format and size of an uncompressed point.
     data_at
-        Where the points begin.
+        Byte offset of the points.
     crs
-        The coordinate system; None where nothing is said.
+        The coordinate system; None if the file names none.
     warnings
         Oddities that did not prevent reading.
     """
@@ -76,7 +75,7 @@ class LasHeader:
 
 
 def read_las_header(path: str) -> LasHeader:
-    """Read and check a header; what contradicts the file's bytes is refused.
+    """Read and check a header; reject one that contradicts the file's bytes.
 
     Raises
     ------
@@ -118,7 +117,7 @@ class _Header:
         self._check_scales()
         points = self._count(legacy, long, form)
         compressed = bool(form & _LAZ_BIT)
-        # LAZ needs more than a bit a point; every LAS point its record
+        # a byte of LAZ holds at most 256 points, and a LAS point takes its whole record
         needed = data_at if compressed else data_at + points * record_bytes
         if self.size < needed or (compressed and points > (self.size - data_at) * 256):
             raise self._error(
@@ -131,7 +130,7 @@ class _Header:
             ("extended records", extended_at, extended, self.size, _EXTENDED),
         ):
             room = max(0, end - first)
-            if count * form_of.size > room:  # laspy would look for each of them
+            if count * form_of.size > room:  # laspy would search for each of them
                 raise self._error(
                     "bad_las", f"{count} {what} announced in {room} bytes", min(first, self.size)
                 )
@@ -161,7 +160,7 @@ class _Header:
                 raise self._error("bad_las", message, 131 + 8 * place)
 
     def _count(self, legacy: int, long: int | None, form: int) -> int:
-        """Points announced: by the wide count of 1.4, or the legacy one where that alone is set."""
+        """Return the number of points: the wide count of 1.4, or the legacy one if only that is set."""
         if long is None:
             return legacy
         if not long and legacy:
@@ -176,7 +175,7 @@ class _Header:
         return long
 
     def _check_rest(self, points: int, end: int, rest_end: int, record_bytes: int) -> None:
-        """Compare the bytes behind the last point with what they could be."""
+        """Check that the bytes after the last point are plausible."""
         rest = rest_end - end
         more = rest // record_bytes if record_bytes else 0
         if more and not points:
@@ -190,14 +189,14 @@ class _Header:
             )
 
     def _check_chunks(self, points: int, data_at: int, laszip: bytes) -> None:
-        """Compare the points of LAZ with its table of chunks."""
+        """Check the number of points of a LAZ file against its chunk table."""
         if len(laszip) < 16:
-            return  # `check_laz` says what is wrong
+            return  # `check_laz` reports the error
         (chunk_points,) = struct.unpack_from("<I", laszip, 12)
         self.file.seek(data_at)
         start = self.file.read(8)
         table_at = int.from_bytes(start, "little", signed=True)
-        if table_at == -1:  # written to a pipe: it stands in the last bytes
+        if table_at == -1:  # LAZ written to a pipe: the offset is in the last bytes
             self.file.seek(max(data_at, self.size - 8))
             table_at = int.from_bytes(self.file.read(8), "little", signed=True)
         if len(start) < 8 or not data_at + 8 <= table_at <= self.size - 8:
@@ -231,7 +230,7 @@ class _Header:
     def _records(
         self, header_bytes: int, records: int, extended_at: int, extended: int
     ) -> Iterator[tuple[tuple[bytes, int], bytes]]:
-        """Yield (user, number) and content of each record that matters, those behind the points last."""
+        """Yield (user, number) and content of each relevant record; records after the points come last."""
         for at, count, form in ((header_bytes, records, _RECORD), (extended_at, extended, _EXTENDED)):
             for _ in range(min(count, _MAX_RECORDS)):
                 self.file.seek(at)
@@ -249,7 +248,7 @@ class _Header:
                     return
 
     def _system(self, found: dict[tuple[bytes, int], bytes]) -> CoordinateSystem | None:
-        """Return the system that the file means, of WKT and GeoTIFF keys the one that its header names."""
+        """Return the file's coordinate system, from WKT or GeoTIFF keys as the header's flag selects."""
         text = found.get((_PROJECTION, _WKT), b"").split(b"\0")[0].decode("utf-8", "replace").strip()
         keys = found.get((_PROJECTION, _GEOKEYS), b"")
         by_text = wkt_system(text) if text else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LAS, LAZ and COPC through laspy, block by block (laspy with lazrs, optional dependencies).
+"""Read LAS, LAZ and COPC block by block, through laspy with lazrs (optional dependencies).
 
 The format is that of the ASPRS LAS specification 1.4 R15; COPC is LAZ with its points in the order
 of an octree.  Coordinates are stored as scaled integers and come out as float64.  Every dimension
@@ -29,7 +29,7 @@ __all__ = ["LAS_SUFFIXES", "LasReader"]
 
 LAS_SUFFIXES: Final = (".las", ".laz")  # COPC files end in .copc.laz
 
-_PANICS: Final = "pyo3_runtime"  # module of exceptions that are panics of Rust
+_PANICS: Final = "pyo3_runtime"  # module of exceptions that stand for panics in Rust
 
 Bound3 = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -45,13 +45,13 @@ class LasReader:
         ``xyz`` (N, 3) float64 in metres (or whatever unit the file's coordinate system has), then every
         other dimension with its own dtype, in file order.
     bounds
-        (min_xyz, max_xyz) as the header claims, float64; None where it claims nothing that could be true.
+        (min_xyz, max_xyz) from the header, float64; None if the header's bounds are impossible.
     crs
-        What the file says of its coordinate system; None where it says nothing.
+        The coordinate system that the file names; None if it names none.
     compressed
-        Whether it is LAZ.
+        Whether the file is LAZ.
     version
-        Of the LAS format, such as ``1.4``.
+        Version of the LAS format, such as ``1.4``.
     warnings
         Oddities of the file.
 
@@ -82,7 +82,7 @@ class LasReader:
                     data_at=checked.data_at,
                 )
             if chunks is not None and not chunks.small:
-                backends = {"laz_backend": laspy.LazBackend.Lazrs}  # point by point
+                backends = {"laz_backend": laspy.LazBackend.Lazrs}  # serial: point by point
             counted = self.points
             if chunks is not None and chunks.points is not None and not checked.warnings:
                 counted = chunks.points
@@ -100,7 +100,7 @@ class LasReader:
 
     def _read_header(self, laspy: Any, points: int) -> None:
         header = self._reader.header
-        header.point_count = points  # laspy believes a wide count of 0
+        header.point_count = points  # laspy trusts a wide count of 0
         self.version = str(header.version)
         self.encoding = ""
         low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
@@ -165,7 +165,7 @@ class LasReader:
 
 @contextmanager
 def _refused(path: str, when: str) -> Iterator[None]:
-    """Turn whatever laspy raises into a refusal; a panic of its decompressor is no `Exception`."""
+    """Convert any exception of laspy to an error; a panic of its decompressor is not an `Exception`."""
     try:
         yield
     except MapDataError:

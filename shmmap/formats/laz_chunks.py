@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a LAZ file says of its compression, checked before a decompressor allocates for it.
+"""Check the compression metadata of a LAZ file before a decompressor allocates memory for it.
 
 The LASzip record names the items that make a point; the table of chunks counts their bytes and, where chunks
-differ in size, their points; a chunk of LAS 1.4's formats counts its layers.  lazrs believes all of them: it
-would end the process for memory that is not there.  As LASzip 3 writes them (laszip_dll, `src/laszip.cpp`).
+differ in size, their points; a chunk of LAS 1.4's formats counts its layers.  lazrs trusts all of these
+numbers, and a wrong one makes it abort the process for lack of memory.  Format as in LASzip 3 (laszip_dll,
+`src/laszip.cpp`).
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from shmmap.formats.source_file import refusal
 
 __all__ = ["LazChunks", "check_laz"]
 
-_RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points a chunk, items
+_RECORD: Final = struct.Struct("<H10xI16xH")  # compressor, points per chunk, items
 _ITEM: Final = struct.Struct("<HHH")  # type, bytes, version
-_VARIABLE: Final = (0, 0xFFFFFFFF)  # points a chunk where the table counts them
+_VARIABLE: Final = (0, 0xFFFFFFFF)  # points per chunk if the table counts them
 _LAYERED: Final = 3  # compressor whose chunks count their points and layers
 _CHUNKED: Final = (2, _LAYERED)
 _POINT10, _GPS, _RGB, _WAVE, _POINT14, _RGB14, _RGBNIR14, _WAVE14 = range(6, 14)
 _EXTRA, _EXTRA14 = 0, 14
-_ITEMS: Final = {  # of each point format
+_ITEMS: Final = {  # item types of each point format
     0: (_POINT10,),
     1: (_POINT10, _GPS),
     2: (_POINT10, _RGB),
@@ -49,17 +50,17 @@ _BYTES: Final = {
     _WAVE14: 29,
 }
 _LAYERS: Final = {_POINT14: 9, _RGB14: 1, _RGBNIR14: 2, _WAVE14: 1}
-_WHOLE_CHUNK_BYTES: Final = 256 << 20  # of the points of one chunk, held at once
+_WHOLE_CHUNK_BYTES: Final = 256 << 20  # bytes of one chunk's points, held at once
 
 
 @dataclass(frozen=True, slots=True)
 class LazChunks:
-    """What the chunks of a file hold.
+    """Summary of a file's chunks.
 
     Attributes
     ----------
     points
-        Points in all chunks; None where neither the table nor a chunk says it.
+        Points in all chunks; None if neither the table nor the chunks contain counts.
     small
         Whether the points of each chunk fit in memory, so that several can be decompressed at once.
     """
@@ -80,8 +81,8 @@ def check_laz(
     laszip
         Content of its LASzip record.
     point_format, record_bytes, data_at
-        As the header says: format without the bits of compression, bytes of an uncompressed point, and where
-        the chunks begin.
+        From the header: format without the compression bits, bytes of an uncompressed point, and byte offset
+        of the chunks.
 
     Returns
     -------
@@ -117,7 +118,7 @@ def check_laz(
         if compressor == _LAYERED:
             layers = sum(nbytes if kind == _EXTRA14 else _LAYERS[kind] for kind, nbytes, _ in items)
             counted = _check_layers(path, file, chunks, layers, record_bytes, data_at + 8)
-            counts[-1:] = counted[-1:]  # where all chunks are of one size, the table does not know the last
+            counts[-1:] = counted[-1:]  # with fixed points per chunk, the table lacks the last count
         elif chunk_points not in _VARIABLE:
             counts = []
     most = max([points for points, _ in chunks], default=0)
@@ -125,7 +126,7 @@ def check_laz(
 
 
 def _check_items(path: str, items: list[tuple[int, int, int]], point_format: int, record_bytes: int) -> None:
-    """Compare what a compressed point is made of with what the header says of points."""
+    """Check the items of a compressed point against the point format in the header."""
     needed = _ITEMS.get(point_format, ())
     extra = record_bytes - sum(_BYTES[kind] for kind in needed)
     expected = [(kind, _BYTES[kind]) for kind in needed]
@@ -139,11 +140,11 @@ def _check_items(path: str, items: list[tuple[int, int, int]], point_format: int
 def _check_layers(
     path: str, file: IO[bytes], chunks: list[tuple[int, int]], layers: int, record_bytes: int, at: int
 ) -> list[int]:
-    """Compare the layers of each chunk, whose first point is not compressed, with its bytes; its points."""
+    """Check each chunk's layers, after its uncompressed first point, against its bytes; return its points."""
     form = struct.Struct(f"<{1 + layers}I")
     counted = []
     for _, nbytes in chunks:
-        if not nbytes:  # as some programs end a file whose points fill its chunks
+        if not nbytes:  # some programs write an empty last chunk if the points fill the others
             counted.append(0)
             continue
         file.seek(at + record_bytes)

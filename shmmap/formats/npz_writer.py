@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Archives of arrays for `numpy.load`; an interrupt in the middle of one leaves no second error."""
+"""Write archives of arrays for `numpy.load`; an interrupt during writing causes no second error."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def npz_archive(file: IO[bytes], compression: int = zipfile.ZIP_STORED) -> Itera
         archive.close()
     except BaseException:
         if archive is not None:
-            archive.fp = None  # interrupted within a call it cannot be closed, and its finalizer would try
+            archive.fp = None  # else the finalizer would close it, which fails after an interrupt
         raise
 
 
 def write_npz(file: IO[bytes], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays of any name; numpy's own function can name none "file"."""
+    """Write arrays of any name; `numpy.savez` does not accept the name "file"."""
     with npz_archive(file) as archive:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

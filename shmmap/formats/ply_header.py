@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The header of a PLY file: its elements and properties, checked against the file's size; and written.
+"""Read PLY headers (elements, properties), check them against the file's size; and write them.
 
 The format is Greg Turk's (The PLY Polygon File Format, 1994), with both families of type names.  Accepted
 beyond it, because such files exist: lines that end in CRLF or CR, `obj_info`, comments in any encoding, a
@@ -22,7 +22,7 @@ from shmmap.formats.source_file import refusal
 __all__ = ["HEADER_LIMIT_BYTES", "PlyElement", "PlyHeader", "PlyProperty", "parse_ply_header", "ply_header"]
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
-"""A header must end within these."""
+"""Maximum length of a header in bytes."""
 
 _FORMATS: Final = ("ascii", "binary_little_endian", "binary_big_endian")
 _TYPES: Final = {
@@ -45,7 +45,7 @@ _SHOWN: Final = 60
 
 @dataclass(frozen=True, slots=True)
 class PlyProperty:
-    """One property; of a list, ``dtype`` is that of an item and ``counter`` that of their number."""
+    """One property; for a list, ``dtype`` is the type of its items and ``counter`` that of its length."""
 
     name: str
     dtype: np.dtype[np.generic]
@@ -54,7 +54,7 @@ class PlyProperty:
 
 @dataclass(slots=True)
 class PlyElement:
-    """One element: ``count`` rows of ``properties``; its line begins at byte ``offset``."""
+    """One element: ``count`` rows of ``properties``, declared at byte ``offset``."""
 
     name: str
     count: int
@@ -63,29 +63,29 @@ class PlyElement:
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows differ in length."""
+        """Whether rows contain lists, and so differ in length."""
         return any(one.counter is not None for one in self.properties)
 
     @property
     def least_row_bytes(self) -> int:
-        """Bytes of a binary row whose lists are empty: of every row, where there are no lists."""
+        """Bytes of a binary row with empty lists; of every row, if there are no lists."""
         return sum((one.counter or one.dtype).itemsize for one in self.properties)
 
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """What a header says, after all checks.
+    """Contents of a header, after all checks.
 
     Attributes
     ----------
     format
         ``ascii``, ``binary_little_endian`` or ``binary_big_endian``.
     before
-        Elements whose rows lie before the vertices.
+        Elements whose rows precede the vertices.
     vertex
-        The vertices.
+        Element of the vertices.
     fields
-        Their properties that are no lists, in file order; x, y and z among them.
+        Properties of the vertices that are not lists, in file order, including x, y and z.
     last
         Whether no element follows the vertices.
     data_offset
@@ -127,7 +127,7 @@ def parse_ply_header(head: bytes, *, path: str, file_bytes: int) -> PlyHeader:
 
 
 class _Parser:
-    """The lines of one header, and the checks between them."""
+    """Parses a header's lines, and checks them against each other."""
 
     def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
         self.head = head
@@ -165,7 +165,7 @@ class _Parser:
         return refusal(cause, message, path=self.path, offset=self.at if at is None else at)
 
     def _magic(self) -> tuple[int, bool]:
-        """Check the first line; returns where the second begins, and whether lines end in CR alone."""
+        """Check the first line; return the offset of the second, and whether lines end in CR alone."""
         start = len(_BOM) if self.head.startswith(_BOM) else 0
         if start:
             self.warnings.append("the file starts with a UTF-8 byte order mark")
@@ -188,7 +188,7 @@ class _Parser:
         raise self._error("not a PLY file: it does not start with the line 'ply'", at=0)
 
     def _lines(self, at: int, newline: bytes) -> int:
-        """Take all lines; returns the offset of the first data byte."""
+        """Parse all lines; return the offset of the first data byte."""
         head = self.head[:HEADER_LIMIT_BYTES]
         while (end := head.find(newline, at)) >= 0:
             self.at = at
@@ -259,7 +259,7 @@ class _Parser:
         element.properties.append(PlyProperty(name, dtypes[1], dtypes[0]))
 
     def _fields(self, vertex: PlyElement) -> tuple[PcdField, ...]:
-        """Name the columns: x, y and z, each other property by its own name, none twice."""
+        """Name the columns uniquely: x, y and z, and each other property by its own name."""
         lists = [one.name for one in vertex.properties if one.counter is not None]
         scalars = [one for one in vertex.properties if one.counter is None]
         if lists:
@@ -292,7 +292,7 @@ class _Parser:
         )
 
     def _check_size(self, header: PlyHeader) -> None:
-        """Refuse counts that the file cannot hold, before anything is allocated for them."""
+        """Refuse counts that the file cannot hold, before allocating memory for them."""
         left = self.file_bytes - header.data_offset
         for element in (*header.before, header.vertex):
             if header.format == "ascii":
@@ -329,13 +329,13 @@ def ply_header(
 ) -> bytes:
     """Return the header of a binary file with ``fields`` (name, dtype of one value).
 
-    ``header_bytes`` asks for that length, got by spaces at the end of a comment: so a header can be written
-    last, before points whose number was not known.
+    ``header_bytes`` pads the header to that length with spaces at the end of a comment.  So it can be written
+    in front of the points once their number is known.
 
     Raises
     ------
     BadRequest
-        PLY has no such type, or the header is longer than asked for.
+        PLY lacks a type, or the header exceeds ``header_bytes``.
     """
     types = [_WRITTEN_TYPES.get(dtype.str.lstrip("<|")) for _, dtype in fields]
     if None in types:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PLY, block by block: every property of the vertices a column with its own name and type.
+"""Read PLY block by block: every property of the vertices becomes a column of its name and type.
 
 Rows of a fixed length are numpy records, in either byte order.  Lists, in the vertices or in elements before
-them, make rows of different lengths: these are walked through one by one, and their lists left out.
+them, make rows differ in length.  Such rows are walked one by one, and their lists left out.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from shmmap.formats.text_rows import RowParser, line_ends, whole_lines
 
 __all__ = ["PlyReader"]
 
-_FIRST_READ_BYTES: Final = 4096  # holds nearly every header
+_FIRST_READ_BYTES: Final = 4096  # long enough for nearly every header
 _WALK_BYTES: Final = 1 << 20
 _SHOWN_NAME: Final = 60
 _HEADER_END: Final = re.compile(rb"[\r\n]end_header[ \t]*\r?[\r\n].", re.DOTALL)
@@ -92,7 +92,7 @@ class PlyReader(FileReader):
     def blocks(self, block_points: int, start: int = 0) -> Iterator[dict[str, NDArray[Any]]]:
         """Yield the columns of the points from ``start`` on, at most ``block_points`` rows at a time.
 
-        The arrays are reused: a consumer that keeps one copies it.
+        The arrays are reused, so a caller that keeps one must copy it.
 
         Raises
         ------
@@ -154,13 +154,13 @@ class PlyReader(FileReader):
         self._source.at += nbytes
 
     def _walked(self, element: PlyElement, block_rows: int, *, keep: bool) -> Iterator[bytes]:
-        """Walk through rows with lists; yields what is no list of ``block_rows`` rows at a time, packed.
+        """Walk rows with lists; yield their other values, packed, ``block_rows`` rows at a time.
 
-        Without ``keep`` nothing is gathered.  Ends with the source at the byte after the last row.
+        Without ``keep`` the rows are only skipped.  At the end the source is at the byte after the last row.
         """
         source = self._source
         steps = _steps(element, ">" if self.encoding == "binary_big_endian" else "<")
-        data, at, base = b"", 0, source.at  # data[0] lies at byte base of the file
+        data, at, base = b"", 0, source.at  # data[0] is at byte ``base`` of the file
         rows = bytearray()
         gathered = 0
         for row in range(element.count):
@@ -250,7 +250,7 @@ class PlyReader(FileReader):
             self._oddities.append(f"{parser.surplus} lines after the last vertex ignored")
 
     def _scalars(self, parser: RowParser, text: bytes, offset: int, vertex: PlyElement) -> list[bytes]:
-        """Values of the properties that are no lists, of rows that have some."""
+        """Return the values of properties that are not lists, for rows that contain lists."""
         found: list[bytes] = []
         row = parser.rows
         for line in text.split(b"\n"):
@@ -275,7 +275,7 @@ class PlyReader(FileReader):
 
 
 def _steps(element: PlyElement, order: str) -> list[tuple[int, struct.Struct | None, int]]:
-    """Return how to walk through a row: fixed bytes, then the count of a list and the bytes of an item."""
+    """Return the steps through a row: bytes of fixed length, then a list's counter and bytes per item."""
     steps: list[tuple[int, struct.Struct | None, int]] = []
     fixed = 0
     for one in element.properties:

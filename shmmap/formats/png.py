@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PNG images row by row (https://www.w3.org/TR/png/): never more of a picture in memory than a few rows."""
+"""Write PNG images (https://www.w3.org/TR/png/) row by row, with only a few rows in memory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PngWriter:
     bits
         8 or 16.
     palette
-        RGB of each value, three bytes each, for an image of one channel of 8 bits; empty for a grey one.
+        RGB of each value, three bytes each, for an image with one channel of 8 bits; empty for a grey image.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class PngWriter:
         Raises
         ------
         BadRequest
-            They do not fit the image.
+            The rows do not fit the image.
         """
         block = rows.reshape(len(rows), -1)
         columns, channels = self._row_shape
@@ -71,7 +71,7 @@ class PngWriter:
         values = np.ascontiguousarray(block, self._dtype).view(np.uint8).reshape(len(block), -1)
         filtered = np.zeros((len(block), values.shape[1] + 1), np.uint8)
         step = channels * self._dtype.itemsize
-        # filter 1: each byte minus that of the pixel before it, which makes smooth pictures small
+        # filter 1: each byte minus that of the pixel to its left, which makes smooth pictures small
         filtered[:, 0] = 1
         filtered[:, 1:] = values
         filtered[:, 1 + step :] -= values[:, :-step]
@@ -81,7 +81,7 @@ class PngWriter:
             self._chunk(b"IDAT", data)
 
     def finish(self) -> None:
-        """Write what is left; all rows must have been added."""
+        """Write the remaining bytes; all rows must have been added."""
         if self._left:
             raise BadRequest(f"{self._left} rows of the image are missing")
         self._chunk(b"IDAT", self._packer.flush())
@@ -99,7 +99,7 @@ def png_bytes(pixels: NDArray[np.unsignedinteger], palette: bytes = b"") -> byte
     Parameters
     ----------
     palette
-        As that of `PngWriter`.
+        As in `PngWriter`.
     """
     channels = 1 if pixels.ndim == 2 else pixels.shape[2]
     file = io.BytesIO()

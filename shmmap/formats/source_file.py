@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud file, opened for what it is and read once from front to back; and all causes of a refusal.
+"""Read a cloud file once from front to back, with its digest; and the causes of all errors.
 
-`MapDataError.cause` of any error that this package raises is a key of `CAUSES`; programs may rely on the
-names, people read the messages.
+`MapDataError.cause` of any error that this package raises is a key of `CAUSES`; the keys are stable for
+programs, the messages are for people.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _Self = TypeVar("_Self", bound="FileReader")
 
 
 def open_regular(path: str) -> int:
-    """Open a file for reading; returns its descriptor.
+    """Open a regular file for reading; return its descriptor.
 
     Raises
     ------
     MapDataError
-        ``missing``, ``unreadable``, or ``not_regular``: no pipe keeps the caller waiting.
+        ``missing``, ``unreadable``, or ``not_regular``; so a pipe never blocks the caller.
     """
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -37,7 +37,7 @@ def open_regular(path: str) -> int:
         raise refusal("missing", "no such file", path=path) from None
     except OSError as error:
         raise refusal("unreadable", f"cannot be opened: {error.strerror}", path=path) from error
-    except ValueError as error:  # a NUL in it
+    except ValueError as error:  # the path contains a NUL
         raise refusal("unreadable", f"cannot be opened: {error}", path=path) from error
     mode = os.fstat(fd).st_mode
     if not stat.S_ISREG(mode):
@@ -48,7 +48,7 @@ def open_regular(path: str) -> int:
 
 
 class FileReader:
-    """A reader that has a file open until it is closed, or its ``with`` block ends.
+    """A reader that keeps a file open until it is closed, or its ``with`` block ends.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class SourceFile:
             self._unreadable(error)
 
     def start(self, head: bytes) -> None:
-        """Digest ``head``, the first bytes of the file, and continue after it."""
+        """Digest ``head``, the first bytes of the file, and continue after them."""
         self.at = len(head)
         self._hash.reset()
         self._hash.update(head)

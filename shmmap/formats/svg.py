@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SVG pictures: a page, data on axes, rasters, legends and scale bars.
+"""Draw SVG pictures: a page, data on axes, rasters, legends and scale bars.
 
-A picture is one file without references.  Names of maps, files and clients stand in it, which may hold any
-character: every text and every attribute passes through `escape`.
+A picture is one file without references.  The names of maps, files and clients in it may contain any
+character, so every text and every attribute passes through `escape`.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ INK: Final = "#1f2933"
 PALE: Final = "#66727f"
 _RULE: Final = "#ced4da"
 _FONT: Final = "system-ui, DejaVu Sans, sans-serif"
-_LETTER_PX: Final = 7.6  # width of a letter of the usual size, on average
+_LETTER_PX: Final = 7.6  # average width of a letter of the usual size
 _LINE_PX: Final = 22.0
 _SYMBOL_PX: Final = 26.0
 _ENTRY_GAP_PX: Final = 18.0
-_SCALE_BAR_PX: Final = 180.0  # at most
-_SCALE_PX: Final = _SCALE_BAR_PX + 90.0  # with its label, and room before it
+_SCALE_BAR_PX: Final = 180.0  # maximum length
+_SCALE_PX: Final = _SCALE_BAR_PX + 90.0  # including its label and the space before it
 _MAX_RASTER: Final = 2400  # pixels along the longer side
 
 
 def escape(text: str) -> str:
-    """Return text for XML and HTML, as content or in double quotes.
+    """Escape text for XML and HTML, as content or in double quotes.
 
-    Characters that XML cannot hold or that do not print become backslash escapes; line breaks stay.
+    Characters that are invalid in XML or unprintable become backslash escapes; line breaks stay.
     """
     return saxutils.escape("\n".join(map(escaped, text.split("\n"))), {'"': "&quot;"})
 
@@ -66,7 +66,7 @@ def element(tag: str, content: str = "", /, **attributes: Attribute) -> str:
     Parameters
     ----------
     content
-        Markup inside; text has passed through `escape`.
+        Markup inside the element, whose text has passed through `escape`.
     **attributes
         ``stroke_width`` is the attribute ``stroke-width``, ``class_`` is ``class``; numbers have at most two
         decimals, None is left out.
@@ -81,22 +81,22 @@ def element(tag: str, content: str = "", /, **attributes: Attribute) -> str:
 
 
 def tooltip(text: str) -> str:
-    """Return the content of an element that shows a text while the pointer is over it; empty for no text."""
+    """Return the content of an element that shows a text under the pointer; empty for no text."""
     return element("title", escape(text)) if text else ""
 
 
 def swatch(**attributes: Attribute) -> str:
-    """Return the symbol of an area for a legend, attributes as `element`."""
+    """Return a legend's symbol for an area; attributes as in `element`."""
     return element("rect", **attributes, y=-11, width=16, height=13)
 
 
 def dash(**attributes: Attribute) -> str:
-    """Return the symbol of a line for a legend, attributes as `element`."""
+    """Return a legend's symbol for a line; attributes as in `element`."""
     return element("path", **attributes, d="M0 -5h19")
 
 
 def box_around(places: Sequence[Place]) -> BoxTuple:
-    """Return the box around all places, one unit a side or larger; at the origin if there are none."""
+    """Return the box around all places, at least one unit a side; at the origin if there are none."""
     x, y = zip(*places, strict=True) if places else ((0.0,), (0.0,))
     return min(x), min(y), max(*x, min(x) + 1.0), max(*y, min(y) + 1.0)
 
@@ -106,16 +106,16 @@ def _number(value: float) -> str:
 
 
 class Page:
-    """A white page that is filled from top to bottom; lengths in pixels, y downwards.
+    """A white page, filled from top to bottom; lengths in pixels, y downwards.
 
     Parameters
     ----------
     width
-        Of the whole page.
+        Width of the whole page.
     title
-        What programs call the picture; a reader sees it where `heading` writes it.
+        Title in the file's metadata; `heading` writes a visible one.
     margin
-        Left and right of what stands in lines.
+        Space left and right of lines of text.
     style
         CSS for the ``class_`` of elements.
     """
@@ -130,7 +130,7 @@ class Page:
         self.add("rect", width="100%", height="100%", fill="#ffffff")
 
     def svg(self, height: float) -> str:
-        """Return the file's text; ``height`` is that of the whole page."""
+        """Return the file's text; ``height`` is the height of the whole page."""
         content = "\n".join(["", *self._parts, ""])
         width, height = round(self.width), round(height)
         size: dict[str, Attribute] = {"width": width, "height": height, "viewBox": f"0 0 {width} {height}"}
@@ -143,14 +143,14 @@ class Page:
 
     @contextlib.contextmanager
     def group(self, **attributes: Attribute) -> Iterator[None]:
-        """Put what is added inside the context into one group."""
+        """Put everything added inside the context into one group."""
         before, self._parts = self._parts, []
         yield
         before.append(element("g", "\n".join(["", *self._parts, ""]), **attributes))
         self._parts = before
 
     def text(self, x: float, y: float, text: str, /, **attributes: Attribute) -> None:
-        """Write one line; ``y`` is its base line."""
+        """Write one line of text with its baseline at ``y``."""
         self.add("text", escape(text), **attributes, x=x, y=y)
 
     def heading(self, y: float, title: str, note: str = "") -> None:
@@ -160,23 +160,23 @@ class Page:
             self.text(self.margin, y + _LINE_PX, note, fill=PALE)
 
     def image(self, png: bytes, /, **attributes: Attribute) -> None:
-        """Embed a PNG; ``x``, ``y``, ``width`` and ``height`` are among the attributes."""
+        """Embed a PNG; the attributes include ``x``, ``y``, ``width`` and ``height``."""
         data = base64.b64encode(png).decode("ascii")
         self.add("image", **attributes, preserveAspectRatio="none", href=f"data:image/png;base64,{data}")
 
     def legend(
         self, y: float, entries: Iterable[tuple[str, str]], *, left: float = 0.0, spare: float = 0.0
     ) -> float:
-        """Write what symbols mean, in as many lines as needed; return the base line of the last.
+        """Write a legend in as many lines as needed; return the baseline of the last.
 
         Parameters
         ----------
         y
-            Base line of the first.
+            Baseline of the first line.
         entries
-            Symbols as `swatch` and `dash` return them, and texts.
+            Pairs of a symbol, as returned by `swatch` or `dash`, and its text.
         left, spare
-            Length of the lines' beginnings and ends that stays free, between the margins.
+            Widths kept free at the start and end of the lines, inside the margins.
         """
         start = self.margin + left
         x = start
@@ -192,16 +192,16 @@ class Page:
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """A rectangle of a page with data on it: x to the right, y upwards, both linear.
+    """A rectangle of a page that shows data: x to the right, y upwards, both linear.
 
     Parameters
     ----------
     page
-        What is drawn on.
+        The page.
     box
-        Values at the rectangle's edges: min_x, min_y, max_x, max_y.
+        Data values at the rectangle's edges: min_x, min_y, max_x, max_y.
     left, top, width, height
-        Where the rectangle is, pixels.
+        Position and size of the rectangle, pixels.
     """
 
     page: Page
@@ -213,12 +213,12 @@ class Axes:
 
     @classmethod
     def fitted(cls, page: Page, box: BoxTuple, top: float, max_height: float) -> Axes:
-        """Make axes with one scale for x and y: as large as fits, in the middle of the page.
+        """Return axes with one scale for x and y: as large as fits, centred on the page.
 
         Parameters
         ----------
         top, max_height
-            Where there is room, pixels: from one margin of the page to the other.
+            Vertical space available, pixels; horizontally it is from margin to margin.
         """
         max_width = page.right - page.margin
         span_x, span_y = max(box[2] - box[0], 1e-9), max(box[3] - box[1], 1e-9)
@@ -237,7 +237,7 @@ class Axes:
         return self.width / max(self.box[2] - self.box[0], 1e-9)
 
     def place(self, x: float, y: float) -> Place:
-        """Return where on the page a value is, pixels."""
+        """Return the position of a value on the page, pixels."""
         min_x, min_y, max_x, max_y = self.box
         return (
             self.left + (x - min_x) / max(max_x - min_x, 1e-9) * self.width,
@@ -245,17 +245,17 @@ class Axes:
         )
 
     def points(self, places: Iterable[Place]) -> str:
-        """Return an attribute ``points`` of these values, without those that are not finite."""
+        """Return an attribute ``points`` with the places, without those that are not finite."""
         pixels = (self.place(x, y) for x, y in places if math.isfinite(x) and math.isfinite(y))
         return " ".join(f"{_number(x)},{_number(y)}" for x, y in pixels)
 
     def line(self, places: Iterable[Place], /, **attributes: Attribute) -> None:
-        """Draw a line through these values."""
+        """Draw a line through places."""
         if points := self.points(places):
             self.page.add("polyline", **attributes, points=points, fill="none", stroke_linejoin="round")
 
     def dot(self, x: float, y: float, radius: float, content: str = "", /, **attributes: Attribute) -> None:
-        """Draw a circle, its radius in pixels."""
+        """Draw a circle; its radius is in pixels."""
         at_x, at_y = self.place(x, y)
         self.page.add("circle", content, **attributes, cx=at_x, cy=at_y, r=radius)
 
@@ -264,7 +264,7 @@ class Axes:
         self.page.add("rect", content, **attributes, **self._extent(box))
 
     def rectangles(self, boxes: Iterable[BoxTuple], /, **attributes: Attribute) -> None:
-        """Draw boxes that look the same, as one element."""
+        """Draw boxes of one style, as one element."""
         steps = []
         for box in boxes:
             x, y, width, height = map(_number, self._extent(box).values())
@@ -277,15 +277,15 @@ class Axes:
         self.page.image(png, **self._extent(box))
 
     def raster(self, layers: Sequence[tuple[NDArray[np.int64], Any]], pixel: float) -> None:
-        """Draw squares of one size as one image; of several at one place the last is seen.
+        """Draw equal squares as one image; of several at one place the last is visible.
 
         Parameters
         ----------
         layers
-            Squares, (N, 2): square (i, j) has its lower left corner at i and j times ``pixel``; and their
-            RGBA colours, (N, 4) or one for all.
+            Squares (N, 2) and their RGBA colours, (N, 4) or one for all.  Square (i, j) has its lower left
+            corner at i and j times ``pixel``.
         pixel
-            Side of a square, in units of the data.  Where there would be too many pixels they are larger.
+            Side of a square, in units of the data.  Enlarged if there would be too many pixels.
         """
         squares = np.concatenate([places for places, _ in layers])
         if not len(squares):
@@ -305,7 +305,7 @@ class Axes:
 
     @contextlib.contextmanager
     def clipped(self) -> Iterator[None]:
-        """Cut off at the rectangle's edges what is drawn inside the context."""
+        """Clip what is drawn inside the context to the rectangle."""
         self.page.add("clipPath", element("rect", **self._extent(self.box)), id="axes")
         with self.page.group(clip_path="url(#axes)"):
             yield
@@ -317,7 +317,7 @@ class Axes:
         x_labels: Iterable[tuple[float, str]] = (),
         y_labels: Iterable[tuple[float, str]] = (),
     ) -> None:
-        """Draw a chart's title, its base line, and labels of values below and to the left of it."""
+        """Draw a chart's title, baseline, and labels of values below and to the left of the chart."""
         small: dict[str, Attribute] = {"font_size": 12, "fill": PALE}
         self.page.text(self.left, self.top - 9, title, **small)
         self.page.add(
@@ -329,12 +329,12 @@ class Axes:
             self.page.text(self.left - 7, self.place(0, value)[1] + 4, text, text_anchor="end", **small)
 
     def scale_bar(self, y: float) -> None:
-        """Draw a bar of 1, 2 or 5 times a power of ten metres at the right, with its label to the left.
+        """Draw a scale bar of 1, 2 or 5 times a power of ten metres at the right, its label to the left.
 
         Parameters
         ----------
         y
-            Base line of the label.
+            Baseline of the label.
         """
         right = self.page.right
         longest = _SCALE_BAR_PX / self.scale

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain text clouds, a point a line: XYZ in its variants, PTS, and tables with named columns (TXT, CSV, ASC).
+"""Read plain text clouds, one point a line: XYZ variants, PTS, and tables with named columns (TXT, CSV, ASC).
 
 Values are separated by white space, commas or semicolons.  Columns are named by a header, a comment or the
-first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``); without one x, y and z come
-first, and what the others are follows from their number, which is said.  All values are float64.
+first line (``//X Y Z I R G B``, ``# x y z intensity``, ``x,y,z,ring``); Without names x, y and z are the
+first three, the others are guessed from their number, and a warning reports the guess.  All values are
+float64.
 """
 
 from __future__ import annotations
@@ -29,26 +30,26 @@ __all__ = ["TABLE_SUFFIXES", "TEXT_SUFFIXES", "TextReader"]
 
 TEXT_SUFFIXES: Final = (".pts", ".xyz", ".xyzn", ".xyzrgb")
 TABLE_SUFFIXES: Final = (".txt", ".csv", ".asc")
-"""Read where they are named; in a directory they may be anything."""
+"""Endings that are read if the file is named; in a directory such files may be anything."""
 
-_HEAD_BYTES: Final = 1 << 16  # the first point must begin within these
+_HEAD_BYTES: Final = 1 << 16  # the first point must begin within this
 _COMMENT: Final = re.compile(rb"(?m)^[ \t]*(?:#|//|%)[^\r\n]*")
 _NO_ROW: Final = re.compile(rb"(?m)^[ \t\r\v\f]*(?:$|#|//|%)")
 _UNIT: Final = re.compile(r"[\[(].*")
 _NORMALS: Final = ("nx", "ny", "nz")
 _COLOURS: Final = ("red", "green", "blue")
 _UNNAMED: Final = {1: ("intensity",), 3: _COLOURS, 4: ("intensity", *_COLOURS)}
-"""Names of the columns after x, y and z, by how many there are, as in PTS files."""
+"""Names of the columns after x, y and z, by their number, as in PTS files."""
 _NORMAL_LENGTHS: Final = (0.99, 1.01)
-_LOOKED_AT: Final = 32  # rows
+_LOOKED_AT: Final = 32  # rows to look at
 _SHOWN: Final = 60
 
 
 @dataclass(slots=True)
 class _Layout:
-    """How the file is laid out, as its first lines show.
+    """The layout of a file, found from its first lines.
 
-    ``names`` are those of the columns, x, y and z among them; ``separator`` is empty for white space.
+    ``names`` are the columns' names, including x, y and z; ``separator`` is empty for white space.
     """
 
     names: list[str]
@@ -60,7 +61,7 @@ class _Layout:
 
 
 class TextReader(FileReader):
-    """A text file, opened, its first lines understood and its points counted.
+    """A text file, opened, its layout known and its points counted.
 
     Attributes
     ----------
@@ -75,7 +76,7 @@ class TextReader(FileReader):
     ------
     MapDataError
         ``bad_row``, ``no_xyz``, ``bad_header``, ``truncated`` and the causes of files that cannot be opened,
-        with the byte offset and, of a row, its line.
+        with the byte offset and, for a row, its line.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -112,7 +113,7 @@ class TextReader(FileReader):
         Raises
         ------
         MapDataError
-            ``bad_row``: not the first row's number of values, or one that is no number.
+            ``bad_row``: the number of values differs from the first row's, or a value is no number.
         """
         parser = RowParser(self.path, self._table, self._line_at)
         names = [spec.name for spec in self.columns]
@@ -136,12 +137,12 @@ class TextReader(FileReader):
         return whole_lines(self._source, bare_cr=self._bare_cr)
 
     def _rows(self, text: bytes) -> int:
-        """Lines of ``text`` that have a point."""
+        """Return the number of lines in ``text`` that contain a point."""
         body = text.removesuffix(b"\n")
         return body.count(b"\n") + 1 - sum(1 for _ in _NO_ROW.finditer(body))
 
     def _plain(self, parser: RowParser, text: bytes, offset: int) -> bytes:
-        """Return as many bytes with the same values, separated by spaces, and comments after ``#``."""
+        """Return the text at equal length with values separated by spaces, and comments after ``#``."""
         if b"#" in text or b"//" in text or b"%" in text:
             text = _COMMENT.sub(lambda found: b"#".ljust(len(found.group())), text)
         separator = self._layout.separator
@@ -173,7 +174,7 @@ class TextReader(FileReader):
             )
 
     def _line_at(self, offset: int) -> int:
-        """Return the number, counted from 1, of the line that begins at a byte of the file."""
+        """Return the number, counted from 1, of the line that begins at a byte offset."""
         line, at = 1, 0
         newline = b"\r" if self._bare_cr else b"\n"
         while part := os.pread(self._fd, min(_HEAD_BYTES, offset - at), at):
@@ -183,7 +184,7 @@ class TextReader(FileReader):
 
 
 class _Lines:
-    """The first lines of a file: comments, a count, names, the first row of numbers."""
+    """Parser of a file's first lines: comments, a count, names, the first row of numbers."""
 
     def __init__(self, head: bytes, path: str, suffix: str, file_bytes: int) -> None:
         self.head = head
@@ -192,7 +193,7 @@ class _Lines:
         self.file_bytes = file_bytes
 
     def layout(self) -> _Layout:
-        """Find out how the file is laid out."""
+        """Return the file's layout."""
         if not self.head:
             raise self._error("empty_file", "the file is empty (0 bytes)", 0)
         if self.head.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -236,7 +237,7 @@ class _Lines:
         return refusal(cause, message, path=self.path, offset=offset, hint=hint)
 
     def _of_row(self, text: bytes, start: int) -> _Layout:
-        """Find out what separates the values of the first row, and their number."""
+        """Return the separator and the number of values of the first row."""
         separator = b";" if b";" in text else b"," if b"," in text else b""
         words = text.split(separator or None)
         trailing = bool(separator) and not words[-1].strip()
@@ -259,7 +260,7 @@ class _Lines:
         return _Layout([""] * len(words), start, separator, trailing)
 
     def _name(self, layout: _Layout, comments: list[bytes], named: bytes, named_at: int) -> None:
-        """Name the columns: by the line before the rows, by a comment, else by their number."""
+        """Name the columns: from the line before the rows, a comment, or their number."""
         count = len(layout.names)
         for text in (named, *comments[::-1]):
             if text and (names := _header_names(text, layout.separator, count)):
@@ -284,7 +285,7 @@ class _Lines:
             layout.guess = f"no header names the columns: after x, y and z they are taken as {taken}"
 
     def _normals(self, layout: _Layout) -> bool:
-        """Whether columns 4 to 6 of the first rows are vectors of length 1, not all along an axis."""
+        """Whether columns 4 to 6 of the first rows are unit vectors, not all along an axis."""
         if self.suffix == ".xyzrgb":
             return False
         vectors = []
@@ -299,7 +300,7 @@ class _Lines:
 
 
 def _header_names(text: bytes, separator: bytes, count: int) -> list[str]:
-    """Return ``count`` names out of a header, x, y and z among them; none where it does not name them."""
+    """Return ``count`` names from a header, including x, y and z; none if it does not name them."""
     plain = text.decode("utf-8", "replace").strip()
     mark = separator.decode()
     words = plain.split(mark) if mark and mark in plain else re.split(r"[\s,;]+", plain)

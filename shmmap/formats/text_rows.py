@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines of numbers into columns: the points of ascii PCD and PLY files, and of plain text clouds.
+"""Parse lines of numbers into columns: points of ascii PCD, PLY, and plain text clouds.
 
 Integers are parsed as integers, so 64-bit values are exact; float64 is correctly rounded; float32
 is the correctly rounded float64, rounded once more.
@@ -30,9 +30,9 @@ NUMBER: Final = re.compile(
 
 
 def whole_lines(source: SourceFile, *, bare_cr: bool = False) -> Iterator[tuple[int, bytes]]:
-    """Yield (offset, text) with whole lines of the rest of the file; the last may lack its newline.
+    """Yield (offset, text) of whole lines from the rest of the file; the last may lack its newline.
 
-    ``bare_cr`` makes LF of each CR.
+    ``bare_cr`` replaces each CR by LF.
     """
     carry = b""
     while source.left:
@@ -53,15 +53,15 @@ def whole_lines(source: SourceFile, *, bare_cr: bool = False) -> Iterator[tuple[
 
 
 def line_ends(text: bytes) -> NDArray[np.intp]:
-    """Offsets just after each line of ``text``, whose last line may lack its newline."""
+    """Return offsets just after each line of ``text``, whose last line may lack its newline."""
     ends = np.flatnonzero(np.frombuffer(text, np.uint8) == 0x0A) + 1
     return ends if text.endswith(b"\n") else np.append(ends, len(text))
 
 
 class RowParser:
-    """Turns whole lines into columns.
+    """Parses whole lines into columns.
 
-    Errors name a row by its number, or, with ``line_at``, the line at a byte of the file.
+    Errors report the row's number, or with ``line_at`` the line at a byte of the file.
     """
 
     def __init__(self, path: str, table: FieldTable, line_at: Callable[[int], int] | None = None) -> None:
@@ -82,7 +82,7 @@ class RowParser:
     def parse(self, text: bytes, offset: int, tokens: list[bytes] | None = None) -> tuple[NDArray[Any], ...]:
         """Return the columns of the points in ``text``, which starts at byte ``offset`` of the file.
 
-        ``tokens`` are the values of its lines where not all words of a line are values of a column.
+        ``tokens`` are the values to parse, if lines also contain words that belong to no column.
         """
         if tokens is None:
             tokens = text.split()
@@ -90,7 +90,7 @@ class RowParser:
                 tokens = self._tokens_line_by_line(text, offset)
         rows = len(tokens) // self.values
         try:
-            # Python's own literals may have underscores, numbers in files not
+            # Python's literals may contain underscores, numbers in files may not
             block = self._columns(tokens, rows, fast=b"_" not in text)
         except _BadTokenError as bad:
             raise self._bad_row(text, offset, bad) from None
@@ -98,7 +98,7 @@ class RowParser:
         return block
 
     def count_surplus(self, text: bytes) -> None:
-        """Count what follows the last point: blank and comment lines are no surprise there either."""
+        """Count rows after the last point, ignoring blank and comment lines."""
         for line in text.splitlines():
             words = line.split()
             if words and not words[0].startswith(b"#"):
@@ -107,7 +107,7 @@ class RowParser:
                 self.skipped += 1
 
     def _regular(self, text: bytes, tokens: int) -> bool:
-        """Whether every line holds exactly the right number of values: checked without a loop."""
+        """Whether every line has exactly the right number of values, checked without a loop."""
         codes = np.frombuffer(text, np.uint8)
         space = (codes == 0x20) | ((codes - np.uint8(9)) < 5)
         starts = ~space
@@ -136,7 +136,7 @@ class RowParser:
                 tokens += words
             at += len(line) + 1
         if not text or text.endswith(b"\n"):
-            self.skipped -= 1  # what follows the last newline is no line
+            self.skipped -= 1  # text after the last newline is no line
         return tokens
 
     def _columns(self, tokens: list[bytes], rows: int, *, fast: bool) -> tuple[NDArray[Any], ...]:
@@ -155,7 +155,7 @@ class RowParser:
         return block
 
     def _bad_row(self, text: bytes, offset: int, bad: _BadTokenError) -> MapDataError:
-        """Find the line of the bad value, for the message."""
+        """Return the error for a bad value, with its line."""
         at, row = offset, 0
         for line in text.split(b"\n"):
             words = line.split()
@@ -204,10 +204,10 @@ def _parse(words: list[bytes], dtype: np.dtype[Any], *, fast: bool) -> NDArray[A
 def _parse_fast(
     words: list[bytes], convert: Callable[[bytes], Any], dtype: np.dtype[Any]
 ) -> NDArray[Any] | None:
-    """Parse all words by one built-in function, or return None if one of them is unusual."""
+    """Parse all words with one built-in function; return None if a word is unusual."""
     try:
         if dtype.kind == "u":
-            # numpy before 2 takes -1 for 2**64 - 1; an array refuses it
+            # numpy before 2 accepts -1 for 2**64 - 1; an array refuses it
             return np.asarray(array("Q", map(convert, words)))
         return np.fromiter(map(convert, words), dtype, len(words))
     except (ValueError, OverflowError):
@@ -221,7 +221,7 @@ def _number(row: int, word: bytes, dtype: np.dtype[Any]) -> float:
 
 
 def _integer(row: int, word: bytes, dtype: np.dtype[Any], limits: np.iinfo[Any]) -> int:
-    """Parse one integer; ``3.0`` and ``4.2e6`` are integers too, some writers print them so."""
+    """Parse one integer; ``3.0`` and ``4.2e6`` count as integers, since some writers print them so."""
     if not NUMBER.match(word):
         raise _BadTokenError(row, word, dtype)
     try:

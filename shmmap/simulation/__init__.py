@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A generated town, and a simulated LiDAR that drives through it."""
+"""Generate a town, and simulate a LiDAR that drives through it."""

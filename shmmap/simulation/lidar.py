@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated LiDAR, and its scans of a drive through a generated town, with the true poses.
+"""Simulate a LiDAR, and its scans with true poses on a drive through a generated town.
 
-The LiDAR looks at a dense cloud, with occlusion, drop-out and noise: each ray returns the nearest point in
-its aperture.  There are no mixed pixels and no motion distortion, and what the cloud does not hold is not
-seen; so the cloud should be several times denser than the rays.  Cars and people move beside the drive.
+The LiDAR scans a dense cloud, with occlusion, drop-out and noise: each ray returns the nearest point in its
+aperture.  There are no mixed pixels and no motion distortion.  Gaps in the cloud are invisible to the LiDAR,
+so the cloud should be several times denser than the rays.  Cars and people move beside the drive.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ __all__ = ["Lidar", "LidarDrive", "LidarReturns", "LidarScan", "Traffic"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarReturns:
-    """One scan.
+    """The returns of one scan.
 
     Attributes
     ----------
     xyz
         (N, 3) float32, sensor frame, metres.
     ring
-        (N,) uint8: 0 is the lowest.
+        (N,) uint8, index of the ring: 0 is the lowest.
     source
         (N,) int64: row of the cloud that each return came from.
     """
@@ -49,15 +49,15 @@ class Lidar:
     Attributes
     ----------
     rings
-        Rays above one another.
+        Number of rings, one above another.
     lowest_deg, highest_deg
         Elevation of the first and the last ring.
     azimuth_deg
-        Between rays of a ring.
+        Angle between rays of a ring.
     nearest, farthest
-        Metres; nothing is returned from nearer or farther.
+        Range limits, metres: nearer or farther points give no return.
     noise
-        Of the range, one standard deviation, metres.
+        Standard deviation of the range, metres.
     dropout
         Share of rays without a return.
     """
@@ -74,10 +74,10 @@ class Lidar:
     def scan(
         self, cloud: NDArray[Any], T_map_sensor: NDArray[np.float64], rng: np.random.Generator
     ) -> LidarReturns:
-        """Look at a cloud, (N, 3), metres, map frame."""
+        """Scan a cloud (N, 3), metres, map frame."""
         R = T_map_sensor[:3, :3]
         away = [cloud[:, axis].astype(np.float64) - T_map_sensor[axis, 3] for axis in range(3)]
-        # column by column: several times faster than a product of matrices as narrow as these
+        # column by column: several times faster than a product of such narrow matrices
         x, y, z = (away[0] * R[0, axis] + away[1] * R[1, axis] + away[2] * R[2, axis] for axis in range(3))
         distance = np.sqrt(x * x + y * y + z * z)
         near = np.flatnonzero((distance > self.nearest) & (distance < self.farthest))
@@ -93,21 +93,21 @@ class Lidar:
         nearest = np.full(self.rings * columns + 1, np.inf)
         np.minimum.at(nearest, ray, distance)
         hit = np.flatnonzero(distance == nearest[ray])
-        hit = hit[np.unique(ray[hit], return_index=True)[1]]  # of equally near ones the first
+        hit = hit[np.unique(ray[hit], return_index=True)[1]]  # of equally near points the first
         hit = hit[seen[hit] & (rng.random(len(hit)) >= self.dropout)]
         scale = 1.0 + self.noise * rng.standard_normal(len(hit)) / distance[hit]
         xyz = (np.column_stack((x[hit], y[hit], z[hit])) * scale[:, None]).astype(np.float32)
         return LidarReturns(xyz, ring[hit].astype(np.uint8), near[hit])
 
 
-_SENSOR_METRES: Final = 1.8  # above the ground
+_SENSOR_METRES: Final = 1.8  # height of the sensor above the ground
 _LIDAR: Final = Lidar(rings=40, azimuth_deg=0.4, farthest=60.0)
 _ODOMETRY_DISTANCE: Final = 1.01
 _ODOMETRY_TURN: Final = 1.02
 _CAR: Final = (4.4, 1.8, 1.5)  # length, width, height, metres
 _PERSON: Final = (0.5, 0.5, 1.75)
-_ONCOMING_METRES: Final = 3.2  # from the drive's lane to the other one
-_PAVEMENT_METRES: Final = 4.5  # from the drive's lane to where people walk
+_ONCOMING_METRES: Final = 3.2  # from the drive's lane to the opposite lane
+_PAVEMENT_METRES: Final = 4.5  # from the drive's lane to the pavement
 _CAR_GAP: Final = 18.0
 _PERSON_GAP: Final = 11.0
 _CAR_SPEED: Final = 8.0
@@ -116,20 +116,20 @@ _PERSON_SPEED: Final = 1.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LidarScan:
-    """One scan and the truth about it.
+    """One scan, with its true pose and labels.
 
     Attributes
     ----------
     stamp_s
-        Since the start of the drive.
+        Seconds since the start of the drive.
     T_map_sensor
         (4, 4) float64, metres.
     xyz
         (N, 3) float32, sensor frame, metres.
     ring
-        (N,) uint8: 0 is the lowest.
+        (N,) uint8, index of the ring: 0 is the lowest.
     moving
-        (N,) uint8: 1 for a point of what moves.
+        (N,) uint8: 1 for points on moving objects.
     """
 
     stamp_s: float
@@ -141,23 +141,23 @@ class LidarScan:
 
 @dataclass(frozen=True, slots=True)
 class LidarDrive:
-    """A drive, and what the LiDAR on the roof is like.
+    """A drive, and the properties of the LiDAR on the vehicle's roof.
 
     Attributes
     ----------
     town
-        Where.
+        Town of the drive.
     length, step
-        Of the drive, and between scans, metres.
+        Length of the drive, and distance between scans, metres.
     speed
-        Metres per second.
+        Speed of the vehicle, metres per second.
     lidar
-        Its ``farthest`` bounds what is simulated at all.
+        The LiDAR; its ``farthest`` limits the simulated surroundings.
     density
-        Of the surfaces that the LiDAR sees, points per square metre.  They are the map's, but other
-        points of them: no scan holds the map's own.
+        Points per square metre on the surfaces that the LiDAR scans.  The surfaces are those of the map, but
+        the points on them differ, so that no scan contains points of the map.
     seed
-        Of the traffic and of the LiDAR's noise.
+        Random seed of the traffic and of the LiDAR's noise.
     """
 
     town: Town
@@ -169,7 +169,7 @@ class LidarDrive:
     seed: int = 0
 
     def poses(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
-        """Time (seconds) and T_map_sensor of every scan."""
+        """Yield time (seconds) and T_map_sensor of every scan."""
         route = self.town.route(length=self.length, step=self.step)
         heights = self.town.ground_height(route[:, 0], route[:, 1]) + _SENSOR_METRES
         for number, ((x, y, heading), z) in enumerate(zip(route.tolist(), heights.tolist(), strict=True)):
@@ -179,9 +179,9 @@ class LidarDrive:
             yield number * self.step / self.speed, T
 
     def odometry(self) -> Iterator[tuple[float, NDArray[np.float64]]]:
-        """Time and pose of every scan as wheels would measure it, from the first scan's, which is unit.
+        """Yield time and odometry pose of every scan, relative to the first scan's pose.
 
-        Distances are 1 % too long, turns 2 % too wide.
+        Wheel odometry with errors: distances are 1 % too long, turns 2 % too wide.
         """
         before, T_odom = np.eye(4), np.eye(4)
         for number, (stamp_s, T) in enumerate(self.poses()):
@@ -196,7 +196,7 @@ class LidarDrive:
             yield stamp_s, T_odom
 
     def scans(self) -> Iterator[LidarScan]:
-        """Take one scan after the other."""
+        """Yield the scans one by one."""
         reach, town = self.lidar.farthest, self.town
         traffic = Traffic(town, town.route(length=self.length + reach, step=self.step), seed=self.seed)
         seen = Town(seed=town.seed, blocks=town.blocks, origin=town.origin, density=self.density)
@@ -214,7 +214,7 @@ class LidarDrive:
             yield LidarScan(stamp_s, T, returns.xyz, returns.ring, moving)
 
     def _blocks(self, x: float, y: float) -> list[tuple[int, int]]:
-        """Blocks that the LiDAR reaches from a place."""
+        """Return the blocks within the LiDAR's range of a place."""
         reach = self.lidar.farthest
         spans = [
             range(
@@ -227,16 +227,16 @@ class LidarDrive:
 
 
 class Traffic:
-    """Cars that come towards a drive on its other lane, and people on the pavement beside it.
+    """Cars on the opposite lane of a drive, and people on the pavement beside it.
 
     Parameters
     ----------
     town
-        Where.
+        Town of the drive.
     route
-        (N, 3) as `Town.route` gives it.
+        (N, 3) as returned by `Town.route`.
     seed
-        Which traffic.
+        Random seed of the traffic.
     density
         Points per square metre of surface.
     """
@@ -256,7 +256,7 @@ class Traffic:
         self._person = _box(rng, _PERSON, density)
 
     def points(self, time_s: float) -> NDArray[np.float64]:
-        """Points of everything that moves, at a time, (N, 3) float64, map frame, metres."""
+        """Return the points of all moving objects at a time, (N, 3) float64, map frame, metres."""
         parts = [
             self._placed(self._car, at - _CAR_SPEED * time_s, -_ONCOMING_METRES, 0.25) for at in self._cars
         ]
@@ -284,13 +284,13 @@ class Traffic:
 
 
 def _spread(rng: np.random.Generator, length: float, gap: float) -> NDArray[np.float64]:
-    """Places along a length, about a gap apart, metres."""
+    """Return random places along a length, about ``gap`` apart, metres."""
     places = np.arange(0.0, length, gap)
     return places + rng.uniform(-0.25 * gap, 0.25 * gap, len(places))
 
 
 def _box(rng: np.random.Generator, size: tuple[float, float, float], density: float) -> NDArray[np.float64]:
-    """Points on the sides and the top of a box that stands on the ground, its middle at the origin."""
+    """Return points on the sides and the top of a box that stands on the ground, centred at the origin."""
     length, width, height = size
     sides = ((length, 0, -width / 2), (length, 0, width / 2), (width, 1, -length / 2), (width, 1, length / 2))
     parts = []

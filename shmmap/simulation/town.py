@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A seeded town of any size as a point-cloud map: hills, streets, buildings, trees, lamps and walls.
 
-Generated tile by tile (one block of 80 m each), every tile by itself and always the same for a seed,
-so a map of any size needs the memory of one tile, and its tiles can be made in any order.
+Each tile (one block of 80 m) is generated independently, and is always the same for a seed.  So a map of any
+size needs the memory of one tile, and its tiles can be made in any order.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from shmmap.simulation.town_surfaces import BLOCK_METRES, ROAD_HALF_METRES, Grou
 __all__ = ["Town", "drive"]
 
 _GROUND_NOISE_METRES = 0.015
-_FOOTPRINT_METRES = 0.25  # raster in which buildings hide the ground
+_FOOTPRINT_METRES = 0.25  # cells of the raster in which buildings hide the ground
 _ASPHALT, _PAINT, _PAVING, _GRASS = 22.0, 130.0, 48.0, 72.0
-_LANE_METRES = 1.5  # right of the centre line
+_LANE_METRES = 1.5  # offset to the right of the centre line
 _TURN_METRES = 6.0  # radius of a corner, on the centre line
 _HEADINGS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 class Town:
-    """A generated town; the same for the same arguments (and numpy version).
+    """A generated town; the same arguments (and numpy version) give the same town.
 
     Parameters
     ----------
     seed
-        Which town.
+        Random seed of the town.
     blocks
-        How many blocks of 80 m in x and in y.
+        Number of 80 m blocks in x and in y.
     origin
         Map coordinates of the town's lower left corner, metres, multiples of 20: blocks then consist
         of whole 20 m cells.
@@ -48,7 +48,7 @@ class Town:
     Raises
     ------
     BadRequest
-        An argument makes no sense.
+        An argument is invalid.
     """
 
     def __init__(
@@ -80,16 +80,16 @@ class Town:
         return x, y, x + self.blocks[0] * BLOCK_METRES, y + self.blocks[1] * BLOCK_METRES
 
     def ground_height(self, x: Any, y: Any) -> NDArray[np.float64]:
-        """Height of the ground at map coordinates (metres, any equal shapes), metres, float64.
+        """Return the height of the ground at map coordinates (metres, any equal shapes), metres, float64.
 
-        Ground points scatter about it by 15 mm (one standard deviation), and no more than float32
-        rounding of x and y allows on top.
+        Ground points scatter about this height with a standard deviation of 15 mm, plus the effect of
+        rounding x and y to float32.
         """
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         return self._ground.height(x - self.origin[0], y - self.origin[1])
 
     def route(self, *, length: float = 1000.0, step: float = 1.0) -> NDArray[np.float64]:
-        """Poses of a drive through the streets, every ``step`` metres, (N, 3) float64.
+        """Return poses of a drive through the streets, every ``step`` metres, (N, 3) float64.
 
         x and y in metres, map frame; heading in radians counter-clockwise from +x, not wrapped.
         """
@@ -100,13 +100,13 @@ class Town:
         return poses
 
     def tiles(self) -> Iterator[dict[str, NDArray[np.float32]]]:
-        """Columns of every tile in turn, see `tile`."""
+        """Yield the columns of every tile, see `tile`."""
         for by in range(self.blocks[1]):
             for bx in range(self.blocks[0]):
                 yield self.tile(bx, by)
 
     def tile(self, bx: int, by: int) -> dict[str, NDArray[np.float32]]:
-        """Points of one block: ``xyz`` (N, 3) float32, metres, map frame; ``intensity`` (N,) float32, 0..255.
+        """Return one block: ``xyz`` (N, 3) float32, metres, map frame; ``intensity`` (N,) float32, 0..255.
 
         All points lie in the block's half-open square.
         """
@@ -155,7 +155,7 @@ class Town:
         row = np.minimum((y / _FOOTPRINT_METRES).astype(np.int32), last)
         seen = ~hidden[row, column]
         x, y = x[seen], y[seen]
-        # the height belongs to where the point ends up after rounding to float32
+        # the height at the point's place after rounding to float32
         map_x, map_y = (self._rounded(local, corner, axis) for axis, local in enumerate((x, y)))
         z = self._ground.height(map_x, map_y)
         z += _GROUND_NOISE_METRES * rng.standard_normal(len(z), dtype=np.float32)
@@ -173,13 +173,13 @@ class Town:
     def _rounded(
         self, local: NDArray[np.float32], corner: NDArray[np.float64], axis: int
     ) -> NDArray[np.float64]:
-        """Town coordinates of tile coordinates, rounded as `_placed` does."""
+        """Return town coordinates of tile coordinates, rounded as in `_placed`."""
         start = float(corner[axis]) + self.origin[axis]
         town: NDArray[np.float64] = (local + start).astype(np.float32).astype(np.float64) - self.origin[axis]
         return town
 
     def _above_ground(self, xyz: NDArray[np.float32], corner: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which points are not buried (walls reach below the ground of a slope)."""
+        """Return a mask of the points above ground (walls reach below the ground of a slope)."""
         xs = np.linspace(0.0, BLOCK_METRES, 9)
         highest = float(self._ground.terrain(corner[0] + xs, corner[1] + xs[:, None]).max()) + 1.0
         seen = np.ones(len(xyz), dtype=np.bool_)
@@ -189,7 +189,7 @@ class Town:
         return seen
 
     def _placed(self, xyz: NDArray[np.float32], corner: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Map coordinates, kept inside the tile whatever rounding does at its far sides."""
+        """Return map coordinates, kept inside the tile despite rounding at its far sides."""
         placed: NDArray[np.float32] = xyz.copy()
         for axis in range(2):
             start = float(corner[axis]) + self.origin[axis]
@@ -199,7 +199,7 @@ class Town:
 
 
 def _footprints(surfaces: Surfaces) -> NDArray[np.bool_]:
-    """Raster of the tile, row by row, True where a building hides the ground."""
+    """Return a raster of the tile, row by row, True where a building hides the ground."""
     side = round(BLOCK_METRES / _FOOTPRINT_METRES)
     hidden = np.zeros((side, side), dtype=np.bool_)
     for x, y, half_x, half_y, yaw in surfaces.footprints:
@@ -219,10 +219,10 @@ def _footprints(surfaces: Surfaces) -> NDArray[np.bool_]:
 
 
 def drive(seed: int, blocks: tuple[int, int], length: float, step: float) -> NDArray[np.float64]:
-    """Drive through the street grid, on the right, round the corners in arcs; ``length`` metres at least.
+    """Return a drive on the right of the streets, with arcs at corners; at least ``length`` metres.
 
-    Returns poses every ``step`` metres, (N, 3) float64: x, y in town coordinates, metres; heading in
-    radians counter-clockwise from +x, continuous (not wrapped).
+    The poses are ``step`` metres apart, (N, 3) float64: x, y in town coordinates, metres; heading in radians
+    counter-clockwise from +x, continuous (not wrapped).
     """
     crossings = _walk(seed, blocks, max(2, math.ceil(length / BLOCK_METRES) + 2))
     poses = _follow(crossings)
@@ -233,7 +233,7 @@ def drive(seed: int, blocks: tuple[int, int], length: float, step: float) -> NDA
 
 
 def _walk(seed: int, blocks: tuple[int, int], steps: int) -> list[tuple[int, int]]:
-    """Crossings visited: no turning round, streets not driven yet first."""
+    """Return the crossings visited, without turning round and preferring streets not driven yet."""
     rng = np.random.Generator(np.random.PCG64([seed, 2]))
     # the outermost streets lie half outside the town
     inner = min(blocks) >= 3
@@ -248,7 +248,7 @@ def _walk(seed: int, blocks: tuple[int, int], steps: int) -> list[tuple[int, int
             dx, dy = _HEADINGS[(heading + turn) % 4]
             there = (here[0] + dx, here[1] + dy)
             if low <= there[0] <= high[0] and low <= there[1] <= high[1]:
-                # turning round only where nothing else is left
+                # turn round only if there is no other choice
                 cost = visits.get(frozenset((here, there)), 0) + (1e6 if turn == 2 and len(path) > 1 else 0)
                 options.append((cost + float(rng.random()) * 0.5, turn, there))
         _, turn, there = min(options)
@@ -259,7 +259,7 @@ def _walk(seed: int, blocks: tuple[int, int], steps: int) -> list[tuple[int, int
 
 
 def _follow(crossings: list[tuple[int, int]]) -> NDArray[np.float64]:
-    """Poses in the right lane along the crossings, densest in the corners."""
+    """Return poses in the right lane along the crossings, densest at the corners."""
     nodes = np.array(crossings, dtype=np.float64) * BLOCK_METRES
     directions = np.diff(nodes, axis=0) / BLOCK_METRES
     heading = math.atan2(directions[0, 1], directions[0, 0])

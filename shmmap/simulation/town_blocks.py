@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands on a block of the generated town: houses, flats, a park, a hall or a church square."""
+"""The blocks of the generated town: houses, flats, a park, a hall or a church square."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FOLIAGE, _BARK, _METAL, _STONE = 58.0, 35.0, 95.0, 70.0
 
 
 def build_block(rng: Rng, ground: Height) -> Surfaces:
-    """Everything above the ground on one block, streets around it included; tile coordinates."""
+    """Return everything above the ground on one block, including its streets; tile coordinates."""
     surfaces = Surfaces()
     use = _USES[int(rng.choice(len(_USES), p=_SHARES))]
     use(rng, ground, surfaces)
@@ -54,7 +54,7 @@ def _building(
     ridge: float = 0.0,
     windows: bool = True,
 ) -> None:
-    """Add a building whose walls reach below the lowest ground around it; what is buried is not seen."""
+    """Add a building whose walls reach below the lowest ground around it; buried parts are invisible."""
     reach = max(half)
     around = [ground(center[0] + a * reach, center[1] + b * reach) for a in (-1, 1) for b in (-1, 1)]
     depth = max(around) - min(around) + 0.5
@@ -89,7 +89,7 @@ def _wall(
 
 
 def _build_houses(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
-    """Two rows of houses back to back, gardens and walls between them."""
+    """Build two rows of houses back to back, with gardens and walls between them."""
     for side in (0, 1):
         x = _LOW + float(rng.uniform(0.0, 2.0))
         while True:
@@ -126,7 +126,7 @@ def _build_houses(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
 
 
 def _build_flats(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
-    """Long blocks of flats around a courtyard with trees."""
+    """Build long blocks of flats around a courtyard with trees."""
     deep = 5.5
     span = (_HIGH - _LOW) / 2
     for x, y, half in (
@@ -144,7 +144,7 @@ def _build_flats(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
 
 
 def _build_park(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
-    """Trees, and a wall around with openings."""
+    """Plant trees, and build a wall with openings around them."""
     for x, y in rng.uniform(_LOW + 4.0, _HIGH - 4.0, (int(rng.integers(25, 45)), 2)):
         _tree(rng, ground, surfaces, float(x), float(y), reach=4.5)
     for fixed in (_LOW + 0.5, _HIGH - 0.5):
@@ -176,7 +176,7 @@ def _build_square(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
 
 
 def _line_streets(rng: Rng, ground: Height, surfaces: Surfaces) -> None:
-    """Lamps, street trees and parked cars along the four streets."""
+    """Add lamps, street trees and parked cars along the four streets."""
     curb = ROAD_HALF_METRES + 0.6
     planted = rng.random(4) < 0.4
     for street, has_trees in enumerate(planted.tolist()):

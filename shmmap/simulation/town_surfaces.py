@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ground of the generated town, and the surfaces of what stands on it, with points sampled on them.
+"""The ground of the generated town, the surfaces of objects on it, and points sampled on them.
 
-The ground is smooth hills, with streets a curb's height below the blocks.
+The ground consists of smooth hills, with streets a curb's height below the blocks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["BLOCK_METRES", "CURB_METRES", "ROAD_HALF_METRES", "Ground", "Surface
 BLOCK_METRES = 80.0
 """Distance between street centre lines, in x and in y."""
 ROAD_HALF_METRES = 4.0
-"""From a street's centre line to its curb."""
+"""Distance from a street's centre line to its curb."""
 CURB_METRES = 0.12
 
 # Four waves: (wavelength, height) in metres; together slopes stay below 10 %.
@@ -37,19 +37,19 @@ class Ground:
         self._ky = 2.0 * np.pi * np.sin(angles) / lengths
 
     def terrain(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
-        """Height of the hills alone, metres."""
+        """Return the height of the hills alone, metres."""
         z = np.zeros(np.broadcast(x, y).shape)
         for kx, ky, phase, height in zip(self._kx, self._ky, self._phases, self._heights, strict=True):
             z += height * np.sin(kx * x + (ky * y + phase))
         return z
 
     def height(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
-        """Height of the ground, metres: the hills, plus the curb away from the streets."""
+        """Return the height of the ground, metres: the hills, plus the curb away from the streets."""
         return self.terrain(x, y) + CURB_METRES * (street_distance(x, y) >= ROAD_HALF_METRES)
 
 
 def street_distance(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
-    """Distance to the nearest street centre line, metres."""
+    """Return the distance to the nearest street centre line, metres."""
     across_x = np.abs(x - BLOCK_METRES * np.rint(x / BLOCK_METRES))
     across_y = np.abs(y - BLOCK_METRES * np.rint(y / BLOCK_METRES))
     return np.minimum(across_x, across_y)
@@ -61,7 +61,7 @@ Vector = tuple[float, float, float]
 _RANGE_NOISE_METRES = 0.015
 _WINDOW_RECESS_METRES = 0.12
 _WINDOW_INTENSITY = 12.0
-# glass mirrors most of the laser away
+# glass reflects most of the laser away
 _WINDOW_RETURNS = 0.25
 _FOLIAGE_PER_METRE2 = 1.5
 
@@ -76,7 +76,7 @@ class Surfaces:
     _cylinders: list[tuple[float, ...]] = field(default_factory=list)
     _crowns: list[tuple[float, ...]] = field(default_factory=list)
     footprints: list[tuple[float, float, float, float, float]] = field(default_factory=list)
-    """Where no ground is seen: centre x and y, half length, half width, yaw (radians)."""
+    """Rectangles that hide the ground: centre x and y, half length, half width, yaw (radians)."""
 
     def flat(
         self,
@@ -91,7 +91,7 @@ class Surfaces:
     ) -> None:
         """Add the parallelogram (or half of it) ``corner + a u + b v``, facing ``u x v``.
 
-        ``share`` scales how densely it is seen.
+        ``share`` scales the density of its points.
         """
         kind = _WINDOWS if windows else _TRIANGLE if triangle else _PLAIN
         self._flat.append((*corner, *u, *v, intensity, share, kind))
@@ -118,7 +118,7 @@ class Surfaces:
         roof_intensity: float = 40.0,
         roof_share: float = 0.6,
     ) -> None:
-        """Add an upright box; with ``ridge`` > 0 a gable roof that much higher, else a flat one."""
+        """Add an upright box; with ``ridge`` > 0 a gable roof of that height, else a flat roof."""
         self.footprints.append((*center, *half, yaw))
         cos, sin = math.cos(yaw), math.sin(yaw)
         along, across = (cos * half[0], sin * half[0]), (-sin * half[1], cos * half[1])
@@ -156,7 +156,7 @@ class Surfaces:
             self.flat(middle, _minus(half_edge), (0.0, 0.0, ridge), intensity, triangle=True)
 
     def sample(self, rng: np.random.Generator, density: float) -> tuple[Points, Points]:
-        """Points on all surfaces: (N, 3) float32 in tile coordinates, and (N,) float32 intensity.
+        """Return points on all surfaces: (N, 3) float32 in tile coordinates, and (N,) float32 intensity.
 
         ``density`` is in points per square metre.
         """
@@ -199,7 +199,7 @@ class Surfaces:
 
     def _sample_cylinders(self, rng: np.random.Generator, density: float) -> tuple[Points, Points]:
         table = np.array(self._cylinders, dtype=np.float32).reshape(-1, 6)
-        # thin things are hit from all sides: never fewer than 20 points for each metre of height
+        # thin objects are hit from all sides: at least 20 points per metre of height
         per_metre = np.maximum(2 * np.pi * table[:, 3] * density, 20.0)
         rows = table[np.repeat(np.arange(len(table)), np.rint(per_metre * table[:, 4]).astype(np.int64))]
         angle = rng.random(len(rows), dtype=np.float32) * np.float32(2 * np.pi)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What users test with.
+"""Tools for the tests of programs that use shmmap.
 
-`shmmap.testing.fixtures` has a daemon for pytest, `shmmap.testing.daemon_process` one for everything else;
-`shmmap.testing.layer_conformance` checks a layer kind of one's own.
+`shmmap.testing.fixtures` provides a daemon for pytest, `shmmap.testing.daemon_process` a daemon for other
+uses; `shmmap.testing.layer_conformance` checks a user's own layer kind.
 """

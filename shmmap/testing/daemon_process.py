@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A real daemon for a test or a demonstration: with names of its own, judged from outside when it ends.
+"""A real daemon for a test or a demonstration: isolated by its own names, and checked for leftovers.
 
 ::
 
@@ -56,45 +56,45 @@ _Daemon = TypeVar("_Daemon", bound="DaemonProcess")
 
 
 class DaemonProcess:
-    """One instance of the daemon: a name, its directories, and a process that comes and goes.
+    """An instance of the daemon for tests: its name, its directories, and a process that can be restarted.
 
-    Nothing of the machine's real daemon matters to it: name, socket, segments, temporary files and log are
-    its own, and ``SHMMAP_*`` variables are kept from it (but for ``SHMMAP_TEST_*``).
+    It is independent of the machine's real daemon: name, socket, segments, temporary files and log are its
+    own, and it receives no ``SHMMAP_*`` variables (except ``SHMMAP_TEST_*``).
 
     Parameters
     ----------
     map_path
-        The map to serve.
+        Path of the map to serve.
     *arguments
-        More options of ``shmmap serve``.
+        Further options of ``shmmap serve``.
     environment
-        More variables, over this process's.
+        Variables that override those of this process.
     shm_dir
-        Directory of the segments; by default one of its own inside ``/dev/shm``.
+        Directory of the segments; by default a new one inside ``/dev/shm``.
     command
-        In front of the daemon's own command, for example ``["taskset", "-c", "1"]``.
+        Prefix of the daemon's command, for example ``["taskset", "-c", "1"]``.
     pass_fds
-        Descriptors that it inherits.
+        Descriptors that the daemon inherits.
 
     Attributes
     ----------
     instance, endpoint, runtime_dir, shm_dir, log_path
-        Its name, and where its socket, segments and log are.
+        Name of the instance, and paths of its socket, segments and log.
     cache_dir, state_dir
         ``XDG_CACHE_HOME`` and ``XDG_STATE_HOME`` of the daemon.
     process
-        Of its present run; None when it does not run.
+        Process of the current run; None if the daemon does not run.
     killed
         Whether its last run ended without cleaning up, by `kill` or `leave`.
 
-    Used as a context manager it is ready on entry; on exit it is stopped and its directories are removed.
-    Without one: `start`, `stop` and, in the end, `dispose`.
+    Used as a context manager, the daemon is ready on entry; on exit it is stopped and its directories are
+    removed. Otherwise call `start`, `stop` and, in the end, `dispose`.
 
     Raises
     ------
     InternalError
-        From starting or stopping: the daemon ended, was not ready in a minute, or did not end within
-        half a minute; the message holds its last words.
+        From starting or stopping: the daemon ended, was not ready in a minute, or did not end within half a
+        minute; the message contains the end of its log.
     """
 
     def __init__(
@@ -117,10 +117,10 @@ class DaemonProcess:
         self._own_shm_dir = shm_dir is None
         self._leftovers: list[str] | None = None
         self._directories: list[str] = []
-        # also when the constructor is interrupted, or dispose() is never called
+        # also if the constructor is interrupted, or dispose() is never called
         self._finalizer = weakref.finalize(self, _remove, self._directories, os.getpid())
         with interrupts_later():
-            # under /tmp whatever TMPDIR says: a socket's path holds 107 bytes
+            # under /tmp whatever TMPDIR is: a socket's path is limited to 107 bytes
             self.runtime_dir = self._directory("/tmp")  # noqa: S108
             self.scratch_dir = self._directory("/tmp")  # noqa: S108
             self.shm_dir = shm_dir or self._directory(DEFAULT_SHM_DIR)
@@ -133,7 +133,7 @@ class DaemonProcess:
             directory.mkdir()
         self.environment = {
             **without_settings(),
-            # compiled kernels are shared by all: they cost seconds, and depend on their source alone
+            # compiled kernels are shared: they take seconds to compile, and depend on their source alone
             "NUMBA_CACHE_DIR": os.environ.get("NUMBA_CACHE_DIR") or _kernels_dir(),
             "TMPDIR": str(self._temporary_dir),
             "XDG_CACHE_HOME": str(self.cache_dir),
@@ -174,10 +174,10 @@ class DaemonProcess:
 
     @property
     def log(self) -> str:
-        """What the daemon wrote to stderr in all its runs."""
+        """Text that the daemon wrote to stderr in all its runs."""
         return self.log_path.read_text(errors="replace") if self.log_path.exists() else ""
 
-    # --- its runs -----------------------------------------------------------------------------------
+    # --- start and stop -----------------------------------------------------------------------------
 
     def spawn(self, *, arguments: Sequence[str] | None = None, notify: str = "") -> subprocess.Popen[bytes]:
         """Start the process without waiting for it to be ready."""
@@ -213,18 +213,18 @@ class DaemonProcess:
             stderr=log,
             cwd="/",
             pass_fds=self.pass_fds,
-            start_new_session=True,  # Ctrl-C is for the program that started it, which ends it in order
+            start_new_session=True,  # Ctrl-C reaches only the parent, which stops the daemon
         )
 
     def start(self: _Self, timeout_s: float = READY_S) -> _Self:
-        """Start the daemon and wait until it says that it is ready."""
+        """Start the daemon and wait until it is ready."""
         self.launch()
         if not self.wait_ready(timeout_s):
             raise InternalError(f"the daemon is not ready after {timeout_s:g} s:\n{self._last_words()}")
         return self
 
     def launch(self) -> None:
-        """Start the daemon; `wait_ready` says when it is."""
+        """Start the daemon without waiting; `wait_ready` waits until it is ready."""
         path = f"{self.runtime_dir}/notify"
         self._forget_ready()
         self._ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
@@ -234,7 +234,7 @@ class DaemonProcess:
             self.process = self.spawn(notify=path)
 
     def wait_ready(self, timeout_s: float = READY_S) -> bool:
-        """Wait until the daemon that was launched says that it is ready (sd_notify); True if it does."""
+        """Wait until the launched daemon reports that it is ready (sd_notify); return whether it does."""
         if self._ready is None:
             return True
         deadline_s = time.monotonic() + timeout_s
@@ -260,23 +260,23 @@ class DaemonProcess:
         os.kill(self.pid, number)
 
     def stop(self) -> int:
-        """End the daemon with SIGTERM, which empties the cache; returns its exit code."""
+        """Stop the daemon with SIGTERM, which empties the cache; return its exit code."""
         return self._end(signal.SIGTERM)
 
     def leave(self) -> int:
-        """End the daemon with SIGUSR1, which leaves the segments to its next run; returns its exit code."""
+        """Stop the daemon with SIGUSR1, which leaves the segments to its next run; return its exit code."""
         code = self._end(signal.SIGUSR1)
         self.killed = True
         return code
 
     def kill(self) -> None:
-        """End the daemon with SIGKILL: it can clean up nothing, and `start` finds what it left."""
+        """Kill the daemon with SIGKILL, without any cleanup; `start` then finds what it left."""
         self._end(signal.SIGKILL)
         self.killed = True
 
     def _end(self, number: signal.Signals) -> int:
         pid = self.pid
-        assert self.process is not None  # noqa: S101  `pid` has looked
+        assert self.process is not None  # noqa: S101  checked by `pid`
         process, self.process = self.process, None
         if process.poll() is None:
             process.send_signal(signal.SIGCONT)
@@ -300,24 +300,24 @@ class DaemonProcess:
     def _last_words(self) -> str:
         return "\n".join(self.log.splitlines()[-20:])
 
-    # --- what there is of it ------------------------------------------------------------------------
+    # --- processes, segments, leftovers -------------------------------------------------------------
 
     def children(self) -> list[int]:
-        """Ids of the daemon's living descendants, wherever they were reparented to."""
+        """Return the ids of the daemon's living descendants, also reparented ones."""
         own = self.process.pid if self.process is not None else 0
         return sorted(pid for pid in processes_marked(self.instance, _MARK) if pid != own)
 
     def segments(self) -> list[str]:
-        """List published and retired segments, sorted; statistics and lock are not among them."""
+        """Return the names of published and retired segments, sorted; without statistics and lock."""
         own = re.compile(rf"shmmap\.{self.instance}\.[0-9a-f]{{16}}(\.zombie)?")
         return sorted(name for name in os.listdir(self.shm_dir) if own.fullmatch(name))
 
     def segment_bytes(self) -> int:
-        """Memory that the segments occupy, by their blocks."""
+        """Return the memory of the segments, counted in allocated blocks."""
         return self._measured(self.segments())
 
     def shm_bytes(self) -> int:
-        """Memory of everything that it has in the shared-memory directory, statistics included."""
+        """Return the memory of all the daemon's shared-memory files, including statistics."""
         prefix = f"shmmap.{self.instance}."
         return self._measured(name for name in os.listdir(self.shm_dir) if name.startswith(prefix))
 
@@ -329,16 +329,16 @@ class DaemonProcess:
         return total
 
     def leftovers(self) -> list[str]:
-        """Everything that a daemon which ended in order must not leave: names, sockets, processes, files.
+        """Return what a daemon that stopped in order must not leave: names, sockets, processes, files.
 
-        After the context manager: what there was at its end.
+        After the context manager's exit: the leftovers found at the exit.
         """
         if self._leftovers is not None:
             return self._leftovers
         prefix = f"shmmap.{self.instance}."
         found = [f"process {pid}" for pid in self.children() if not wait_ended(pid, 10.0)]
         if self.killed:
-            return found  # names are left behind for the next run to adopt
+            return found  # names stay for the next run to adopt
         found += [f"segment {name}" for name in os.listdir(self.shm_dir) if name.startswith(prefix)]
         if self._own_shm_dir:
             found += [
@@ -349,7 +349,7 @@ class DaemonProcess:
         return found
 
     def dispose(self) -> None:
-        """Kill what is left and remove all directories; no judgement."""
+        """Kill remaining processes and remove all directories, without checks."""
         with interrupts_later():
             if self.process is not None:
                 self.kill()
@@ -365,35 +365,35 @@ class DaemonProcess:
 
 
 def _remove(directories: list[str], owner: int) -> None:
-    """Remove directories, unless this is a forked child of the process that made them."""
+    """Remove directories, except in a forked child of the process that made them."""
     if os.getpid() == owner:
         for path in directories:
             shutil.rmtree(path, ignore_errors=True)
 
 
 def _kernels_dir() -> str:
-    """Where kernels are kept, see `shmmap.compiling`, which loads numba."""
+    """Return the directory of compiled kernels, see `shmmap.compiling`, which loads numba."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return str(Path(base if base.startswith("/") else os.path.expanduser("~/.cache"), "shmmap", "kernels"))
 
 
 @contextlib.contextmanager
 def isolated_daemons(kind: type[_Daemon]) -> Iterator[Callable[..., _Daemon]]:
-    """Start daemons for one test, ``make(map_path, *options, environment=..., shm_dir=..., start=True)``.
+    """Provide ``make(map_path, *options, environment=..., shm_dir=..., start=True)`` to start daemons.
 
-    At the end each one still running gets SIGTERM and must exit 0 and leave no name, no socket, no
-    process, no temporary file (one that was killed and not started again is judged by its processes
-    alone); and this process must have no more open files than before.
+    At the end each daemon still running gets SIGTERM.  It must exit with 0, and leave no name, socket,
+    process or temporary file; a daemon that was killed and not restarted must only leave no process.  This
+    process must have no more open files than before.
 
     Parameters
     ----------
     kind
-        `DaemonProcess`, or a class made of it.
+        `DaemonProcess`, or a subclass.
 
     Raises
     ------
     InternalError
-        At the end: something was left behind; the message names it and holds the daemon's log.
+        At the end: something was left behind; the message names it and contains the daemon's log.
     """
     before = open_files()
     started: list[_Daemon] = []
@@ -407,7 +407,7 @@ def isolated_daemons(kind: type[_Daemon]) -> Iterator[Callable[..., _Daemon]]:
         yield make
     finally:
         problems: list[str] = []
-        for one in reversed(started):  # a later one may live in an earlier one's directory
+        for one in reversed(started):  # a later daemon may use an earlier one's directory
             problems += _stopped(one)
     gc.collect()
     problems += [
@@ -420,7 +420,7 @@ def isolated_daemons(kind: type[_Daemon]) -> Iterator[Callable[..., _Daemon]]:
 
 
 def _stopped(one: DaemonProcess) -> list[str]:
-    """Stop a daemon and remove all it had; return what it should not have left."""
+    """Stop a daemon and remove all its files; return its leftovers."""
     problems = []
     try:
         if one.process is not None and (code := one.stop()) != 0:
@@ -432,7 +432,7 @@ def _stopped(one: DaemonProcess) -> list[str]:
 
 
 def wait_readable(fds: Sequence[int], timeout_s: float) -> list[int]:
-    """Wait until one of the descriptors is readable; returns those that are, none after ``timeout_s``."""
+    """Wait until a descriptor is readable; return the readable ones, none after ``timeout_s``."""
     poller = select.poll()
     for fd in fds:
         poller.register(fd, select.POLLIN)
@@ -440,7 +440,7 @@ def wait_readable(fds: Sequence[int], timeout_s: float) -> list[int]:
 
 
 def wait_ended(pid: int, timeout_s: float = 30.0) -> bool:
-    """Wait until a process has ended; True if it has."""
+    """Wait for a process to end; return whether it has."""
     try:
         fd = os.pidfd_open(pid)
     except ProcessLookupError:
@@ -452,7 +452,7 @@ def wait_ended(pid: int, timeout_s: float = 30.0) -> bool:
 
 
 def processes_marked(mark: str, variable: str = "SHMMAP_TEST_RUN") -> list[int]:
-    """Ids of the living processes that were started with ``variable=mark`` in their environment."""
+    """Return the ids of living processes started with ``variable=mark`` in their environment."""
     wanted = f"{variable}={mark}".encode()
     found = []
     for entry in os.listdir("/proc"):
@@ -460,22 +460,22 @@ def processes_marked(mark: str, variable: str = "SHMMAP_TEST_RUN") -> list[int]:
             try:
                 if wanted in Path(f"/proc/{entry}/environ").read_bytes().split(b"\0"):
                     found.append(int(entry))
-            except OSError:  # gone by now, or another account's
+            except OSError:  # ended meanwhile, or of another account
                 continue
     return found
 
 
 def open_files() -> dict[int, str]:
-    """Descriptors of this process and what they refer to."""
+    """Return this process's open descriptors and their targets."""
     found = {}
     for entry in os.listdir("/proc/self/fd"):
-        with contextlib.suppress(OSError):  # the one that lists the directory
+        with contextlib.suppress(OSError):  # the descriptor that lists the directory
             found[int(entry)] = os.readlink(f"/proc/self/fd/{entry}")
     return found
 
 
 def without_settings(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the variables without ``SHMMAP_*``, the settings of a real daemon; ``SHMMAP_TEST_*`` stay."""
+    """Return the variables without ``SHMMAP_*`` (settings of a real daemon), but with ``SHMMAP_TEST_*``."""
     return {
         name: value
         for name, value in environ.items()

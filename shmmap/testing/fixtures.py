@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for pytest, which has to be installed.
+"""Fixtures for pytest, which must be installed.
 
 In the `conftest.py` of your tests::
 
@@ -12,7 +12,7 @@ and in a test::
         with shmmap.connect(daemon.endpoint) as client:
             ...
 
-The test fails where the daemon leaves anything behind, or the test itself an open file.
+The test fails if the daemon leaves anything behind, or if the test leaves a file open.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _Daemon = TypeVar("_Daemon", bound=DaemonProcess)
 
 @pytest.fixture
 def shmmap_daemon() -> Iterator[Callable[..., DaemonProcess]]:
-    """Start daemons, ``shmmap_daemon(map_path, *options)``, see `isolated_daemons`."""
+    """Provide ``shmmap_daemon(map_path, *options)`` to start daemons, see `isolated_daemons`."""
     yield from judged_daemons(DaemonProcess)
 
 
 def judged_daemons(kind: type[_Daemon]) -> Iterator[Callable[..., _Daemon]]:
-    """Do the work of `shmmap_daemon`, for a fixture with another class of daemons."""
+    """Implement `shmmap_daemon`, also for fixtures with another class of daemons."""
     try:
         with isolated_daemons(kind) as make:
             yield make

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of what every layer kind must guarantee, on clouds of every sort.
+"""Check the guarantees of every layer kind, on clouds of many sorts.
 
 ::
 
@@ -7,7 +7,7 @@
     def test_my_kind(cloud: str) -> None:
         check_layer("roughness(leaf=1.0)", cloud)
 
-It does not know what a layer should hold: test that against an independent, slow computation.
+The contents of a layer are not checked: test them against an independent, slow computation.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ MAY_BE_REFUSED = frozenset({"far_apart"})
 
 
 def check_layer(layer: str, cloud: str) -> LayerTable | None:
-    """Build a layer of one of `CORNERS` and check everything that holds for every kind.
+    """Build a layer of one of `CORNERS` and check all properties that every kind must have.
 
-    Return the table, or None if the builder refused the cloud.  It may refuse ``far_apart`` only.
+    Return the table, or None if the builder refused the cloud, which is allowed for ``far_apart`` only.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def _check_columns(spec: LayerSpec, table: LayerTable, source: Mapping[str, NDAr
 
 
 def _check_segment(spec: LayerSpec, table: LayerTable) -> None:
-    """Check that the table fits a segment, and comes back out of it."""
+    """Check that the table fits in a segment and is read back unchanged."""
     origin = SegmentOrigin("/cell.pcd", _BOX, "map", NO_SOURCE, bytes(16), 0, 0)
     fd = os.memfd_create("layer")
     try:
@@ -172,7 +172,7 @@ def _check_segment(spec: LayerSpec, table: LayerTable) -> None:
 
 
 def surface(rng: np.random.Generator, points: int, size_m: float = 20.0) -> NDArray[np.float64]:
-    """Gently hilly ground with a wall: (points, 3), metres, x and y in 0 .. size_m."""
+    """Return points of gently hilly ground with a wall: (points, 3), metres, x and y in 0 .. size_m."""
     xy = rng.uniform(0, size_m, (points, 2))
     z = np.sin(xy[:, 0] / 4) + rng.normal(0, 0.02, points)
     wall = rng.random(points) < 0.3
@@ -182,7 +182,7 @@ def surface(rng: np.random.Generator, points: int, size_m: float = 20.0) -> NDAr
 
 
 def corner(name: str, points: int = 600) -> Any:
-    """One cloud of `CORNERS`, (N, 3) float32 or float64."""
+    """Return one cloud of `CORNERS`, (N, 3) float32 or float64."""
     rng = np.random.default_rng(CORNERS.index(name))
     base: NDArray[Any] = surface(rng, points)
     if name == "origin":
@@ -194,7 +194,7 @@ def corner(name: str, points: int = 600) -> Any:
         return base.astype(np.float32)
     if name == "large_f8":
         return base + MOVED
-    if name == "borders":  # exactly on faces of voxels, and a hair to either side
+    if name == "borders":  # exactly on faces of voxels, and just beside them
         steps = rng.integers(-4, 5, (points, 3)).astype(np.float32) * np.float32(0.5)
         hairs: NDArray[Any] = np.nextafter(steps, steps + rng.integers(-1, 2, steps.shape).astype(np.float32))
         return hairs

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the verbs show: tables, pictures, progress."""
+"""Output of the verbs: tables, pictures, progress."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap demo`` shows: its progress, and at the end what was measured, as text or JSON."""
+"""Output of ``shmmap demo``: progress, and the measured results as text or JSON."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ __all__ = [
 
 _PLAIN_EVERY_S: Final = 10.0
 
-_BAR: Final = 12  # columns: the text of a stage, its numbers and its time fit beside it
+_BAR: Final = 12  # columns: leave room for the stage's text, numbers and time beside the bar
 
 
 class PlainProgress(Progress):
-    """A line per stage when it begins, one per event, and one every ten seconds of a long stage."""
+    """Prints a line when a stage begins, one per event, and one every ten seconds of a long stage."""
 
     def __init__(self) -> None:
         self._total = self._done = 0
@@ -53,7 +53,7 @@ class PlainProgress(Progress):
         print_line(f"{text} ...", flush=True)
 
     def step(self, *lines: str) -> None:
-        """Print how far a long stage is."""
+        """Print the progress of a long stage."""
         del lines
         self._done += 1
         now_s = time.monotonic()
@@ -62,12 +62,12 @@ class PlainProgress(Progress):
             print_line(f"  step {self._done} of {self._total}", flush=True)
 
     def event(self, text: str) -> None:
-        """Print what has happened."""
+        """Print an event."""
         print_line(f"  {text}", flush=True)
 
 
 class LiveProgress(Progress):
-    """A bar for each stage; below them the last event, and the lines of the last step."""
+    """Shows a bar per stage; below the bars the last event, and the lines of the last step."""
 
     def __init__(self, live: Live) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
@@ -90,18 +90,18 @@ class LiveProgress(Progress):
         self._draw()
 
     def step(self, *lines: str) -> None:
-        """Draw the step and its lines."""
+        """Draw the current step and its lines."""
         if self._stage is not None:
             self._bars.advance(self._stage)
         self._draw(*lines)
 
     def event(self, text: str) -> None:
-        """Draw the event until the stage ends, or until the next event."""
+        """Show an event until the stage ends or the next event."""
         self._event = text
         self._draw()
 
     def close(self) -> None:
-        """Leave only the bars on the screen."""
+        """Stop the display; only the bars stay on the screen."""
         self._event = ""
         self._draw()
 
@@ -116,7 +116,7 @@ class LiveProgress(Progress):
 
 @contextlib.contextmanager
 def progress_for(*, quiet: bool) -> Iterator[Progress]:
-    """Choose what to show: nothing, lines, or a live view on a terminal that can do that."""
+    """Return the progress display: none, lines, or a live view if the terminal supports it."""
     if quiet:
         yield Progress()
         return
@@ -136,27 +136,27 @@ _WIDTH: Final = 79  # columns of the longest line
 
 _NARROWEST: Final = 30
 
-_NAMES: Final = 10  # columns, in front of the lines
+_NAMES: Final = 10  # columns before the lines
 
 _COLUMNS: Final = ("PROCESSES", "MEMORY", "CPU TIME", "FIRST MAP", "LOOP HELD UP")
 
 
 @dataclass(frozen=True, slots=True)
 class DemoReport:
-    """The result of a demonstration for its spectators.
+    """The result of a demonstration.
 
     Attributes
     ----------
     document
         What ``--json`` prints.
     lines
-        The texts by name.
+        Lines of the report by name.
     picture_svg
         The picture.
     passed
-        Whether all was as it has to be.
+        Whether all checks passed.
     rows
-        Of the table of memory and times; empty without one.
+        Rows of the table of memory and times; empty without a table.
     """
 
     document: dict[str, Any]
@@ -167,7 +167,7 @@ class DemoReport:
 
 
 def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
-    """Print the table and the lines, each with its name in front; in a pipe, too, no wider than a page."""
+    """Print the table, then each line after its name; no wider than a page, also in a pipe."""
     print_line()
     if report.rows:
         columns = [Column(name, "right" if number else "left") for number, name in enumerate(_COLUMNS)]
@@ -188,7 +188,7 @@ def print_report(report: DemoReport, picture: str, duration_s: float) -> None:
 
 
 def town_report(result: DemoResult) -> DemoReport:
-    """Report a drive on one shared copy of the map, and on private ones."""
+    """Report a drive on one shared copy of the map, and one on private copies."""
     rows = []
     for each in result.rounds:
         copies = "private copies" if each.consumers > 1 else "private copy"
@@ -222,7 +222,7 @@ def _town_lines(result: DemoResult) -> dict[str, str]:
     count, shared, private = last.consumers, last.shared, last.private
     more_shared, more_private = result.one_more_bytes
     too_small = ""
-    if shared.total_bytes >= private.total_bytes:  # every process also has a fixed size
+    if shared.total_bytes >= private.total_bytes:  # plus each process's fixed size
         too_small = (
             f". The map around the vehicle ({format_bytes(shared.map_bytes)}) is too small to gain"
             " from sharing; --density 100 makes a larger one"
@@ -289,7 +289,7 @@ def _draw(result: DemoResult) -> str:
 
 
 def live_report(result: LiveDriveResult) -> DemoReport:
-    """Report a drive that was mapped, what was killed on it, and whether a voxel was lost."""
+    """Report a drive that was mapped, the processes killed on it, and whether a voxel was lost."""
     voxels = f"{result.voxels:,}".replace(",", " ")
     compared = f"all {voxels} voxels on disk are as in a map without bounds of the same scans"
     if result.differing:

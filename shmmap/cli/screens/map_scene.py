@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map from above, cells of its clients or chunks of a live map: for a terminal, as SVG or HTML."""
+"""The map from above, with cells or with chunks of a live map: for a terminal, as SVG, or as HTML."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ GLYPHS: Final = {
     "none": (" ", ""),
 }
 
-_ORDER: Final = ("zombie", "stale", "fetched", "resident")  # the last of a cell's states is what is drawn
+_ORDER: Final = ("zombie", "stale", "fetched", "resident")  # the last state in this order is drawn
 
 _OUTLINE_POINTS: Final = 180
 CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wide
@@ -44,12 +44,12 @@ CHARACTER_ASPECT: Final = 2.0  # a character is about twice as high as it is wid
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything there is to draw.
+    """Everything that a picture shows.
 
     Attributes
     ----------
     bounds
-        What is shown, metres, map frame.
+        The area shown, metres, map frame.
     disk
         Boxes of all cells of the map, resident or not.
     rows
@@ -59,9 +59,9 @@ class Scene:
     now_ns
         CLOCK_MONOTONIC of ``rows`` and ``clients``.
     title, note
-        Two lines.
+        The two lines of text.
     empty
-        There is nothing to draw, not even on disk.
+        Whether the map has nothing to draw, not even on disk.
     chunks
         Columns of chunks of a live map, drawn instead of cells.
     """
@@ -77,7 +77,7 @@ class Scene:
     chunks: Sequence[CellSquare] = ()
 
     def by_cell(self) -> dict[str, list[CellRow]]:
-        """Segments of each cell, the most important state last."""
+        """Return the segments of each cell, the most important state last."""
         found: dict[str, list[CellRow]] = {}
         for row in sorted(self.rows, key=_rank):
             found.setdefault(row.id, []).append(row)
@@ -85,7 +85,7 @@ class Scene:
 
 
 def state_of(row: CellRow) -> str:
-    """Name in `GLYPHS` of a segment's state; ``fetched`` is one that was prefetched and not requested yet."""
+    """Return the name in `GLYPHS` of a segment's state; ``fetched``: prefetched and not requested yet."""
     return "fetched" if row.ahead else row.state
 
 
@@ -96,7 +96,7 @@ def _rank(row: CellRow) -> int:
 
 # --- on a terminal ------------------------------------------------------------------------------------
 def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
-    """Return the picture as rows of states, north up; a position is a name in `GLYPHS`."""
+    """Return the picture as rows of states (names in `GLYPHS`), north up."""
     min_x, min_y, max_x, max_y = scene.bounds
     span_x, span_y = max(max_x - min_x, 1e-9), max(max_y - min_y, 1e-9)
     step = max(span_x / columns, span_y / (lines * CHARACTER_ASPECT))
@@ -111,7 +111,7 @@ def terminal_rows(scene: Scene, columns: int, lines: int) -> list[list[str]]:
         return math.floor((max_y - y) / span_y * height)
 
     def fill(box: BoxTuple, state: str) -> None:
-        # a position belongs to the cell that its middle lies in; a cell too small for one still shows
+        # a character shows the cell at its centre; a cell too small for that still gets one character
         first, last = (
             math.ceil((box[0] - min_x) / span_x * width - 0.5),
             math.ceil((box[2] - min_x) / span_x * width - 0.5),
@@ -214,7 +214,7 @@ _STYLE: Final = """
 
 
 def html_page(scene: Scene) -> str:
-    """Return a page that needs nothing else: the picture, its tooltips, and the clients as a table."""
+    """Return a self-contained page: the picture, its tooltips, and a table of the clients."""
     rows = "".join(
         f"<tr><td>{escape(c.client or c.command or '?')}</td><td>{c.pid or '?'}</td><td>{c.cells:,}</td>"
         f"<td>{format_bytes(c.bytes)}</td><td>{c.requests:,}</td>"
@@ -240,13 +240,13 @@ LIVE_STATES: Final = {
     "saving": "saving",
     "dirty": "not saved yet",
 }
-"""States of chunks and what they are called; of chunks above one another that of the last here is drawn."""
+"""States of chunks, and their names in the legend; of a column's chunks the last state here is drawn."""
 
 _LIVE_ORDER: Final = list(LIVE_STATES)
 
 
 def chunk_squares(chunks: Iterable[ChunkInfo], resolution: float) -> list[CellSquare]:
-    """Return a square for each column of chunks, with a line of its tooltip for each chunk.
+    """Return a square for each column of chunks; its tooltip has a line for each chunk.
 
     Parameters
     ----------

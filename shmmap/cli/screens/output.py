@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How verbs print: lines, aligned text, a table on a terminal, or JSON.
+r"""Print what verbs show: lines, aligned text, tables on a terminal, or JSON.
 
-Everything a verb prints leaves through here.  Names of clients, processes, files and cells were chosen by
-others: a name may hold the codes that move a terminal's cursor or rename its window.  So whatever cannot be
-printed is shown escaped (``\x1b``), in this one place.
+All output of the verbs passes through this module.  Names of clients, processes, files and cells are not
+trusted: a name may contain codes that move a terminal's cursor or rename its window.  So unprintable
+characters are shown escaped (``\x1b``), in this one place.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ __all__ = [
 _EDGES: Final = 2  # blanks left and right of a table
 _GAP: Final = 3  # blanks between columns
 
-_NARROWEST: Final = 20  # columns that text needs to be worth breaking
+_NARROWEST: Final = 20  # columns that make breaking the text worthwhile
 
 
 class Column(NamedTuple):
-    """One column of a table; numbers are aligned right.
+    """One column of a table; numbers are right-aligned.
 
-    A terminal too narrow for the table shows of the ``spare`` columns those that fit, lowest first;
-    ``looks`` are colours of some of its words.
+    A terminal too narrow for the table shows only the ``spare`` columns that fit, lowest number first.
+    ``looks`` maps words of the column to colours.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Column(NamedTuple):
 def printable(text: str) -> str:
     r"""Return ``text`` with unprintable characters replaced by Python escapes, such as ``\x1b``.
 
-    These are control and format characters, line breaks, and bytes of a file name that are no text.
+    Unprintable are control and format characters, line breaks, and bytes of a file name that are no text.
     """
     if text.isprintable():
         return text
@@ -69,7 +69,7 @@ def printable(text: str) -> str:
 
 
 def rows_text(count: int, layer: str) -> str:
-    """Return ``"1,200 points"``, and ``"157 rows"`` for a layer whose rows are voxels or the like."""
+    """Return ``"1,200 points"``, or ``"157 rows"`` for a layer whose rows are not points."""
     return counted(count, "point" if layer == "points" else "row")
 
 
@@ -79,20 +79,20 @@ def print_line(text: str = "", *, file: TextIO | None = None, flush: bool = Fals
 
 
 def json_text(value: object, *, indent: int | None = None) -> str:
-    """Return one JSON document whose strings hold nothing that a terminal obeys."""
+    """Return a JSON document whose strings contain no control codes for terminals."""
     import json
 
     text = json.dumps(value, indent=indent, allow_nan=False, ensure_ascii=False)
     if text.replace("\n", "").isprintable():
         return text
-    # outside its strings JSON has no other such character than the line break
+    # outside strings JSON has no unprintable character but the line break
     return "".join(
         one if one == "\n" or one.isprintable() else json.dumps(one, ensure_ascii=True)[1:-1] for one in text
     )
 
 
 def print_json(value: object) -> None:
-    """Print a struct or plain values as one JSON document; NaN and infinity are a defect."""
+    """Print a struct or plain values as one JSON document; NaN and infinity are not allowed."""
     if hasattr(value, "__struct_fields__"):
         import msgspec
 
@@ -108,7 +108,7 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         return
     cells = [[column.name for column in columns], *rows]
     widths = [max(map(len, texts)) for texts in zip(*cells, strict=True)]
-    # one format for the whole line: thousands of rows are printed in the time of an eye's blink
+    # one format for the whole line keeps thousands of rows fast
     line = "  ".join(
         f"{{:{'>' if column.align == 'right' else '<'}{width}}}"
         for column, width in zip(columns, widths, strict=True)
@@ -117,12 +117,12 @@ def print_table(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
 
 
 def wants_style() -> bool:
-    """Whether to print colours: on a terminal that can, unless NO_COLOR says not to."""
+    """Whether to print colours: stdout is a terminal that supports them, and NO_COLOR is not set."""
     return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
 def _has_rich() -> bool:
-    """Whether rich is installed: a client-only install lacks it."""
+    """Whether rich is installed; a client-only install lacks it."""
     from importlib.util import find_spec
 
     return find_spec("rich") is not None
@@ -138,7 +138,7 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
     shown = columns_that_fit(columns, rows, console.width - _EDGES)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
     for index in shown:
-        # only the first column, a name, may be folded: numbers in pieces say nothing
+        # only the first column, a name, may be folded: broken numbers are unreadable
         column = columns[index]
         table.add_column(column.name, justify=column.align, overflow="fold", no_wrap=index > 0)
     for row in rows:
@@ -154,7 +154,7 @@ def _print_rich(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
 
 
 def columns_that_fit(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> list[int]:
-    """Return the indices of the columns that are not spare, and of the others that fit, least spare first."""
+    """Return the indices of the columns to show: all that are not spare, then spare ones that fit."""
     widths = [max(map(len, texts)) for texts in zip([column.name for column in columns], *rows, strict=True)]
     shown: list[int] = []
     for level in sorted({0, *(column.spare for column in columns)}):
@@ -165,14 +165,14 @@ def columns_that_fit(columns: Sequence[Column], rows: Sequence[Sequence[str]], w
 
 
 def print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
-    """Print ``name  value`` lines with the values aligned; on a terminal long ones are folded."""
+    """Print ``name  value`` lines with the values aligned; on a terminal, long values are folded."""
     width = max((len(name) for name, _ in pairs), default=0)
     for name, value in pairs:
         print_hanging(f"{name:{width}}  ", value)
 
 
 def print_hanging(head: str, text: str) -> None:
-    """Print ``head`` and ``text`` as a line; on a terminal too narrow for it the text continues below."""
+    """Print ``head`` and ``text`` on one line; on a narrow terminal the text continues indented below."""
     head, lines = printable(head), [printable(text)]
     if sys.stdout.isatty():
         import shutil
@@ -186,7 +186,7 @@ def print_hanging(head: str, text: str) -> None:
 
 
 def user_name(uid: int) -> str:
-    """Return the name of a user id; the number where there is none, ``?`` where it is not known."""
+    """Return the name of a user id; the number if it has no name, ``?`` if the id is unknown."""
     import pwd
 
     if uid < 0:

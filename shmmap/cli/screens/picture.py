@@ -13,9 +13,9 @@ from shmmap.formats.svg import Axes, BoxTuple, Page, dash, element, swatch, tool
 __all__ = ["CellSquare", "Raster", "Vehicle", "top_view_svg"]
 
 WIDTH_PX: Final = 960.0
-HEIGHT_PX: Final = 1400.0  # of the map, at most
+HEIGHT_PX: Final = 1400.0  # pixels of the map, at most
 MARGIN_PX: Final = 16.0
-LABEL_PX: Final = 16.0  # labels nearer than a line to one another could not be read
+LABEL_PX: Final = 16.0  # labels closer than a line would overlap
 
 _STYLE: Final = """
   .label { font-size: 13px; stroke: #fff; stroke-width: 3; paint-order: stroke; }
@@ -45,7 +45,7 @@ _STATES: Final = {
     "saving": "being saved",
     "loading": "being loaded",
 }
-"""States of cells and of chunks of a live map: classes of `_STYLE`, and what the legend calls them."""
+"""States of cells and of live chunks: classes of `_STYLE`, and their names in the legend."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,10 @@ class Raster:
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """Where a vehicle is (metres), where it heads (radians from x to y), how far it looks; a tooltip.
+    """A vehicle: position (metres), heading (radians from x to y), radius of its window, tooltip, label.
 
-    ``heading`` None is not known, ``radius`` 0 draws no window; ``label`` is written beside it.
+    ``heading`` is None if unknown; with ``radius`` 0 no window is drawn; ``label`` is written beside the
+    vehicle.
     """
 
     x: float
@@ -97,9 +98,9 @@ def top_view_svg(
     Parameters
     ----------
     bounds
-        What the picture shows, metres, map frame.
+        Area of the picture, metres, map frame.
     cells
-        Drawn in order; those with a state on top of those without.
+        Cells, drawn in order; cells with a state are drawn on top.
     title, note
         Two lines below the map.
     raster
@@ -136,7 +137,7 @@ def top_view_svg(
 
 
 def _labelled_apart(axes: Axes, vehicles: Sequence[Vehicle]) -> list[Vehicle]:
-    """Join the labels of those that stand on one another, as the programs of one vehicle do."""
+    """Join the labels of vehicles at the same place, such as several programs of one vehicle."""
     found: list[Vehicle] = []
     for vehicle in vehicles:
         for index, other in enumerate(found):

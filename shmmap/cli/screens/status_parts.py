@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``status`` and ``top`` say of prefetching, a published map and live maps."""
+"""Lines of ``status`` and ``top`` about prefetching, a published map and live maps."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ __all__ = [
 
 
 def over_fetch(counters: Mapping[str, int]) -> float | None:
-    """Return bytes loaded by bytes that were handed out at least once; None before the first.
+    """Return loaded bytes divided by bytes handed out at least once; None if none were.
 
-    What was fetched ahead and not used yet counts as loaded only.  The ratio is below 1 after a warm start,
+    Prefetched bytes that were not used yet count as loaded only.  The ratio is below 1 after a warm start,
     when segments that the previous run loaded are handed out.
     """
     used = counters.get("bytes_used", 0)
@@ -36,7 +36,7 @@ def over_fetch(counters: Mapping[str, int]) -> float | None:
 
 
 def prefetch_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
-    """Return short texts, each with whether it is a problem; none while prefetching has nothing to do."""
+    """Return short texts about prefetching, each with whether it is a problem; none while it is idle."""
     misses, lately = counters.get("prefetch_misses", 0), counters.get("prefetch_misses_1min", 0)
     if not (counters.get("prefetch_started") or misses):
         return []
@@ -52,7 +52,7 @@ def prefetch_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
 
 
 def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
-    """Return label and text of each line; none where the map is files."""
+    """Return label and text of each line about a published map; none if the map is files."""
     if not counters.get("published_version"):
         return []
     lines = [("version", _version(counters)), ("known", _known(counters)), ("fetched", _fetched(counters))]
@@ -63,7 +63,7 @@ def published_lines(counters: Mapping[str, int]) -> list[tuple[str, str]]:
 
 
 def published_words(counters: Mapping[str, int]) -> list[tuple[str, bool]]:
-    """Return the same as short texts, each with whether it is a problem."""
+    """Return short texts about a published map, each with whether it is a problem."""
     if not counters.get("published_version"):
         return []
     problems = trust_problems(counters, time.time())
@@ -122,11 +122,11 @@ STATE_STYLES: Final = {
     "dirty": "blue",
     "saving": "cyan",
 }
-"""Colours of chunks by state, as Rolling-Bonxai has them."""
+"""Colours of chunks by state, the same as in Rolling-Bonxai."""
 
 
 def live_problems(row: LiveMapRow) -> list[str]:
-    """List what is wrong with a live map, a line each."""
+    """Return the problems of a live map, one line each."""
     found = [row.problem] if row.problem else []
     if row.damaged_count:
         found.append(f"damaged files, missing chunks: {row.damaged_count:,}; `shmmap live ls` names them")
@@ -134,7 +134,7 @@ def live_problems(row: LiveMapRow) -> list[str]:
 
 
 def status_lines(rows: Sequence[LiveMapRow], restarts: int) -> list[tuple[str, str]]:
-    """Return the lines of ``status``: one for each map, and what is wrong; none where there are no maps."""
+    """Return the lines of ``status`` about live maps and their problems; none without live maps."""
     lines = []
     for row in rows:
         unsaved = f"{row.unsaved:,} not saved" if row.unsaved else "all saved"

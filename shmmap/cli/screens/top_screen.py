@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap top`` shows, as lines of styled text: the same on a terminal and in a pipe."""
+"""Lines of ``shmmap top`` as styled text: the same on a terminal and in a pipe."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Line: TypeAlias = list[tuple[str, str]]  # (text, style) pieces
 
 LABEL: Final = 12
 WORTH_SHOWING_NS: Final = 1_000_000
-_WIDE: Final = 100  # columns from which there is room for everything about a client
+_WIDE: Final = 100  # from this width on, everything about a client fits
 _SHORTEST_NAME: Final = 14
 SPAN_TITLES: Final = (("10s", "10 s"), ("1min", "1 min"), ("10min", "10 min"))
 _STATE_NAMES: Final = {"healthy": "healthy", "starting": "starting", "stopped": "PAUSED"}
@@ -44,9 +44,9 @@ _LATENCIES: Final = {
     "load_cached": "  disk cache",
 }
 _SOURCES: Final = ("load_points", "load_computed", "load_cached")
-"""A loader's own time by what it did, shown where it was done."""
+"""Statistics of loaders' own time, by kind of work; shown if any."""
 _PARTS: Final = (
-    # part, what it is called, glyph, style
+    # part, name, glyph, style
     ("in_use", "in use", "█", "cyan"),
     ("idle", "idle", "▓", "green"),
     ("retired", "retired", "▒", "yellow"),
@@ -57,12 +57,13 @@ _PARTS: Final = (
 
 
 def budget_parts(counters: dict[str, int]) -> dict[str, int]:
-    """Split the budget: bytes in use and idle (both can be handed out), retired, loading, statistics, free.
+    """Split the budget into bytes: in use, idle (both can be handed out), retired, loading, statistics, free.
 
-    Loading is reserved for loads under way, statistics is what the statistics themselves take.
+    ``loading`` is reserved for loads in progress; ``statistics`` is the size of the statistics segment
+    itself.
     """
     resident, zombie = counters["bytes_resident"], counters["bytes_zombie"]
-    # retired segments are there only because they are mapped
+    # retired segments exist only because clients map them
     pinned = min(max(counters["bytes_pinned"] - zombie, 0), resident)
     parts = {
         "in_use": pinned,
@@ -83,16 +84,17 @@ def screen(
     max_clients: int,
     earlier: Snapshot | None = None,
 ) -> list[Line]:
-    """Return the lines.
+    """Return the lines of one screen.
 
     Parameters
     ----------
     width
         Columns of the terminal.
     max_clients
-        Rows there are for clients.
+        Maximum rows for clients.
     earlier
-        A snapshot of some seconds ago; latencies are of the time since, without it since the start.
+        A snapshot of some seconds ago: latencies cover the time since then.  Without it they cover the whole
+        run.
     """
     counters = found.counters
     lines = [_title(found, identity), *_flowing("map", _map(identity, counters), width, gap=1), []]
@@ -127,7 +129,7 @@ def _labelled(label: str, pieces: Line) -> Line:
 
 
 def _flowing(label: str, units: Sequence[Line], width: int, *, gap: int = 3) -> list[Line]:
-    """Put units side by side behind a label, continued below the first where the line is full."""
+    """Put units side by side after a label, continued on further lines where one is full."""
     lines: list[Line] = [_labelled(label, [])]
     used = LABEL
     for unit in units:
@@ -180,7 +182,7 @@ def _budget(counters: dict[str, int], width: int) -> list[Line]:
     for index, (name, _, glyph, style) in enumerate(_PARTS):
         cells = room - used if index == len(_PARTS) - 1 else round(room * parts[name] / total)
         if parts[name] and not cells:
-            cells = 1  # what there is can be seen
+            cells = 1  # even a small part is visible
         cells = min(cells, room - used)
         used += cells
         bar.append((glyph * cells, style))
@@ -227,7 +229,7 @@ def _quantiles(histogram: Histogram) -> str:
 
 
 def _longest_turns(counters: dict[str, int]) -> list[Line]:
-    """Show the turns that others waited for longest: some that took over a millisecond, else one."""
+    """Return the longest turns of the daemon's loop: some above a millisecond, else the longest."""
     longest = {kind: counters.get(f"longest_turn_{kind}_ns", 0) for kind in TURN_KINDS}
     shown = sorted(longest, key=lambda kind: -longest[kind])
     named = [kind for kind in shown if longest[kind] >= WORTH_SHOWING_NS][:3] or shown[:1]
@@ -286,7 +288,7 @@ def _clients(
     rest = f" {'PID':>8}{' UID':>7} {'CELLS':>6}" if with_uid else f" {'PID':>8} {'CELLS':>6}"
     rest += f" {'GIVEN':>9} {'REQUESTS':>9} {'IDLE':>8}  AT"
     places = [f"{one.pose[0]:.1f},{one.pose[1]:.1f}" if one.pose is not None else "–" for one in shown]
-    # the name gets what the numbers leave
+    # the name gets the columns that the numbers leave
     room = width - len(rest) - max(map(len, places), default=0) + len("AT")
     column = max(_SHORTEST_NAME, min(max(map(len, names), default=0), room))
     lines: list[Line] = [[(f"{'CLIENT':{column}}{rest}"[:width], "bold")]]

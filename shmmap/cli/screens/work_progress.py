@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Long runs over clouds: how far one is, on stderr, and what it made and took."""
+"""Progress of long runs over clouds on stderr, and their results."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ __all__ = ["StageProgress", "fields_text", "print_result"]
 
 _REDRAW_S: Final = 0.2
 
-_LINE_S: Final = 10.0  # between lines where each one stays
+_LINE_S: Final = 10.0  # seconds between lines where output is not a terminal
 
-_SETTLE_S: Final = 1.0  # before that, no rate is worth showing
+_SETTLE_S: Final = 1.0  # seconds before a rate is worth showing
 
 
 class StageProgress:
-    """Shows stage, part done, rate and time left; a `shmmap.dividing.settings.Progress`.
+    """Shows stage, fraction done, rate and time left; a `shmmap.dividing.settings.Progress`.
 
     Parameters
     ----------
     stream
-        Where to; stderr by default.
+        Output stream; stderr by default.
     quiet
         Show nothing.
     unit, scale
-        What is counted, and how much of it is shown as 1; a stage with less is shown one by one.
+        The unit of the counts, and the count that is shown as 1; a smaller stage is shown one by one.
     """
 
     def __init__(
@@ -66,23 +66,23 @@ class StageProgress:
             self._show()
 
     def advance(self, points: int) -> None:
-        """Count further points as done."""
+        """Count further points of the stage as done."""
         self._points += points
         if self._counted_from < 0:
-            self._counted_from = self._points  # what a resumed run finds done says nothing of its rate
+            self._counted_from = self._points  # points that a resumed run finds done would falsify the rate
         now = time.monotonic()
         if now - self._shown_s >= (_REDRAW_S if self._live else _LINE_S):
             self._shown_s = now
             self._show()
 
     def done(self, points: int) -> None:
-        """Everything is done."""
+        """Finish the stage."""
         del points
         self._end_line()
         self._total = 0
 
     def text(self, now: float) -> str:
-        """Return the line as it would be shown at ``now``, `time.monotonic`."""
+        """Return the progress line at time ``now`` (`time.monotonic`)."""
         part = f"{self._points / self._total:4.0%}  " if self._total else ""
         text = f"{self._name}  {part}{self._number(self._points)} of {self._number(self._total)} {self._unit}"
         spent = now - self._stage_s
@@ -117,14 +117,14 @@ class StageProgress:
 
 
 def fields_text(fields: Sequence[tuple[str, str]]) -> str:
-    """Return (name, dtype) pairs for a reader: ``"x:f4 y:f4 z:f4"``."""
+    """Return (name, dtype) pairs as text: ``"x:f4 y:f4 z:f4"``."""
     return " ".join(f"{name}:{dtype.lstrip('<|')}" for name, dtype in fields)
 
 
 def print_result(
     made: DividedMap | MergedCloud, lines: Sequence[tuple[str, str]], *, seconds: float, as_json: bool
 ) -> None:
-    """Print all of ``made`` as JSON, or ``lines`` about it; with the time and the memory it took."""
+    """Print the result ``made`` as JSON, or ``lines`` about it; with the run's time and memory."""
     from shmmap.dividing.settings import peak_memory_bytes
 
     peak = peak_memory_bytes()

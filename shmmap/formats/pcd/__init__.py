@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PCD files: ascii, binary and compressed."""
+"""Read and write PCD files: ascii, binary and compressed."""

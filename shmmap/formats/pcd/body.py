@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points of PCD files in each encoding, as blocks of columns."""
+"""Read the points of PCD files in each encoding, as blocks of columns."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ __all__ = [
     "record_blocks",
 ]
 
-_BLOCK_BYTES: Final = 1 << 20  # of file data per block, at most
+_BLOCK_BYTES: Final = 1 << 20  # bytes of file data per block, at most
 _BYTE: Final = np.dtype(np.uint8)
 
 _KEPT_BYTES: Final = 16 << 20  # larger sets of buffers are not kept
-_FIRST_BYTES: Final = 4 << 20  # from here on numpy asks for huge pages; only what is touched counts
+_FIRST_BYTES: Final = 4 << 20  # from this size on numpy asks for huge pages; only touched pages count
 _ALIGNMENT_BYTES: Final = 64
 _idle: list[_Scratch] = []
 
@@ -61,7 +61,7 @@ def record_blocks(
 
 
 def _balanced(points: int, limit: int) -> int:
-    """Rows per block: at most ``limit``, and no short block at the end."""
+    """Return the rows per block: at most ``limit``, without a short block at the end."""
     blocks = -(-points // max(1, limit))
     return -(-points // blocks)
 
@@ -71,13 +71,13 @@ def compressed_blocks(
 ) -> Iterator[RawBlock]:
     """Yield blocks of a ``binary_compressed`` body: two uint32 sizes, then LZF over whole fields.
 
-    Decompressed, the data is all values of the first field, then all of the second, ...  PCL leaves
-    padding fields out; a file whose sizes say that they are in is read too.
+    Decompressed, the data is all values of the first field, then all of the second, ...  PCL leaves padding
+    fields out; a file whose sizes include them is read, too.
 
     Raises
     ------
     MapDataError
-        ``bad_lzf`` or ``truncated``; nothing is allocated for sizes that cannot be true.
+        ``bad_lzf`` or ``truncated``; nothing is allocated for impossible sizes.
     """
     if not header.points:
         return
@@ -115,7 +115,7 @@ def compressed_blocks(
 
 
 def check_sizes(header: PcdHeader, compressed_bytes: int, output_bytes: int, *, left: int, path: str) -> bool:
-    """Check the two sizes before a compressed body against the header and the ``left`` bytes of the file.
+    """Check the two sizes of a compressed body against the header and the ``left`` bytes of the file.
 
     Returns
     -------
@@ -199,10 +199,10 @@ def ascii_blocks(
 
 
 class _Scratch:
-    """One growing buffer, cut into arrays; a cut stays valid until the next `cut`.
+    """One growing buffer, cut into arrays that stay valid until the next `cut`.
 
-    It outlives one file: cells are small and many, and fresh buffers for each would cost more in page faults
-    than the reading itself.
+    The buffer is used for many files: cells are small and many, and a new buffer for each would cost more in
+    page faults than reading the file.
     """
 
     def __init__(self) -> None:
@@ -238,7 +238,7 @@ class _Scratch:
 
 
 def _borrow_scratch() -> _Scratch:
-    """Return a buffer for the use inside its ``with`` alone; at most one idle one is kept."""
+    """Return a buffer for the block of a ``with``; at most one idle buffer is kept."""
     try:
         return _idle.pop()
     except IndexError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The FIELDS, SIZE, TYPE and COUNT lines of a PCD header: which values a point has."""
+"""Parse the FIELDS, SIZE, TYPE and COUNT lines of a PCD header: the values of a point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["MAX_FIELDS", "MAX_POINT_BYTES", "PADDING", "FieldProblem", "PcdField
 
 MAX_FIELDS: Final = 1024
 MAX_POINT_BYTES: Final = 1 << 20
-MAX_NAME_BYTES: Final = 40  # of a column in a segment
+MAX_NAME_BYTES: Final = 40  # bytes of a column's name in a segment
 PADDING: Final = "_"
 AXES: Final = ("x", "y", "z")
 
@@ -31,7 +31,7 @@ class PcdField:
     Attributes
     ----------
     name
-        Unique name: duplicates carry a number, ``x``, ``y`` and ``z`` are in lower case.
+        Unique name: duplicates get a number, ``x``, ``y`` and ``z`` are in lower case.
     dtype
         Little-endian type of one value.
     count
@@ -55,7 +55,7 @@ class PcdField:
 
 
 class FieldProblem(Exception):
-    """The field lines make no sense: which line, why, and the cause's name."""
+    """Contradictory or invalid field lines: which line, why, and the error's cause."""
 
     def __init__(self, key: bytes, message: str, cause: str = "bad_header") -> None:
         super().__init__(message)
@@ -64,7 +64,7 @@ class FieldProblem(Exception):
         self.cause = cause
 
 
-@lru_cache(maxsize=64)  # the cells of a map share these lines
+@lru_cache(maxsize=64)  # cells of a map share these lines
 def parse_fields(
     names: tuple[bytes, ...],
     sizes: tuple[bytes, ...],
@@ -126,7 +126,7 @@ def _count(word: bytes, low: int) -> int:
 
 
 def _unique_names(names: list[str]) -> tuple[list[str], list[str]]:
-    """Lower-case x, y and z, number duplicates, cut names to what a segment holds.
+    """Lower-case x, y and z, number duplicates, and cut names to the length that a segment can store.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def _unique_names(names: list[str]) -> tuple[list[str], list[str]]:
             renamed[names.index(axis.upper())] = axis
             warnings.append(f"field {axis.upper()!r} is taken as {axis!r}")
     original = set(renamed)
-    taken = {"xyz"}  # the name of the column that x, y and z become
+    taken = {"xyz"}  # name of the column that x, y and z form
     for index, name in enumerate(renamed):
         if name == PADDING:
             continue

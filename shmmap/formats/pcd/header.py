@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The header of a PCD file: read liberally, checked against the file's size before anything is allocated.
+"""Read PCD headers liberally, and check them against the file's size before allocating memory.
 
-The format is that of the Point Cloud Library (https://pointclouds.org/documentation/tutorials/pcd_file_format.html).
-Accepted beyond it, because such files exist: any order of lines, lower-case keys, a byte order mark,
-CRLF, comments, unknown lines, missing VERSION, COUNT, VIEWPOINT, POINTS or WIDTH and HEIGHT.
-What is merely odd becomes a warning; what leaves the meaning open is refused.
+The format is that of the Point Cloud Library
+(https://pointclouds.org/documentation/tutorials/pcd_file_format.html). Accepted beyond it, because such files
+exist: any order of lines, lower-case keys, a byte order mark, CRLF, comments, unknown lines, missing VERSION,
+COUNT, VIEWPOINT, POINTS or WIDTH and HEIGHT. Oddities become warnings; ambiguous headers are refused.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shmmap.formats.source_file import refusal
 
 __all__ = ["ENCODINGS", "HEADER_LIMIT_BYTES", "IDENTITY_VIEWPOINT", "PcdHeader", "parse_header"]
 
-HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within these
+HEADER_LIMIT_BYTES: Final = 1 << 16  # a header must end within this
 MAX_POINTS: Final = (1 << 32) - 1  # WIDTH and HEIGHT are uint32 in PCL
 ENCODINGS: Final = ("ascii", "binary", "binary_compressed")
 IDENTITY_VIEWPOINT: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -27,7 +27,7 @@ IDENTITY_VIEWPOINT: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _KEYS: Final = frozenset(
     (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 )
-_ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # the name of FIELDS in the oldest files; PCL reads it too
+_ALIASES: Final = {b"COLUMNS": b"FIELDS"}  # name of the FIELDS line in the oldest files; PCL accepts it, too
 _BOM: Final = b"\xef\xbb\xbf"
 _LFS: Final = b"version https://git-lfs"
 _INTEGER: Final = re.compile(rb"[+-]?[0-9]{1,19}\Z")
@@ -35,14 +35,14 @@ _INTEGER: Final = re.compile(rb"[+-]?[0-9]{1,19}\Z")
 
 @dataclass(frozen=True, slots=True)
 class PcdHeader:
-    """What a PCD header says, after all checks.
+    """Contents of a PCD header, after all checks.
 
     Attributes
     ----------
     fields
         In file order, padding included.
     width, height, points
-        As in the file; where they disagree, ``points`` counts and a warning says so.
+        As in the file; if they disagree, ``points`` is used and a warning added.
     encoding
         ``ascii``, ``binary`` or ``binary_compressed``.
     viewpoint
@@ -78,7 +78,7 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
         The file's first bytes, at least min(file_bytes, `HEADER_LIMIT_BYTES`) of them unless the
         whole header lies in fewer.
     path
-        For messages.
+        Name of the file in messages.
     file_bytes
         Size of the whole file.
 
@@ -117,8 +117,8 @@ def parse_header(head: bytes, *, path: str, file_bytes: int) -> PcdHeader:
     return header
 
 
-# The cells of a map share all of their headers but the numbers of points.  So a header written the
-# way PCL writes it is recognised by what it shares with one that was parsed before.
+# Headers of a map's cells differ only in their numbers of points.  So a header as PCL writes it
+# is compared with the common parts of one that was parsed before.
 _PLAIN: Final = re.compile(
     rb"(?:#[^\n]*\n)?VERSION (?P<version>[^\n]*)\nFIELDS (?P<fields>[^\n]*)\nSIZE (?P<size>[^\n]*)\n"
     rb"TYPE (?P<type>[^\n]*)\nCOUNT (?P<count>[^\n]*)\nWIDTH (?P<width>[0-9]{1,10})\n"
@@ -145,7 +145,7 @@ def _parse_any(head: bytes, path: str, file_bytes: int) -> PcdHeader:
 
 
 class _HeaderParser:
-    """The lines of one header, and the checks between them."""
+    """Parses a header's lines, and checks them against each other."""
 
     def __init__(self, head: bytes, path: str, file_bytes: int) -> None:
         self.head = head
@@ -180,14 +180,14 @@ class _HeaderParser:
         raise refusal(cause, message, path=self.path, offset=self.offsets.get(key, 0))
 
     def _read_lines(self) -> int:
-        """Collect the header's lines; returns the offset of the first data byte."""
+        """Collect the header's lines; return the offset of the first data byte."""
         offset = self._collect_lines()
         if offset is None:
             self._refuse_without_data_line()
         return offset
 
     def _collect_lines(self) -> int | None:
-        """Fill ``values``; None where the header stops without a DATA line."""
+        """Fill ``values``; return None if the header has no DATA line."""
         head, at, lower, unknown = self.head[:HEADER_LIMIT_BYTES], 0, False, 0
         if head.startswith(_BOM):
             at = len(_BOM)
@@ -332,7 +332,7 @@ class _HeaderParser:
 
 
 def _check_size(header: PcdHeader, path: str, file_bytes: int) -> None:
-    """Refuse a header that promises more than the file can hold, before memory is allocated for it."""
+    """Refuse a header that claims more than the file can hold, before allocating memory for it."""
     left = file_bytes - header.data_offset
     if header.encoding == "binary":
         needed, what = header.points * header.point_bytes, "bytes of points"

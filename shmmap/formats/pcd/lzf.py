@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LZF, the compression inside ``binary_compressed`` PCD files, with limits.
+"""Bounded LZF, the compression in ``binary_compressed`` PCD files.
 
 A stream is a sequence of tokens (Marc Lehmann's liblzf, ``lzf_d.c``): a control byte below 32
 starts a literal run of that many bytes plus one; otherwise its top three bits plus two are the
@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 __all__ = ["LITERAL_RUN", "MAX_RATIO", "TRUST_BYTES", "compress", "decompress", "first_error", "reachable"]
 
 LITERAL_RUN: Final = 32
-MAX_RATIO: Final = 88  # three bytes of input make at most 264 of output
+MAX_RATIO: Final = 88  # three bytes of input become at most 264 of output
 _LONG: Final = 7 << 5
-TRUST_BYTES: Final = 64 << 20  # walk streams that claim more output (`first_error`) before allocating it
+TRUST_BYTES: Final = 64 << 20  # streams that claim more output are checked by `first_error` before allocation
 _LIMIT_BYTES: Final = (1 << 32) - 1
 
 _Bytes = NDArray[np.uint8]
-_PROBE: Final = (b"\x01ab\x20\x01", b"ababa")  # two literals, then three bytes from two back
+_PROBE: Final = (b"\x01ab\x20\x01", b"ababa")  # two literals, then three bytes copied from two back
 
 
 def decompress(data: _Bytes, output: _Bytes) -> bool:
-    """Fill ``output`` with what the stream ``data`` stands for; False if it is not exactly that.
+    """Decompress the stream ``data`` into ``output``; False if the result does not fill it exactly.
 
     Both are contiguous, and shorter than 4 GiB (the format's size words).
     """
@@ -41,18 +41,18 @@ def decompress(data: _Bytes, output: _Bytes) -> bool:
 
 
 def reachable(input_bytes: int, output_bytes: int) -> bool:
-    """Whether any stream of ``input_bytes`` bytes can make ``output_bytes`` bytes."""
+    """Whether any stream of ``input_bytes`` bytes can decompress to ``output_bytes`` bytes."""
     return 0 < output_bytes <= min(_LIMIT_BYTES, MAX_RATIO * input_bytes)
 
 
 @lru_cache(maxsize=1)
 def _native() -> Callable[[_Bytes, _Bytes], bool] | None:
-    """Find liblzf's own function in the extension module; None where the module does not export it.
+    """Return liblzf's C function from the extension module; None if the module does not export it.
 
-    The module's function allocates its result twice, which costs as much as half the decompression
-    in page faults; the C function writes to the buffer that it is given.
+    The module's Python function allocates its result twice, which costs half as much as the decompression in
+    page faults.  The C function writes to a given buffer.
     """
-    import lzf  # a client process must not load it
+    import lzf  # a client process must not load the module
 
     try:
         function = ctypes.CDLL(lzf.__file__).lzf_decompress
@@ -84,7 +84,7 @@ def _through_module(data: _Bytes, output: _Bytes) -> bool:
 
 
 def first_error(data: memoryview[Any] | bytes, output_bytes: int) -> int | None:
-    """Walk the tokens without decoding; offset of the first bad one, or None for a sound stream."""
+    """Walk the tokens without decoding; return the offset of the first invalid one, or None."""
     at, made, size = 0, 0, len(data)
     while at < size:
         control = data[at]
@@ -110,7 +110,7 @@ def first_error(data: memoryview[Any] | bytes, output_bytes: int) -> int | None:
 
 
 def compress(data: bytes) -> bytes:
-    """Return ``data`` as an LZF stream; data that does not shrink becomes literal runs."""
+    """Return ``data`` as an LZF stream; incompressible data becomes literal runs."""
     import lzf
 
     if not data:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a PCD file straight into columns, block by block, in bounded memory.
+"""Read a PCD file directly into columns, block by block, in bounded memory.
 
-The first column is ``xyz``, (N, 3); every other field follows as a column of its own, with its own
-dtype.  Points whose x, y or z is not finite are left out and counted.  While reading, the bounds of
-the points and the XXH3-128 digest of the whole file are taken along.
+The first column is ``xyz``, (N, 3); every other field follows as a column of its own, with its own dtype.
+Points whose x, y or z is not finite are left out and counted.  Reading also yields the bounds of the points
+and the XXH3-128 digest of the whole file.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 
 Block = tuple[NDArray[Any], ...]
 
-_FIRST_READ_BYTES: Final = 2048  # holds nearly every header
+_FIRST_READ_BYTES: Final = 2048  # long enough for nearly every header
 _DATA_LINE: Final = re.compile(rb"^[ \t]*DATA(?=\s)[^\n]*\n", re.MULTILINE | re.IGNORECASE)
 _TAIL_READ_BYTES: Final = 1 << 18
 
@@ -55,9 +55,9 @@ class PcdReader(FileReader):
     header
         The checked `PcdHeader`.
     columns
-        What `blocks` yields, in order.  ``xyz`` has the file's own type, float32 or float64;
-        mixed and integer coordinates are promoted to the smallest of both that holds every value
-        (8 and 16-bit integers float32, wider ones float64).
+        What `blocks` yields, in order.  ``xyz`` has the file's own type, float32 or float64; mixed and
+        integer coordinates become the smaller of the two that holds every value (8 and 16-bit integers
+        float32, wider ones float64).
     kept, dropped
         Points yielded and left out so far.
     digest
@@ -101,17 +101,17 @@ class PcdReader(FileReader):
         return self._table.record
 
     def put_axis(self, xyz: NDArray[Any], axis: int, values: NDArray[Any]) -> None:
-        """Copy one coordinate to where it belongs, as `FieldTable.put_axis`."""
+        """Copy one coordinate to its place, as `FieldTable.put_axis`."""
         self._table.put_axis(xyz, axis, values, self.path)
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(min_xyz, max_xyz) of the finite points read so far, metres, map frame; NaN when there are none."""
+        """(min_xyz, max_xyz) of the finite points read so far, metres, map frame; NaN if there are none."""
         return self._bounds.result()
 
     @property
     def extremes(self) -> tuple[list[float], list[float]]:
-        """The same as numbers, cheaper: infinite, the wrong way round, when there are none."""
+        """Bounds as plain numbers, which is faster; +inf and -inf if there is no finite point."""
         return self._bounds.low, self._bounds.high
 
     @property
@@ -122,8 +122,8 @@ class PcdReader(FileReader):
     def blocks(self) -> Iterator[Block]:
         """Yield the points, one C-contiguous array per column, all with the same number of rows.
 
-        The arrays are reused: a consumer that keeps one copies it.  Another call reads the file
-        again from its start.
+        The arrays are reused, so a caller that keeps one must copy it.  Another call reads the file again
+        from its start.
         """
         header, source = self.header, self._source
         self.kept = self.dropped = 0
@@ -155,7 +155,7 @@ class PcdReader(FileReader):
         self.digest = source.digest()
 
     def _read_head(self) -> bytes:
-        """Return the first bytes of the file, at least its whole header."""
+        """Return the first bytes of the file, which contain its whole header."""
         size = self._source.size
         head = self._source.peek(min(size, _FIRST_READ_BYTES))
         if len(head) < size and not _DATA_LINE.search(head):
@@ -166,14 +166,14 @@ class PcdReader(FileReader):
 def expanded_blocks(
     reader: PcdReader, scratch_dir: str, block_points: int, start: int = 0
 ) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield the columns of the points from ``start`` on, points that are not finite included.
+    """Yield the columns of the points from ``start`` on, including points that are not finite.
 
     Parameters
     ----------
     reader
         An open ``binary_compressed`` file.
     scratch_dir
-        Directory of the file without a name, as large as the decompressed points.
+        Directory for an unnamed temporary file, as large as the decompressed points.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def expanded_blocks(
     compressed_bytes, output_bytes = (int(part) for part in np.frombuffer(head, "<u4"))
     padded = check_sizes(header, compressed_bytes, output_bytes, left=size - body, path=reader.path)
     with tempfile.TemporaryFile(dir=scratch_dir) as file:
-        os.posix_fallocate(file.fileno(), 0, output_bytes)  # a full disk is an error here, not a SIGBUS
+        os.posix_fallocate(file.fileno(), 0, output_bytes)  # a full disk raises an error, not SIGBUS
         data = np.memmap(file, np.uint8, mode="r+", shape=(output_bytes,))
         packed = np.memmap(reader.path, np.uint8, mode="r", offset=body, shape=(compressed_bytes,))
         if not lzf.reachable(compressed_bytes, output_bytes) or not lzf.decompress(packed, data):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the fields of a PCD file become columns: which, of which type, and from which bytes."""
+"""Map the fields of a PCD file to columns: names, types, and source bytes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from shmmap.formats.source_file import refusal
 
 __all__ = ["FieldTable", "RawBlock", "coordinate_dtype", "field_table"]
 
-# a block of columns, and x, y and z once more where they are at hand as contiguous arrays
+# a block of columns; and x, y and z as contiguous arrays if available
 RawBlock = tuple[tuple[NDArray[Any], ...], tuple[NDArray[Any], ...]]
 
 _EXACT: Final = 1 << 53  # the largest integers that float64 holds exactly
 
 
 def coordinate_dtype(dtypes: Sequence[np.dtype[Any]]) -> np.dtype[Any]:
-    """Return float32 or float64, the smaller that holds every value of all ``dtypes`` exactly.
+    """Return the smaller of float32 and float64 that holds every value of all ``dtypes`` exactly.
 
     64-bit integers become float64 too; `FieldTable.put_axis` refuses values beyond 2**53.
     """
@@ -30,14 +30,14 @@ def coordinate_dtype(dtypes: Sequence[np.dtype[Any]]) -> np.dtype[Any]:
 
 
 class FieldTable:
-    """The columns of a file and how to fill them from its fields.
+    """The columns of a file, and how its fields fill them.
 
     Attributes
     ----------
     columns
         ``xyz`` first, then every field that is neither padding nor a coordinate, in file order.
     axes, others
-        The fields behind ``xyz`` and behind the other columns.
+        The source fields of ``xyz`` and of the other columns.
     axes_are_xyz
         Whether the coordinates have the type of ``xyz`` already.
     record
@@ -63,7 +63,7 @@ class FieldTable:
         self.record = _record_dtype(fields)
 
     def block_shapes(self, rows: int) -> list[tuple[tuple[int, ...], np.dtype[Any]]]:
-        """Shape and type of each column in a block of ``rows`` rows."""
+        """Return shape and type of each column in a block of ``rows`` rows."""
         return [
             ((rows,) if spec.components == 1 else (rows, spec.components), spec.dtype)
             for spec in self.columns
@@ -87,12 +87,12 @@ class FieldTable:
         wide = values.dtype.kind in "iu" and values.dtype.itemsize == 8 and len(values) > 0
         if wide and (int(values.max()) > _EXACT or int(values.min()) < -_EXACT):
             raise refusal("coordinate_range", f"{AXES[axis]} has integers beyond 2**53", path=path)
-        with np.errstate(invalid="ignore"):  # signalling NaNs
+        with np.errstate(invalid="ignore"):  # signalling NaNs would warn
             xyz[:, axis] = values
 
     def put_records(self, block: tuple[NDArray[Any], ...], records: NDArray[Any], path: str) -> None:
-        """Copy records, fields by their unique names, into the columns of a block of as many rows."""
-        # one strided copy per axis: a copy of (N, 3) at once takes four times as long
+        """Copy records, with fields by their unique names, into the columns of a block of equal length."""
+        # one strided copy per axis: copying (N, 3) at once takes four times as long
         for axis, field in enumerate(self.axes):
             self.put_axis(block[0], axis, records[field.name], path)
         for column, field in zip(block[1:], self.others, strict=True):
@@ -118,9 +118,9 @@ _tables: Final[dict[int, FieldTable]] = {}
 
 
 def field_table(fields: tuple[PcdField, ...]) -> FieldTable:
-    """Return the table for ``fields``; the cells of a map share one.
+    """Return the table for ``fields``; cells of a map share one table.
 
-    The headers of one map share the very tuple, and its id is found faster than its hash.
+    The headers of a map share the tuple object, and looking up its id is faster than hashing it.
     """
     table = _tables.get(id(fields))
     if table is None or table.fields is not fields:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes columns as a PCD file that the Point Cloud Library and every common reader accept."""
+"""Write columns as a PCD file that the Point Cloud Library and all common readers accept."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from shmmap.formats.pcd.header import ENCODINGS, IDENTITY_VIEWPOINT
 __all__ = ["pcd_header", "pcd_rows", "write_pcd"]
 
 _BLOCK_POINTS: Final = 1 << 16
-_LZF_LIMIT_BYTES: Final = (1 << 31) - 1  # liblzf's int sizes; the file's own size words are uint32
-_FORMATS: Final = {4: "%.9g", 8: "%.17g"}  # digits that bring the same bits back
+_LZF_LIMIT_BYTES: Final = (1 << 31) - 1  # limit of liblzf's int sizes; the file's own size words are uint32
+_FORMATS: Final = {4: "%.9g", 8: "%.17g"}  # digits that restore the same bits
 
 
 def write_pcd(
@@ -42,8 +42,8 @@ def write_pcd(
         becomes one field of COUNT k.  The types are those of PCD: 8 to 64-bit integers, float32 and
         float64.
     encoding
-        ``ascii``, ``binary`` or ``binary_compressed`` (at most 2 GiB of data).  All three keep every
-        bit, but for the payload of NaNs in ``ascii``.
+        ``ascii``, ``binary`` or ``binary_compressed`` (at most 2 GiB of data).  All three keep every bit,
+        except the payload of NaNs in ``ascii``.
     viewpoint
         Translation x y z (metres), then quaternion w x y z.
 
@@ -69,7 +69,7 @@ def write_pcd(
 
 
 def _fields(columns: Mapping[str, NDArray[Any]]) -> list[tuple[str, NDArray[Any]]]:
-    """Return (name, array) of every PCD field, checked; little-endian, rows first."""
+    """Return (name, array) of every PCD field, checked: little-endian, row-major."""
     fields: list[tuple[str, NDArray[Any]]] = []
     for name, values in columns.items():
         array = np.asarray(values)
@@ -109,13 +109,13 @@ def pcd_header(
 ) -> bytes:
     """Return the header of a file with ``fields`` (name, dtype of one value, values per point).
 
-    ``header_bytes`` asks for that length, got by spaces at the end of the comment line: so a header can
-    be written last, before points whose number was not known.
+    ``header_bytes`` pads the header to that length with spaces at the end of the comment line.  So it can be
+    written in front of the points once their number is known.
 
     Raises
     ------
     BadRequest
-        The viewpoint makes no sense, there are too many points, or the header is longer than asked for.
+        The viewpoint is invalid, there are too many points, or the header exceeds ``header_bytes``.
     """
     numbers = [float(number) for number in viewpoint]
     if len(numbers) != 7 or not np.isfinite(numbers).all():

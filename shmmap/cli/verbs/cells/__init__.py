@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verbs that get cells, and manage those in memory."""
+"""Verbs that read cells, and manage those in memory."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap reload``, ``evict``, ``pin``, ``unpin`` and ``stop``: what operators alone may ask of a daemon."""
+"""``shmmap reload``, ``evict``, ``pin``, ``unpin`` and ``stop``: commands that only operators may send."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ daemon answers."""
 
 
 def add_reload(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``reload``."""
     parser = add_verb(
         subparsers,
         "reload",
@@ -52,7 +52,7 @@ def add_reload(subparsers: Subparsers) -> None:
 
 
 def run_reload(args: argparse.Namespace) -> int:
-    """Print what changed."""
+    """Reload the map's metadata, and print what changed."""
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:
@@ -80,14 +80,14 @@ def run_reload(args: argparse.Namespace) -> int:
 
 
 _NAMED: Final = 20
-"""Kept segments that are named one by one."""
+"""Pinned segments that are named one by one, at most."""
 
 _CELLS_EXIT = """\
 Exit code: 0; 1 when an id is unknown, an area touches no cell, or this user may not do it."""
 
 
 def add_evict(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``evict``."""
     parser = add_verb(
         subparsers,
         "evict",
@@ -105,7 +105,7 @@ def add_evict(subparsers: Subparsers) -> None:
 
 
 def run_evict(args: argparse.Namespace) -> int:
-    """Evict, and print what became free."""
+    """Evict cells, and print the bytes freed."""
     from shmmap.protocol.messages import Evicted
 
     kept: list[str] = []
@@ -136,7 +136,7 @@ def run_evict(args: argparse.Namespace) -> int:
 
 
 def _kept(client: Client, cells: list[str] | None) -> list[str]:
-    """Return the segments that an operator keeps, of these cells or of all: ``"town_0_0.pcd: points"``."""
+    """Return the pinned segments of these cells or of all: ``"town_0_0.pcd: points"``."""
     names = {cell.removeprefix(client.welcome.id_prefix) for cell in cells or ()}
     return [
         f"{row.id.rpartition('/')[2]}: {row.layer}"
@@ -151,7 +151,7 @@ Exit code: 0, or 1 when this user may not do it."""
 
 
 def add_stop(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``stop``."""
     parser = add_verb(
         subparsers,
         "stop",
@@ -167,7 +167,7 @@ def add_stop(subparsers: Subparsers) -> None:
 
 
 def run_stop(args: argparse.Namespace) -> int:
-    """Ask for the end."""
+    """Ask the daemon to stop."""
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:
@@ -186,7 +186,7 @@ _PIN_COLUMNS = (Column("CELL"), Column("LAYER"), Column("STATE"), Column("MEMORY
 
 
 def add_pin(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``pin``."""
     parser = add_verb(
         subparsers,
         "pin",
@@ -204,7 +204,7 @@ def add_pin(subparsers: Subparsers) -> None:
 
 
 def run_pin(args: argparse.Namespace) -> int:
-    """Pin, and print the pinned cells."""
+    """Pin cells, and print all pins."""
     layers = layers_from(args)
     return _change_pins(args, "pin", lambda client, cells: client.pin(cells or (), layers), optional=True)
 
@@ -216,7 +216,7 @@ def _change_pins(
     *,
     optional: bool = False,
 ) -> int:
-    """Change what is pinned, and print what is pinned then; returns the exit code."""
+    """Change pins, and print those that result; return the exit code."""
     from shmmap.protocol.messages import Pinned
 
     def show(answer: Pinned) -> None:
@@ -235,7 +235,7 @@ def _change_pins(
 
 
 def add_unpin(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``unpin``."""
     parser = add_verb(
         subparsers,
         "unpin",
@@ -253,5 +253,5 @@ def add_unpin(subparsers: Subparsers) -> None:
 
 
 def run_unpin(args: argparse.Namespace) -> int:
-    """End pins, and print what stays pinned."""
+    """Remove pins, and print those that remain."""
     return _change_pins(args, "unpin", lambda client, cells: client.unpin(cells))

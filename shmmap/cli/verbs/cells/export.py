@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap export``: cells from shared memory to files."""
+"""``shmmap export``: write cells from shared memory to files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Exit code: 0; 1 when a cell could not be loaded, or there is no cell or no point
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``export``."""
     parser = add_verb(
         subparsers,
         "export",
@@ -68,7 +68,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the files."""
+    """Write the files of an export."""
     from shmmap.cli.daemon_address import connect
 
     area = area_from(args)
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _complain_of(found: CellSet, wait_s: float) -> None:
-    """Say which cells could not be loaded."""
+    """Report the cells that could not be loaded."""
     for line in failure_lines(found.failed):
         complain("shmmap", line)
     for pending in found.pending:
@@ -137,7 +137,7 @@ def _format(args: argparse.Namespace) -> str:
 
 
 def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tuple[Path, list[Cell]]]:
-    """Which file takes which cells."""
+    """Return the cells of each output file."""
     unique = list({cell.id: cell for cell in cells}.values())
     if args.output is not None:
         return [(Path(args.output), unique)]
@@ -148,12 +148,12 @@ def _plan(args: argparse.Namespace, cells: Sequence[Cell], kind: str) -> list[tu
 
 
 def _merged_columns(cells: Sequence[Cell], area: Area | None) -> dict[str, NDArray[Any]]:
-    """Put the points of several cells one after the other; given an area, only those in it.
+    """Concatenate the points of several cells; given an area, only the points in it.
 
     Raises
     ------
     BadRequest
-        The cells have different columns, so that no one table holds all of them.
+        The cells have different columns, so that one table cannot hold them all.
     """
     import numpy as np
 
@@ -177,7 +177,7 @@ def _merged_columns(cells: Sequence[Cell], area: Area | None) -> dict[str, NDArr
 
 
 def _inside(area: Area, cell: Cell) -> NDArray[np.bool_]:
-    """Which points of a cell lie in an area, (N,): each is judged as a box without extent."""
+    """Return a mask (N,) of a cell's points in an area; each point counts as a box without extent."""
     import numpy as np
 
     x, y, z = (cell.xyz[:, axis].astype(np.float64) + cell.origin[axis] for axis in range(3))
@@ -188,7 +188,7 @@ def _inside(area: Area, cell: Cell) -> NDArray[np.bool_]:
 
 
 def _write(path: Path, columns: dict[str, NDArray[Any]], kind: str, args: argparse.Namespace) -> None:
-    """Write one file; it appears whole or not at all."""
+    """Write one file, complete or not at all."""
     from shmmap.formats.durable_file import appearing_file, writing_errors
     from shmmap.formats.npz_writer import write_npz
     from shmmap.formats.pcd.writer import write_pcd

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap inspect PATH``: what a point-cloud file holds, or every cloud of a directory."""
+"""``shmmap inspect PATH``: describe a point-cloud file, or every cloud of a directory."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _FILES = (
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``inspect``."""
     parser = add_verb(
         subparsers,
         "inspect",
@@ -71,7 +71,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what is there."""
+    """Print the description of a file or directory."""
     from shmmap.cli.verbs.cells import outputs
 
     if os.path.isdir(args.path):
@@ -166,7 +166,7 @@ def _directory(args: argparse.Namespace) -> int:
 
 
 def _as_map(path: str, found: list[CloudDescription]) -> outputs.ServedMap | None:
-    """Describe files as cells of their map, and where its metadata is wrong; None where there is none."""
+    """Compare files with the metadata of their divided map; None if they have none."""
     import numpy as np
 
     from shmmap.cli.verbs.cells import outputs
@@ -266,7 +266,7 @@ def _all_bounds(found: list[CloudDescription]) -> outputs.Bounds | None:
 
 
 def _grouped_warnings(found: list[CloudDescription]) -> list[tuple[str, str]]:
-    """Warnings, each once, with the file it is about or how many there are of it."""
+    """Return each distinct warning once, with its file or the number of files that have it."""
     files: dict[str, list[str]] = {}
     for one in found:
         for warning in one.warnings:
@@ -281,7 +281,7 @@ def _grouped_warnings(found: list[CloudDescription]) -> list[tuple[str, str]]:
 
 
 def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
-    """Name and units of a file's system; of its warnings nothing is said twice."""
+    """Return the name and units of a file's coordinate system, without text that its warnings repeat."""
     if crs is None:
         return []
     from shmmap.formats.coordinate_system import units_text
@@ -292,7 +292,7 @@ def _crs_lines(crs: CoordinateSystem | None) -> list[tuple[str, str]]:
 
 
 def _in_metres(crs: CoordinateSystem | None) -> bool:
-    """Whether coordinates are in metres, as far as the file says."""
+    """Whether coordinates are in metres, or the file does not say."""
     return crs is None or not (crs.geographic or any(unit.metres != 1.0 for unit in crs.units))
 
 

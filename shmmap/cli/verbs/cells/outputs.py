@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs about cells print as JSON; imported for that alone."""
+"""JSON output of the verbs about cells; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
 
 
 class Reload(msgspec.Struct):
-    """What is different in the map."""
+    """Changes of the map found by a reload."""
 
     map_version: Hex
     changed: Annotated[int, msgspec.Meta(description="cells whose file changed")]
@@ -48,7 +48,7 @@ class Reload(msgspec.Struct):
 
 
 class Eviction(msgspec.Struct):
-    """Numbers of segments."""
+    """Numbers of segments after an eviction."""
 
     freed: int
     still_mapped: Annotated[int, msgspec.Meta(description="retired, freed when no client maps them")]
@@ -57,13 +57,13 @@ class Eviction(msgspec.Struct):
 
 
 class Stop(msgspec.Struct):
-    """The daemon that ends."""
+    """The daemon that is stopping."""
 
     stopping: Annotated[int, msgspec.Meta(description="its pid")]
 
 
 class Pin(msgspec.Struct):
-    """A layer of a cell that is kept."""
+    """A pinned layer of a cell."""
 
     id: str
     layer: str
@@ -74,14 +74,14 @@ class Pin(msgspec.Struct):
 
 
 class Pins(msgspec.Struct):
-    """What is pinned."""
+    """All pinned layers."""
 
     cells: list[Pin]
     unknown: Annotated[list[str], msgspec.Meta(description="ids that the map does not have")]
 
 
 class FoundCell(msgspec.Struct):
-    """Where a layer of a cell lies in shared memory."""
+    """Location of a layer of a cell in shared memory."""
 
     id: str
     version: Hex
@@ -95,14 +95,14 @@ class FoundCell(msgspec.Struct):
 
 
 class PendingLayer(msgspec.Struct):
-    """A layer of a cell that is being loaded."""
+    """A layer of a cell that is still being loaded."""
 
     id: str
     layer: str
 
 
 class FailedLayer(msgspec.Struct):
-    """A layer of a cell that could not be loaded; ``holders`` map memory of the full budget."""
+    """A layer of a cell that could not be loaded; if the budget is full, ``holders`` use its memory."""
 
     id: str
     layer: str
@@ -112,7 +112,7 @@ class FailedLayer(msgspec.Struct):
 
 
 class Found(msgspec.Struct):
-    """What a client would get."""
+    """The reply to a client's request for cells."""
 
     epoch: Hex
     map_version: Hex
@@ -124,7 +124,7 @@ class Found(msgspec.Struct):
 
     @classmethod
     def of(cls, found: CellSet, frame_id: str) -> Found:
-        """Return all of an answer."""
+        """Return the JSON form of an answer."""
         return cls(
             hexed(found.epoch),
             hexed(found.map_version),
@@ -155,7 +155,7 @@ class Found(msgspec.Struct):
 
 
 class File(msgspec.Struct):
-    """A file, and the ids of the cells in it."""
+    """An exported file, and the ids of the cells in it."""
 
     path: str
     points: int
@@ -163,13 +163,13 @@ class File(msgspec.Struct):
 
 
 class Exported(msgspec.Struct):
-    """What was written."""
+    """The files written by an export."""
 
     files: list[File]
 
 
 class Field(msgspec.Struct):
-    """A field; ``xyz`` is x, y and z."""
+    """A field of a cloud; ``xyz`` stands for x, y and z."""
 
     name: str
     dtype: Annotated[str, msgspec.Meta(description="as numpy writes it")]
@@ -178,20 +178,20 @@ class Field(msgspec.Struct):
 
 
 class Bounds(msgspec.Struct):
-    """Bounds of finite points."""
+    """Bounds of all finite points."""
 
     min: list[float]
     max: list[float]
 
     @classmethod
     def of(cls, found: CloudDescription) -> Bounds | None:
-        """Return the bounds of a file; None without a finite point."""
+        """Return the JSON form of a file's bounds; None without a finite point."""
         lowest, highest = (bound.tolist() for bound in found.bounds)
         return cls(lowest, highest) if all(map(math.isfinite, lowest)) else None
 
 
 class Crs(msgspec.Struct):
-    """What a file says of its coordinates."""
+    """The coordinate system that a file names."""
 
     name: str
     epsg: Annotated[int, msgspec.Meta(description="0: not said")]
@@ -220,7 +220,7 @@ class CloudFile(msgspec.Struct):
 
     @classmethod
     def of(cls, found: CloudDescription) -> CloudFile:
-        """Return all that a file holds."""
+        """Return the JSON form of a file's description."""
         crs = found.crs
         return cls(
             found.path,
@@ -249,7 +249,7 @@ class CloudFile(msgspec.Struct):
 
 
 class UnreadFile(msgspec.Struct):
-    """A file that cannot be read, and why."""
+    """A file that cannot be read, and the reason."""
 
     path: str
     message: str
@@ -263,7 +263,7 @@ class Outside(msgspec.Struct):
 
 
 class ServedMap(msgspec.Struct):
-    """A directory as a divided map."""
+    """A directory, described as a divided map."""
 
     cells: int
     outside_box: list[Outside]
@@ -277,7 +277,7 @@ class ServedMap(msgspec.Struct):
 
 
 class Directory(msgspec.Struct):
-    """A directory of files: sums and bounds of all."""
+    """A directory of clouds: totals, and bounds of all points."""
 
     path: str
     files: list[CloudFile]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap query``: what a client would get."""
+"""``shmmap query``: request cells as a client does, and print the answer."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ _COLUMNS = (
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``query``."""
     parser = add_verb(
         subparsers,
         "query",
@@ -101,7 +101,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the answer."""
+    """Request cells and print the answer."""
     from shmmap.cli.daemon_address import connect
 
     area = area_from(args)
@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, found: CellSet) -> int:
-    """Return the exit code of a complete answer; where there is nothing in it, say so."""
+    """Return the exit code of a complete answer; report if it has no cells."""
     if found.cells:
         if args.held is None and (empty := empty_layers(found)):
             return nothing_found(args, empty)
@@ -143,10 +143,10 @@ def _judge_empty(args: argparse.Namespace, client: Client, area: Area | None, fo
 
 
 def held_cell(text: str) -> str | tuple[str, int]:
-    """Read ``ID`` or ``ID@VERSION``, split at the last @; the version is 1 to 16 hex digits."""
+    """Parse ``ID`` or ``ID@VERSION``, split at the last @; the version is 1 to 16 hex digits."""
     cell_id, at, version = text.rpartition("@")
     if not at or "/" in version or "." in version:
-        return text  # the @ belongs to a name
+        return text  # the @ is part of the id
     if not cell_id or not re.fullmatch("[0-9a-fA-F]{1,16}", version):
         raise BadRequest(
             f"--held: {text!r} is not ID@VERSION",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap live``: what is done with live maps."""
+"""``shmmap live``: inspect, save, check, export and reset live maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["add_parser"]
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``live``."""
     parser = add_verb(
         subparsers,
         "live",

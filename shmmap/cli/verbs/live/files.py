@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap live fsck``, ``export`` and ``reset``: the files of a live map, without its daemon."""
+"""``shmmap live fsck``, ``export`` and ``reset``: work on a live map's files without its daemon."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _add_directory(parser: argparse.ArgumentParser) -> None:
 
 
 def _directory_from(args: argparse.Namespace) -> str:
-    """Return its path: what is no directory may be the name of a map that has one."""
+    """Return the map's directory; an argument that is no directory may be the name of a map."""
     given: str = args.directory
     if os.path.isdir(given) or os.sep in given:
         return os.path.abspath(given)
@@ -46,13 +46,13 @@ def _directory_from(args: argparse.Namespace) -> str:
 
 
 def _places(name: str) -> list[str]:
-    """Where a live map of a name may have its files, as settings and custom say."""
+    """Return the directories where a live map of this name may be, by settings and by default."""
     from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.daemon.config_live import SERVICE_STATE, live_directory
 
     config = load_config({}, file=installed_config_file())
     places = [one.path for one in config.live if one.name == name and one.path]
-    with contextlib.suppress(ConfigError):  # no home, no state of its own
+    with contextlib.suppress(ConfigError):  # no home directory: no state directory of the user
         places.append(live_directory(config.instance, name))
     return [*places, f"{SERVICE_STATE}/{config.instance}/live/{name}"]
 
@@ -70,7 +70,7 @@ _MANIFEST = {
 
 
 def add_fsck(subparsers: Subparsers) -> None:
-    """Describe the action."""
+    """Add the action ``fsck``."""
     parser = add_verb(
         subparsers,
         "fsck",
@@ -95,7 +95,7 @@ def add_fsck(subparsers: Subparsers) -> None:
 
 
 def run_fsck(args: argparse.Namespace) -> int:
-    """Check, and repair if that was asked for."""
+    """Check the files, and repair them if requested."""
     from shmmap.daemon.live.disk.maintenance import check, repair
     from shmmap.daemon.live.disk.stored_map import opened_folder, opened_folder_to_read
     from shmmap.formats.durable_file import writing_errors
@@ -176,7 +176,7 @@ Exit code: 0; 1 no such voxel (then nothing is written), 2 wrong usage or OUT ex
 
 
 def add_export(subparsers: Subparsers) -> None:
-    """Describe the action."""
+    """Add the action ``export``."""
     parser = add_verb(
         subparsers,
         "export",
@@ -215,7 +215,7 @@ def add_export(subparsers: Subparsers) -> None:
 
 
 def _run_export(args: argparse.Namespace) -> int:
-    """Export, and say what came out."""
+    """Export the map, and print the result."""
     import time
 
     from shmmap.daemon.live.disk.exporting import export
@@ -280,7 +280,7 @@ with it."""
 
 
 def add_reset(subparsers: Subparsers) -> None:
-    """Describe the action."""
+    """Add the action ``reset``."""
     parser = add_verb(
         subparsers,
         "reset",
@@ -298,7 +298,7 @@ def add_reset(subparsers: Subparsers) -> None:
 
 
 def _run_reset(args: argparse.Namespace) -> int:
-    """Move or delete the files."""
+    """Move the files aside, or delete them."""
     from shmmap.daemon.live.disk.maintenance import files_of_map, reset
     from shmmap.daemon.live.disk.stored_map import opened_folder
     from shmmap.formats.durable_file import writing_errors

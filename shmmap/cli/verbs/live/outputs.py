@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap live`` prints as JSON; imported for that alone."""
+"""JSON output of ``shmmap live``; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Chunk(msgspec.Struct):
 
     @classmethod
     def of(cls, chunk: ChunkInfo, resolution: float) -> Chunk:
-        """Return what is known of a chunk."""
+        """Return the JSON form of a chunk."""
         return cls(
             (chunk.key.x, chunk.key.y, chunk.key.z),
             chunk.state,
@@ -64,7 +64,7 @@ class ShownMap(msgspec.Struct):
 
 
 class Saved(msgspec.Struct):
-    """A live map that was saved."""
+    """The result of saving a live map."""
 
     map: str
     files: Annotated[int, msgspec.Meta(description="chunks on disk")]
@@ -72,7 +72,7 @@ class Saved(msgspec.Struct):
 
 
 def checked_kind() -> object:
-    """Return what ``fsck --json`` prints: totals are those of good chunks."""
+    """Return the struct that ``fsck --json`` prints; its totals count sound chunks only."""
     from shmmap.daemon.live.disk.maintenance import CheckedMap
 
     kind = more_of(CheckedMap, good=bool, chunks=int, **dict.fromkeys(TOTALS, int))
@@ -82,14 +82,14 @@ def checked_kind() -> object:
 
 
 def exported_kind() -> object:
-    """Return what ``export --json`` prints."""
+    """Return the struct that ``export --json`` prints."""
     from shmmap.daemon.live.disk.exporting import ExportedVoxels
 
     return more_of(ExportedVoxels, seconds=float)
 
 
 def reset_kind() -> object:
-    """Return what ``reset --json`` prints."""
+    """Return the struct that ``reset --json`` prints."""
     from shmmap.daemon.live.disk.maintenance import ResetMap
 
     return ResetMap

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap live ls``, ``show`` and ``save``: the live maps of a daemon."""
+"""``shmmap live ls``, ``show`` and ``save``: live maps of a running daemon."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _MAP_COLUMNS = (
 
 
 def add_ls(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the action ``ls``."""
     parser = add_verb(
         subparsers,
         "ls",
@@ -62,7 +62,7 @@ def add_ls(subparsers: Subparsers) -> None:
 
 
 def _run_ls(args: argparse.Namespace) -> int:
-    """Print the table."""
+    """Print the table of live maps."""
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:
@@ -84,7 +84,7 @@ def _run_ls(args: argparse.Namespace) -> int:
 
 
 def _problems_of(row: LiveMapRow) -> list[str]:
-    """List what is wrong with a live map, a line each."""
+    """Return the problems of a live map, one line each."""
     found = [row.problem] if row.problem else []
     return [*found, *row.damaged]
 
@@ -114,7 +114,7 @@ _COLOURS = {
     "loading": "bright_black",
     "saved": "dim",
 }
-"""Rolling-Bonxai's colours: clean green, dirty blue, not there yet dark."""
+"""Rolling-Bonxai's colours: clean green, dirty blue, not yet loaded dark."""
 
 _CHUNK_COLUMNS = (
     Column("CHUNK"),
@@ -131,7 +131,7 @@ _CHUNK_COLUMNS = (
 
 
 def add_show(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the action ``show``."""
     parser = add_verb(
         subparsers,
         "show",
@@ -150,7 +150,7 @@ def add_show(subparsers: Subparsers) -> None:
 
 
 def _run_show(args: argparse.Namespace) -> int:
-    """Print it."""
+    """Print a live map and its chunks."""
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:
@@ -207,7 +207,7 @@ Exit code: 0, 1 when this user may not, 2 when there is no such map, 69 when no 
 
 
 def add_save(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the action ``save``."""
     parser = add_verb(
         subparsers,
         "save",
@@ -223,7 +223,7 @@ def add_save(subparsers: Subparsers) -> None:
 
 
 def _run_save(args: argparse.Namespace) -> int:
-    """Ask for it, and wait."""
+    """Request a save, and wait for it."""
     from shmmap.cli.daemon_address import connect
 
     begin_s = time.monotonic()

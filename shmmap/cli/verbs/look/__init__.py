@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verbs that look at a daemon and its clients."""
+"""Verbs that show the state of a daemon and its clients."""

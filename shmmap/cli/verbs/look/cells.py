@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap ls`` and ``shmmap show``: the cells in shared memory, and everything about one."""
+"""``shmmap ls`` and ``shmmap show``: list the cells in shared memory, and describe one."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ _COLUMNS = (
 
 
 _STATES = ("resident", "ahead", "stale", "retired")
-"""States as they are shown; JSON has ``zombie`` for the last, and ``ahead`` apart."""
+"""States as printed; JSON says ``zombie`` for the last, and has ``ahead`` as a field of its own."""
 
 
 def add_ls(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``ls``."""
     parser = add_verb(
         subparsers,
         "ls",
@@ -88,10 +88,10 @@ def add_ls(subparsers: Subparsers) -> None:
 
 
 def run_ls(args: argparse.Namespace) -> int:
-    """Print the table."""
+    """Print the table of cells."""
     import gc
 
-    gc.disable()  # a look for cycles among thousands of rows takes a quarter of the time
+    gc.disable()  # garbage collection among thousands of rows takes a quarter of the time
     try:
         return _list(args)
     finally:
@@ -171,7 +171,7 @@ Exit code: 0, or 1 when the map has no such cell."""
 
 
 def add_show(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``show``."""
     parser = add_verb(
         subparsers,
         "show",
@@ -187,7 +187,7 @@ def add_show(subparsers: Subparsers) -> None:
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """Print the cell."""
+    """Print everything about one cell."""
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap map``: the map from above, what of it is in memory, and where clients are."""
+"""``shmmap map``: the map from above, its cells in memory, and the clients' positions."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 MAX_ON_DISK: Final = 50_000
-"""More cells than this are left out of a picture where they are not in memory, and not asked for."""
+"""With more cells on disk than this, a picture shows only those in memory."""
 
 
 class OnDisk(NamedTuple):
-    """What the daemon said of the part of the map that is drawn.
+    """The daemon's description of the drawn part of the map.
 
     Attributes
     ----------
     cells
-        Names and boxes of its cells; none if there are more than `MAX_ON_DISK`.
+        Names and boxes of the cells; empty if there are more than `MAX_ON_DISK`.
     total
-        How many there are, of too many in an area only that; None if the daemon did not say.
+        Number of cells; for an area with too many only a larger number than `MAX_ON_DISK`; None if unknown.
     everywhere
-        What the whole map spans; None where it has no cells, or the daemon did not say.
+        Bounds of the whole map; None if it has no cells, or the daemon did not say.
     """
 
     cells: list[tuple[str, BoxTuple]]
@@ -51,7 +51,7 @@ class OnDisk(NamedTuple):
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``map``."""
     parser = add_verb(
         subparsers,
         "map",
@@ -74,7 +74,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw."""
+    """Draw the map."""
     from shmmap.cli.daemon_address import snapshot
     from shmmap.cli.program import write_text
     from shmmap.cli.screens.map_scene import html_page, svg
@@ -110,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
 def _live_scene(
     args: argparse.Namespace, area: Area | None, found: Snapshot
 ) -> tuple[Scene, BoxTuple | None]:
-    """Ask for the chunks of a live map; also returns what all of them span."""
+    """Request the chunks of a live map; return the scene and the bounds of all chunks."""
     from shmmap.cli.daemon_address import connect
     from shmmap.cli.screens.map_scene import Scene, chunk_squares
     from shmmap.geometry import Box
@@ -145,7 +145,7 @@ def _scene(
     bounds = everywhere or (0.0, 0.0, 1.0, 1.0)
     if area is not None:
         bounds = area.bounds
-        shown = Box(*bounds)  # all of what is drawn
+        shown = Box(*bounds)  # bounds of everything drawn
         rows = [rows[index] for index in those_in(shown, [row.box for row in rows])]
     return Scene(
         bounds=bounds,
@@ -160,7 +160,7 @@ def _scene(
 
 
 def _on_disk(args: argparse.Namespace, area: Area | None, found: Snapshot, id_prefix: str) -> OnDisk:
-    """Ask for the cells that are drawn, unless they are too many or the daemon does not answer."""
+    """Request the cells to draw, unless they are too many or the daemon does not reply."""
     from shmmap.cli.daemon_address import connect
     from shmmap.geometry import Box
 
@@ -199,7 +199,7 @@ def _note(area: Area | None, found: Snapshot, rows: list[CellRow], disk: OnDisk)
 
 
 def _published(counters: dict[str, int]) -> list[str]:
-    """Say how much of a published map is known, and whether its store answers."""
+    """Return texts about a published map, and for how long its store has been out of reach."""
     texts = [text for text, _trouble in published_words(counters)]
     if texts and counters.get("origin_out", 0):
         texts.append(f"its store is out of reach for {outage_so_far(counters)}")

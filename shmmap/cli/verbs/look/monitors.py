@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap health``, ``metrics`` and ``doctor``: what scripts and monitors ask, and what is wrong."""
+"""``shmmap health``, ``metrics`` and ``doctor``: for scripts, for monitoring, and for finding faults."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ offers is refused, or a live map has a problem."""
 
 
 def add_health(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``health``."""
     parser = add_verb(
         subparsers,
         "health",
@@ -47,7 +47,7 @@ def add_health(subparsers: Subparsers) -> None:
 
 
 def run_health(args: argparse.Namespace) -> int:
-    """Print one word and why; return what the exit code says."""
+    """Print the health in one word, with reasons; return the exit code."""
     from shmmap.cli.daemon_address import has_lost_socket, snapshot
 
     found, identity = snapshot(args)
@@ -77,7 +77,7 @@ def run_health(args: argparse.Namespace) -> int:
 
 
 def _troubles(found: Snapshot) -> list[str]:
-    """List what clients lack although the daemon answers."""
+    """Return problems that clients have although the daemon replies."""
     counts = found.counters
     counted_troubles = (
         (counts.get("refused_over_budget_1min", 0), "cells refused for lack of memory in the last minute"),
@@ -94,7 +94,7 @@ def _troubles(found: Snapshot) -> list[str]:
 
 
 def _defects(found: Snapshot) -> str:
-    """Return the defects that the daemon survived, if any: to be reported."""
+    """Return a line about internal errors that the daemon survived and that should be reported."""
     count = found.counters.get("defects", 0)
     return f"; it survived {counted(count, 'exception')}, see its log" if count else ""
 
@@ -107,7 +107,7 @@ Exit code: 0, or 69 when the daemon is dead or was never started (shmmap_up is 0
 
 
 def add_metrics(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``metrics``."""
     parser = add_verb(
         subparsers,
         "metrics",
@@ -122,7 +122,7 @@ def add_metrics(subparsers: Subparsers) -> None:
 
 
 def run_metrics(args: argparse.Namespace) -> int:
-    """Print one scrape."""
+    """Print the metrics once."""
     from shmmap.cli.daemon_address import locate
     from shmmap.statistics.prometheus import exposition
     from shmmap.statistics.reader import read_statistics
@@ -138,7 +138,7 @@ Exit code: 0 no finding is `fail`, 1 one is, 78 the configuration has a mistake.
 
 
 def add_doctor(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``doctor``."""
     parser = add_verb(
         subparsers,
         "doctor",
@@ -160,7 +160,7 @@ def add_doctor(subparsers: Subparsers) -> None:
 
 
 def run_doctor(args: argparse.Namespace) -> int:
-    """Print every finding."""
+    """Print all findings."""
     from shmmap.cli import daemon_address
     from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.doctor.checks import diagnose, examine

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``shmmap status``, ``top`` and ``health`` print as JSON; imported for that alone."""
+"""JSON output of ``shmmap status``, ``top`` and ``health``; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ State: TypeAlias = Annotated[
 
 
 class Prefetching(msgspec.Struct):
-    """Cells fetched before clients request them."""
+    """Counters of cells fetched before clients request them."""
 
     outage_tolerance_s: Annotated[float, msgspec.Meta(description="the setting")]
     origin_out: Annotated[bool, msgspec.Meta(description="no load succeeds")]
@@ -59,7 +59,7 @@ class Prefetching(msgspec.Struct):
 
     @classmethod
     def of(cls, counters: Mapping[str, int]) -> Prefetching:
-        """Return the setting, the storage's outages and the counters."""
+        """Return the setting, the storage's outages and the counters of prefetching."""
         ratio = over_fetch(counters)
         return cls(
             counters.get("outage_tolerance_ns", 0) * 1e-9,
@@ -76,7 +76,7 @@ class Prefetching(msgspec.Struct):
 
 
 class Published(msgspec.Struct):
-    """The published map that is served; times are Unix seconds."""
+    """The published map that the daemon serves; times are Unix seconds."""
 
     version: int
     refused: Annotated[int | None, msgspec.Meta(description="number of an offered version that is refused")]
@@ -97,7 +97,7 @@ class Published(msgspec.Struct):
 
     @classmethod
     def of(cls, counters: Mapping[str, int]) -> Published | None:
-        """Return what is known of it; None where the map is files."""
+        """Return the JSON form of a published map's counters; None if the map is files."""
         if not counters.get("published_version"):
             return None
         taken, expires, out = (
@@ -146,7 +146,7 @@ class Status(msgspec.Struct):
 
     @classmethod
     def of(cls, found: Snapshot, identity: DaemonIdentity) -> Status:
-        """Return all of it."""
+        """Return the state of a daemon."""
         return cls(
             found.state,
             round(found.beat_age_s, 6),
@@ -168,7 +168,7 @@ class Status(msgspec.Struct):
 
 
 class Latency(msgspec.Struct):
-    """Quantiles in seconds, null when there is none."""
+    """Quantiles in seconds, null without measurements."""
 
     p50: float | None
     p99: float | None
@@ -209,7 +209,7 @@ class Top(msgspec.Struct):
 
     @classmethod
     def of(cls, found: Snapshot) -> Top:
-        """Return all of it."""
+        """Return memory, latency and clients of a daemon."""
         count = found.counters
         verdict = cache_verdict(count)
         ratios = {}
@@ -252,7 +252,7 @@ class Health(msgspec.Struct):
 
 
 class Listed(msgspec.Struct):
-    """The segments of a daemon, in its statistics' state."""
+    """The state of a daemon, and its segments."""
 
     state: str
     epoch: Hex
@@ -261,7 +261,7 @@ class Listed(msgspec.Struct):
 
 
 class Shown(msgspec.Struct):
-    """One cell."""
+    """Everything about one cell."""
 
     id: str
     version: Hex
@@ -277,7 +277,7 @@ class Shown(msgspec.Struct):
 
     @classmethod
     def of(cls, cell: ShownCell) -> Shown:
-        """Return all that a daemon knows of a cell."""
+        """Return the JSON form of a cell."""
         segments, now_ns = [], time.monotonic_ns()
         for row in cell.segments:
             segments.append(Segment.whole(row, now_ns))
@@ -296,7 +296,7 @@ class Shown(msgspec.Struct):
 
 
 class Clients(msgspec.Struct):
-    """The clients of a daemon, this program among them."""
+    """The clients of a daemon, including this program."""
 
     clients: list[Client]
     unknown_holders: Annotated[int, msgspec.Meta(description="segments mapped by unidentified processes")]
@@ -304,14 +304,14 @@ class Clients(msgspec.Struct):
 
 
 class Diagnosis(msgspec.Struct):
-    """Everything that was looked at."""
+    """All findings of the doctor."""
 
     worst: Literal["ok", "warn", "fail"]
     findings: list[Finding]
 
 
 def json_events() -> object:
-    """Return the kinds of lines that ``--json`` prints: the protocol's events, and lost ones."""
+    """Return the types of the lines that ``--json`` prints: the protocol's events, and lost events."""
     from shmmap.client.event_stream import MissedEvents
     from shmmap.protocol.events import Event
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap status`` and ``shmmap clients``: one screen about the daemon, and its clients."""
+"""``shmmap status`` and ``shmmap clients``: the daemon's state on one screen, and its clients."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Exit code: 0, or 69 when the daemon is dead or was never started."""
 
 
 def add_status(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``status``."""
     parser = add_verb(
         subparsers,
         "status",
@@ -87,7 +87,7 @@ def _state_text(found: Snapshot, pid: int, uptime_s: float) -> str:
 
 
 def _occasional_lines(count: Mapping[str, int]) -> list[tuple[str, str]]:
-    """Return the lines that most daemons do not need: what is wrong, old or unusual."""
+    """Return the lines that most daemons do not need: problems, old versions, unusual settings."""
     lines = []
     if problems := count.get("map_problems", 0):
         lines.append(("problems", f"{problems:,} in the map: see the daemon's log, or `shmmap reload`"))
@@ -193,7 +193,7 @@ the last client releases it)"""
 
 
 def add_clients(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``clients``."""
     parser = add_verb(
         subparsers,
         "clients",
@@ -210,7 +210,7 @@ def add_clients(subparsers: Subparsers) -> None:
 
 
 def run_clients(args: argparse.Namespace) -> int:
-    """Print the table."""
+    """Print the table of clients."""
     from shmmap.cli.daemon_address import connect
 
     with connect(args) as client:

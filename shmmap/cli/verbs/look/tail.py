@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap tail``: the daemon's events as they happen."""
+"""``shmmap tail``: print the daemon's events as they happen."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SILENT_S: Final = 5.0
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``tail``."""
     parser = add_verb(
         subparsers,
         "tail",
@@ -72,7 +72,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print event after event."""
+    """Print events until interrupted."""
     from shmmap.cli.daemon_address import endpoint
     from shmmap.client.event_stream import EventStream
 
@@ -94,14 +94,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _wait_for_heartbeat(stream: EventStream, show: Callable[[Happening | None], None]) -> None:
-    """Say once that the daemon is silent: it sends a heartbeat every second otherwise."""
+    """Report once that the daemon, which sends a heartbeat every second, is silent."""
     complain("shmmap", "no heartbeat from the daemon", "shmmap health")
     show(stream.next(None))
     sys.stdout.flush()
 
 
 def _is_me(happening: Happening) -> bool:
-    """Whether it only says that this program came."""
+    """Whether an event only reports that this program connected."""
     return getattr(happening, "pid", 0) == os.getpid()
 
 
@@ -208,7 +208,7 @@ _COLUMN: Final = {
     "prefetch_miss": "miss",
     **dict.fromkeys(("live_started", "live_ended", "live_problem", "live_damaged"), "live"),
 }
-"""Shorter names of kinds of events, for the narrow column."""
+"""Shorter names of event kinds, for the narrow column."""
 
 _SENTENCES: Final[dict[str, Callable[[dict[str, Any]], str]]] = {
     "epoch": _epoch,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap top``: live view of memory, latency and clients; it only reads the daemon's statistics."""
+"""``shmmap top``: live view of memory, latency and clients, from the daemon's statistics alone."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SHORTEST_S: Final = 0.05
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``top``."""
     parser = add_verb(
         subparsers,
         "top",
@@ -69,7 +69,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show one screen, or one after the other."""
+    """Show one screen, or update it until interrupted."""
     from shmmap.cli.daemon_address import locate, snapshot
     from shmmap.cli.screens.top_screen import screen
     from shmmap.statistics.reader import StatisticsReader
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Ended(BaseException):
-    """A signal asks the program to end; raised so that the terminal is restored before the program exits."""
+    """Raised by a signal handler, so that the terminal is restored before the program exits."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -111,7 +111,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _live(reader: StatisticsReader, interval_s: float) -> int:
-    """Show it until it is interrupted; the terminal is then as it was."""
+    """Show the screen until interrupted, then restore the terminal."""
     from rich.console import Console
     from rich.live import Live
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap divide`` and ``shmmap merge``: clouds of any size into a divided map, and back into one cloud."""
+"""``shmmap divide`` and ``shmmap merge``: clouds of any size to a divided map, and back to one cloud."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no finite point, 66 no
 
 
 def add_divide(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``divide``."""
     parser = add_verb(
         subparsers,
         "divide",
@@ -114,7 +114,7 @@ def add_divide(subparsers: Subparsers) -> None:
 
 
 def run_divide(args: argparse.Namespace) -> int:
-    """Divide, and say what came out."""
+    """Divide clouds, and print the result."""
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress
@@ -150,7 +150,7 @@ def run_divide(args: argparse.Namespace) -> int:
 
 
 def metres(text: str) -> float:
-    """Read a length in metres."""
+    """Parse a length in metres."""
     try:
         return float(text)
     except ValueError:
@@ -158,14 +158,14 @@ def metres(text: str) -> float:
 
 
 def _order_is_gone(text: str) -> NoReturn:
-    """Refuse an option of earlier versions."""
+    """Refuse an option that only earlier versions had."""
     raise argparse.ArgumentTypeError(
         f"{text}: this option is gone, leave it out; points keep the order of the input"
     )
 
 
 def translation(text: str) -> Translation:
-    """Read what is to be added to points."""
+    """Parse the translation to add to points."""
     if text == "auto":
         return "auto"
     if text == "none":
@@ -197,7 +197,7 @@ Exit code: 0, 2 wrong usage or OUT exists, 65 bad data or no point in the inputs
 
 
 def add_merge(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``merge``."""
     parser = add_verb(
         subparsers,
         "merge",
@@ -229,7 +229,7 @@ def add_merge(subparsers: Subparsers) -> None:
 
 
 def run_merge(args: argparse.Namespace) -> int:
-    """Merge, and say what came out."""
+    """Merge a map into one cloud, and print the result."""
     import time
 
     from shmmap.cli.screens.work_progress import StageProgress

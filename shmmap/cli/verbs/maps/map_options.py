@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of the verbs that read all of a map, or work on a published one."""
+"""Options of the verbs that read a whole map, or work on a published one."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def add_map_options(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str] = ()) -> None:
-    """Refuse options about reading files, and ``others``, where no file is read; ``what`` says why."""
+    """Refuse ``others`` and options for reading files where no file is read; ``what`` is the reason."""
     from shmmap.errors import BadRequest
 
     for option in ("metadata", "strict", "unit", "vertical_unit", *others):
@@ -63,7 +63,7 @@ def refuse_map_options(args: argparse.Namespace, what: str, others: Sequence[str
 
 
 def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:
-    """Return the map at ``args.map_path``, to be read as the options say."""
+    """Open the map at ``args.map_path`` with the options for reading it."""
     from shmmap.dividing.served_cloud import find_origin
 
     return find_origin(
@@ -77,21 +77,21 @@ def origin_at(args: argparse.Namespace, cache_dir: str) -> MapOrigin:
 
 
 def worker_count(args: argparse.Namespace) -> int:
-    """Return the number of processes that the options ask for."""
+    """Return the number of processes from the options."""
     import os
 
     return args.workers or len(os.sched_getaffinity(0))
 
 
 def failure_rows(failures: Sequence[Failure]) -> list[json_output.Failure]:
-    """Return layers that could not be made, for JSON."""
+    """Return the JSON form of layers that could not be made."""
     from shmmap.cli import json_output
 
     return [json_output.Failure(one.cell_id, one.layer, one.message) for one in failures]
 
 
 def print_failures(failures: Sequence[Failure]) -> None:
-    """Print layers that could not be made; of many, only the first."""
+    """Print the layers that could not be made; only the first if there are many."""
     for failure in failures[:_SHOWN_FAILURES]:
         print_line(f"failed: {failure.cell_id} ({failure.layer}): {failure.message}")
     if len(failures) > _SHOWN_FAILURES:
@@ -102,7 +102,7 @@ URL_HELP = "where the map is published: s3://, gs://, az://, https://, file://, 
 
 
 def add_store_options(parser: argparse.ArgumentParser) -> None:
-    """Add how a store is reached, besides its URL."""
+    """Add the options for reaching a store, besides its URL."""
     group = parser.add_argument_group("the store")
     group.add_argument(
         "--insecure-http",
@@ -117,7 +117,7 @@ def add_store_options(parser: argparse.ArgumentParser) -> None:
 
 
 def store_at(url: str, args: argparse.Namespace) -> Store:
-    """Return the store at a URL, opened as the options say."""
+    """Open the store at a URL with the options."""
     from shmmap.lazy_imports import needed_packages
 
     with needed_packages("a published map"):
@@ -129,12 +129,12 @@ def store_at(url: str, args: argparse.Namespace) -> Store:
 
 
 def add_sign_option(parser: argparse.ArgumentParser) -> None:
-    """Add where the keys of a signed map are."""
+    """Add the option for the keys of a signed map."""
     parser.add_argument("--sign", metavar="KEYDIR", help="sign with the keys in this directory")
 
 
 def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False) -> MapSigner | None:
-    """Return what signs a map, as the options say; None: it is not signed."""
+    """Return the signer of a map from the options; None if it is not signed."""
     from shmmap.lazy_imports import TO_SIGN, needed_packages
 
     if args.sign is None:
@@ -146,14 +146,14 @@ def signer_at(store: Store, args: argparse.Namespace, *, make_keys: bool = False
 
 
 def add_trust_option(group: argparse._ActionsContainer) -> None:
-    """Add the root of trust."""
+    """Add the option for the root of trust."""
     group.add_argument(
         "--trust", metavar="ROOT.json", help="take only what is signed under this root, and nothing older"
     )
 
 
 def verified_at(store: Store, args: argparse.Namespace) -> Verified | None:
-    """Return the version that is signed under the root of trust; None: none was given."""
+    """Return the current version, verified by the root of trust; None if no root was given."""
     import os
 
     if args.trust is None:

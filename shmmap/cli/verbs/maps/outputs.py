@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs that make and publish maps print as JSON; imported for that alone."""
+"""JSON output of the verbs that make and publish maps; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ __all__ = [
 
 
 def divided_kind() -> object:
-    """Return what ``--json`` prints."""
+    """Return the struct that ``divide --json`` prints."""
     from shmmap.origin.map_report import DividedMap
 
     return more_of(DividedMap, seconds=float, peak_memory_bytes=int)
 
 
 def merged_kind() -> object:
-    """Return what ``--json`` prints."""
+    """Return the struct that ``merge --json`` prints."""
     from shmmap.dividing.merge import MergedCloud
 
     return more_of(MergedCloud, seconds=float, peak_memory_bytes=int)
 
 
 class Fetched(msgspec.Struct):
-    """What was written, and what of it had to be fetched."""
+    """A fetched version: totals of the written map, and the part that was downloaded."""
 
     url: str
     path: str
@@ -55,7 +55,7 @@ class Fetched(msgspec.Struct):
 
 
 class PublishedMap(msgspec.Struct):
-    """The current version, and what was sent for it."""
+    """The version current after publishing, and the amount of data sent for it."""
 
     map: str
     url: str
@@ -77,7 +77,7 @@ class PublishedMap(msgspec.Struct):
 
 
 class Joined(msgspec.Struct):
-    """The current version after --join."""
+    """The version current after joining slices with --join."""
 
     url: str
     run: str
@@ -93,7 +93,7 @@ class Joined(msgspec.Struct):
 
 
 class Prepared(msgspec.Struct):
-    """What is kept of a map's layers."""
+    """The stored layers of a map."""
 
     map: str
     cells: int
@@ -109,7 +109,7 @@ class Prepared(msgspec.Struct):
 
 
 class Slice(msgspec.Struct):
-    """A slice that was made with --shards."""
+    """A slice of layers made with --shards."""
 
     url: str
     version: Annotated[int, msgspec.Meta(description="the current one")]
@@ -130,7 +130,7 @@ class Slice(msgspec.Struct):
 
 
 class Version(msgspec.Struct):
-    """One version."""
+    """One version of a published map."""
 
     version: int
     state: Annotated[str, msgspec.Meta(description="current, earlier, or never served")]
@@ -142,7 +142,7 @@ class Version(msgspec.Struct):
 
 
 class Versions(msgspec.Struct):
-    """All versions, the latest first."""
+    """All versions of a published map, the latest first."""
 
     url: str
     current: int
@@ -151,7 +151,7 @@ class Versions(msgspec.Struct):
 
 
 class RolledBack(msgspec.Struct):
-    """After --rollback."""
+    """The result of --rollback."""
 
     url: str
     changed: bool
@@ -161,7 +161,7 @@ class RolledBack(msgspec.Struct):
 
 
 class Refreshed(msgspec.Struct):
-    """After --refresh."""
+    """The result of --refresh."""
 
     url: str
     version: int
@@ -169,14 +169,14 @@ class Refreshed(msgspec.Struct):
 
 
 def rotated_kind() -> object:
-    """Return what ``--rotate`` prints."""
+    """Return the struct that ``versions --rotate`` prints."""
     from shmmap.publishing.signing import Rotated
 
     return more_of(Rotated, url=str)
 
 
 def pruned_kind() -> object:
-    """Return what ``--prune`` prints."""
+    """Return the struct that ``versions --prune`` prints."""
     from shmmap.publishing.prune import Pruned
 
     return more_of(Pruned, url=str)

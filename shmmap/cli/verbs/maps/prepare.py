@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon only reads them.
+"""``shmmap prepare MAP``: compute layers ahead of time, so that the daemon only needs to read them.
 
 ``shmmap prepare URL --shards I/N`` computes layers of a slice of a published map, for ``publish --join``.
 """
@@ -57,7 +57,7 @@ does not answer or refuses, 78 unusable credentials."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``prepare``."""
     parser = add_verb(
         subparsers,
         "prepare",
@@ -101,7 +101,7 @@ def _slice(text: str) -> tuple[int, int]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Prepare, with progress on stderr."""
+    """Compute the layers, with progress on stderr."""
     from shmmap.errors import BadRequest
     from shmmap.origin.remote.store import is_published
 
@@ -221,7 +221,7 @@ def _prepare_slice(args: argparse.Namespace) -> int:
 
 
 def _report_slice(args: argparse.Namespace, url: str, done: Sliced, seconds: float) -> int:
-    """Print what was made; return the exit code."""
+    """Print the layers made of a slice; return the exit code."""
     number, slices = args.shards
     if args.json:
         from shmmap.cli.verbs.maps import outputs

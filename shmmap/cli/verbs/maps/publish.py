@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap publish MAP URL``: a map into a bucket or a directory, for vehicles to fetch.
+"""``shmmap publish MAP URL``: upload a map to a bucket or a directory, from which vehicles fetch it.
 
 ``shmmap publish URL --join RUN`` joins the slices of a run into a version.
 """
@@ -59,7 +59,7 @@ keys."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``publish``."""
     parser = add_verb(
         subparsers,
         "publish",
@@ -109,7 +109,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 class _Join(argparse.Action):
-    """Takes the name of a run; the only argument is then the URL, and argparse calls it MAP."""
+    """Stores the name of a run; the only argument is then the URL, although argparse calls it MAP."""
 
     def __init__(self, *, url: argparse.Action, **settings: Any) -> None:
         super().__init__(**settings)
@@ -128,7 +128,7 @@ class _Join(argparse.Action):
 
 
 def run(args: argparse.Namespace) -> int:
-    """Publish, or join, with progress on stderr."""
+    """Publish a map or join slices, with progress on stderr."""
     return _publish(args) if args.join is None else _join(args)
 
 
@@ -230,7 +230,7 @@ def _publish(args: argparse.Namespace) -> int:
 def _report(
     args: argparse.Namespace, path: str, url: str, done: Published, problems: Sequence[str], seconds: float
 ) -> int:
-    """Print what was published; return the exit code."""
+    """Print the result of publishing; return the exit code."""
     if args.json:
         from shmmap.cli.verbs.maps import outputs
 

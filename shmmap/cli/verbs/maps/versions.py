@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap versions`` and ``shmmap fetch``: a published map's versions, and one of them as a divided map.
+"""``shmmap versions`` and ``shmmap fetch``: manage a published map's versions, and download one.
 
-``versions`` lists them, goes back to one, removes old ones, and renews keys.
+``versions`` lists versions, rolls back to one, removes old ones, and renews keys.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ credentials or keys."""
 
 
 def add_versions(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``versions``."""
     parser = add_verb(
         subparsers,
         "versions",
@@ -105,7 +105,7 @@ def _days(text: str) -> float:
 
 
 def run_versions(args: argparse.Namespace) -> int:
-    """List, roll back, refresh, rotate or prune."""
+    """List versions, or roll back, refresh, rotate or prune."""
     from shmmap.cli.screens.work_progress import StageProgress
     from shmmap.errors import BadRequest
 
@@ -209,20 +209,20 @@ def _numbers(versions: list[int]) -> str:
 
 
 def _find_versions(store: Store, current: Current) -> tuple[list[Entry], dict[int, str]]:
-    """Return the entries of all versions that can be found, latest first, and the state of each."""
+    """Return the entries of all versions found, latest first, and the state of each."""
     import contextlib
 
     from shmmap.errors import MapMissing
     from shmmap.origin.remote.map_versions import Entry, earlier_versions, list_entries, read_entry
 
-    # a map that was copied may have no entries
+    # a copied map may have no entries
     entries = {current.version: Entry(current.version, current.root, current.bytes, "")}
     entries |= {entry.version: entry for entry in earlier_versions(store, current)}
     states = {version: "current" if version == current.version else "earlier" for version in entries}
     if not store.read_only:
         for version in list_entries(store):
             if version not in entries:
-                with contextlib.suppress(MapMissing):  # pruned in this moment
+                with contextlib.suppress(MapMissing):  # pruned meanwhile
                     entries[version] = read_entry(store, version)
                     states[version] = "never served"
     return sorted(entries.values(), key=lambda entry: -entry.version), states
@@ -286,7 +286,7 @@ answer or refuses, or another run is making DIR, 78 unusable credentials."""
 
 
 def add_fetch(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``fetch``."""
     parser = add_verb(
         subparsers,
         "fetch",
@@ -308,7 +308,7 @@ def add_fetch(subparsers: Subparsers) -> None:
 
 
 def run_fetch(args: argparse.Namespace) -> int:
-    """Fetch, with progress on stderr."""
+    """Fetch a version as a divided map, with progress on stderr."""
     import os
     import time
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verbs that run a daemon, and what is installed."""
+"""Verbs that run a daemon, and describe the installation."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap version`` and ``shmmap cpp``: what is installed, and where its C++ header is."""
+"""``shmmap version`` and ``shmmap cpp``: installed versions, and the location of the C++ header."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def installed_version() -> str:
 
 
 def add_version(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``version``."""
     parser = add_verb(
         subparsers,
         "version",
@@ -81,7 +81,7 @@ Exit code: 0."""
 
 
 def add_cpp(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``cpp``."""
     parser = add_verb(
         subparsers,
         "cpp",
@@ -98,12 +98,12 @@ def add_cpp(subparsers: Subparsers) -> None:
 
 
 def prefix() -> Path:
-    """Return the directory that has ``include`` and ``share``.
+    """Return the directory that contains ``include`` and ``share``.
 
     Raises
     ------
     InternalError
-        The package was installed without them.
+        The package was installed without these directories.
     """
     import shmmap
 
@@ -115,11 +115,11 @@ def prefix() -> Path:
 
 
 def run_cpp(args: argparse.Namespace) -> int:
-    """Print a directory, or what to do with all of them."""
+    """Print one directory, or how to use them all."""
     root = prefix()
     includes = f"-I{root / 'include'}"
     if args.includes:
-        print_line(shlex.quote(includes))  # as pybind11 does: for a shell or a Makefile
+        print_line(shlex.quote(includes))  # like pybind11: for use in a shell or a Makefile
     elif args.cmakedir:
         print_line(str(root / "share" / "cmake" / "shmmap"))
     elif args.pkgconfigdir:

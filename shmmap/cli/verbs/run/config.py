@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap config``: check settings, show where each comes from, create a file with all of them."""
+"""``shmmap config``: check settings, show where each was set, create a file with all of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _EPILOG = """\
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``config``."""
     parser = add_verb(
         subparsers,
         "config",
@@ -69,7 +69,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Look for what would keep the daemon from starting."""
+    """Report settings that would keep the daemon from starting."""
     from shmmap.daemon.config import installed_config_file, load_config
     from shmmap.daemon.prerequisites import access_of_segments
     from shmmap.origin.remote.store import is_url
@@ -95,7 +95,7 @@ def run_check(args: argparse.Namespace) -> int:
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """Print every setting."""
+    """Print every setting and its source."""
     from dataclasses import asdict
 
     from shmmap.daemon.config import ROWS, installed_config_file, trace_settings
@@ -129,7 +129,7 @@ def run_show(args: argparse.Namespace) -> int:
 
 
 def run_init(args: argparse.Namespace) -> int:
-    """Write a file to start with."""
+    """Write a configuration file with all settings."""
     from shmmap.service.installation import configuration
 
     path = Path(args.file)

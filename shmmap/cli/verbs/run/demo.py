@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``shmmap demo``: the whole thing on a generated town, without a map or any configuration."""
+"""``shmmap demo``: a demonstration on a generated town, without a map or any configuration."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _JSON = """\
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``demo``."""
     parser = add_verb(
         subparsers,
         "demo",
@@ -81,7 +81,7 @@ def add_parser(subparsers: Subparsers) -> None:
         help="map a drive into a live map with too little memory, and kill daemon and mapping program on the"
         " way: no voxel is lost (less than a minute)",
     )
-    parser.add_argument("--full", action="store_true", help=argparse.SUPPRESS)  # of earlier versions
+    parser.add_argument("--full", action="store_true", help=argparse.SUPPRESS)  # options of earlier versions
     add_json_option(parser)
 
 
@@ -96,7 +96,7 @@ def _density(text: str) -> float:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demonstration and print what it measured."""
+    """Run the demonstration and print its measurements."""
     import time
 
     from shmmap.cli.screens.demo import print_report, progress_for
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drive(args: argparse.Namespace, progress: Progress) -> DemoReport:
-    """Drive on one copy of a town's map, and on private copies."""
+    """Drive on one shared copy of a town's map, and on private copies."""
     from dataclasses import replace
 
     from shmmap.cli.screens.demo import town_report
@@ -141,7 +141,7 @@ def _drive(args: argparse.Namespace, progress: Progress) -> DemoReport:
 
 
 def _drive_live(args: argparse.Namespace, progress: Progress) -> DemoReport:
-    """Map a drive, and look whether a voxel was lost."""
+    """Drive while a live map is recorded, and check that no voxel was lost."""
     from shmmap.cli.screens.demo import live_report
     from shmmap.demo.live_drive import LiveDriveSettings, run_live_drive
 
@@ -150,7 +150,7 @@ def _drive_live(args: argparse.Namespace, progress: Progress) -> DemoReport:
 
 
 def _picture_path(named: str | None, usual: str) -> Path:
-    """Find out before the work begins where the picture can be written."""
+    """Return the path of the picture, checked before the work begins."""
     path = Path(named or usual).absolute()
     if (
         path.parent.is_dir()

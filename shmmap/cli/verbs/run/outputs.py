@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What verbs that run a daemon print as JSON; imported for that alone."""
+"""JSON output of the verbs that run a daemon; imported only for ``--json``."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ __all__ = ["Checked", "Setting", "Settings", "versions_kind"]
 
 
 class Setting(msgspec.Struct):
-    """A setting, and FILE:LINE, the variable, or ``default`` that it comes from."""
+    """A setting, and its source: FILE:LINE, a variable, or ``default``."""
 
     value: Any
     origin: str
 
 
 class Settings(msgspec.Struct):
-    """Every setting; sizes stand there under two names, such as budget (as in the file) and budget_bytes."""
+    """All settings; sizes have two names, such as budget (text, as in the file) and budget_bytes."""
 
     file: str | None
     settings: dict[str, Setting]
 
 
 class Checked(msgspec.Struct):
-    """A file without mistakes."""
+    """A configuration file without mistakes."""
 
     file: str | None
     good: bool
 
 
 def versions_kind() -> object:
-    """Return what ``--json`` prints."""
+    """Return the struct that ``version --json`` prints."""
     from shmmap.cli.verbs.run.about import Versions
 
     return more_of(Versions)

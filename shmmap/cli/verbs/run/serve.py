@@ -35,7 +35,7 @@ reach, 75 the instance runs already, 78 bad setting."""
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``serve``."""
     parser = add_verb(
         subparsers,
         "serve",
@@ -57,12 +57,12 @@ def add_parser(subparsers: Subparsers) -> None:
         help="keep a live map, which mappers write to, with its files in DIR (default: live/NAME in the "
         "state directory); may be given again",
     )
-    for name in (*DROPPED, *RENAMED):  # `load_config` refuses them
+    for name in (*DROPPED, *RENAMED):  # rejected by `load_config`
         parser.add_argument(option_of(name), dest=name, help=argparse.SUPPRESS)
 
 
 def _add_option(group: argparse._ActionsContainer, row: Row) -> None:
-    """Add the option of a setting; what is not given stays None, for the configuration file may say."""
+    """Add the option of a setting; None if not given, so that the configuration file can set it."""
     words = row.option_help().replace("%", "%%")
     if row.name == "map_path":
         group.add_argument(row.name, metavar=row.metavar, nargs="?", help=words)
@@ -79,8 +79,8 @@ def _add_option(group: argparse._ActionsContainer, row: Row) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until a signal says stop."""
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy's threads would spin, and forking would fail
+    """Serve until a signal ends the daemon."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # numpy's threads waste time, and forking would fail
     from shmmap.segment.process_limits import limit_behind
 
     try:

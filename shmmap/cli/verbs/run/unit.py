@@ -41,7 +41,7 @@ drop-ins/maps-in-home.conf, system/run-shmmap_huge.mount or README.md (the opera
 
 
 def add_parser(subparsers: Subparsers) -> None:
-    """Describe the verb."""
+    """Add the verb ``unit``."""
     parser = add_verb(
         subparsers,
         "unit",
@@ -86,7 +86,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def run_print(args: argparse.Namespace) -> int:
-    """Print a unit."""
+    """Print a systemd unit."""
     from shmmap.service.installation import shipped_names, unit_text
 
     if args.list:
@@ -101,7 +101,7 @@ def run_print(args: argparse.Namespace) -> int:
 
 
 def run_install(args: argparse.Namespace) -> int:
-    """Write what a service needs."""
+    """Write the files of a systemd service."""
     from shmmap.service.huge_pages import check_possible
     from shmmap.service.installation import plan_system, plan_user, write
 
@@ -144,7 +144,7 @@ def run_install(args: argparse.Namespace) -> int:
 
 
 def _let_systemd_know(user: bool, planned: Sequence[PlannedFile]) -> None:
-    """Make the account and the directories, and let the manager read its units again."""
+    """Create the account and the directories, and reload systemd's units."""
     import subprocess
 
     commands = [["systemctl", "--user", "daemon-reload"]]
