@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers: read-only tables computed from a cell once for all (``LAYERS.md``).
+"""Layers: read-only tables computed once from a cell and shared by all clients (``LAYERS.md``).
 
 ====================  ==========================================================================
-`build_layer`         compute a layer of plain arrays, without a daemon
-`canonical_layer`     the name that a layer has in replies, of a spec in any form
+`build_layer`         compute a layer from plain arrays, without a daemon
+`canonical_layer`     canonical form of a layer spec, as in replies
 `LayerKind`           what a module that adds a kind of layer defines
 `LayerTable`          what a builder returns
 `voxel_covariances`   covariances of PCL, ndt_omp and Autoware from the rows of an ``ndt`` layer
-`ground_height`       height of the ground at a place, from ``ground`` layers
-`needed_packages`     one clear line where a package that a kind needs is missing
+`ground_height`       height of the ground at a point, from ``ground`` layers
+`needed_packages`     turns the import error of a package that a kind needs into one clear line
 ====================  ==========================================================================
 """
 

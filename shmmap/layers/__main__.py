@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m shmmap.layers SPEC CLOUD OUT.npz``: a layer of a cloud file, without a daemon.
+"""``python -m shmmap.layers SPEC CLOUD OUT.npz``: compute a layer of a cloud file, without a daemon.
 
-OUT holds the layer's columns by name and, where it lies on a lattice, ``lattice_leaf``, ``lattice_first`` and
-``lattice_shape`` (x, y, z).
+OUT contains the layer's columns by name and, if the layer has a lattice, ``lattice_leaf``, ``lattice_first``
+and ``lattice_shape`` (x, y, z).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Build and write; returns the exit code."""
+    """Build the layer, write it, and return the exit code."""
     known = "\n".join(f"  {kind.describe()}: {kind.summary}" for kind in kinds())
     parser = argparse.ArgumentParser(
         prog="python -m shmmap.layers",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Building layers: of plain arrays, or of one cell into a segment file.
+"""Builds layers from plain arrays, or for one cell into a segment file.
 
 `build_layer` runs the same builders as the daemon's loaders, without a daemon::
 
@@ -8,7 +8,7 @@
     ndt = build_layer("ndt(leaf=2.0)", xyz)
     ndt["mean"], ndt["inverse_covariance"], ndt.lattice
 
-`make_layer` fills a segment file: out of the disk cache where the layer is there, else built and kept.
+`make_layer` fills a segment file from the disk cache, or else builds the layer and keeps it there.
 """
 
 from __future__ import annotations
@@ -69,24 +69,24 @@ def build_layer(
         (N, 3) float32 or float64, metres; or named columns, ``xyz`` among them, all of N rows.
         Other dtypes of coordinates become float64.
     units
-        Unit of each column, for the table's.
+        Unit of each column, copied into the result.
     box
-        (min_x, min_y, max_x, max_y) of the cell, metres; only kinds with a halo look at it.
+        (min_x, min_y, max_x, max_y) of the cell, metres; only kinds with a halo use it.
     halo
-        (M, 3) coordinates of points around the cell, for such kinds.
+        (M, 3) coordinates of points around the cell, for kinds with a halo.
 
     Returns
     -------
-    The layer; points that are not finite are left out.
+    The layer, without points that are not finite.
 
     Raises
     ------
     BadRequest
-        If the spec or the arrays make no sense.
+        The spec or the arrays are invalid.
     MapDataError
-        If the points cannot be turned into this layer.
+        The layer cannot be computed from these points.
     PackageMissing
-        If a package that builds it is not installed.
+        A package that the builder needs is not installed.
     """
     spec = parse_layer(layer) if isinstance(layer, str) else layer
     given = points if isinstance(points, Mapping) else {"xyz": points}
@@ -99,7 +99,7 @@ def build_layer(
 
 
 def build_spec(spec: LayerSpec, points: PointTable) -> LayerTable:
-    """Build a layer along its chain from the source's points."""
+    """Build a layer, and first the layers it is built of, from the source's points."""
     if spec.of is not None:
         below = build_spec(spec.of, points)
         points = PointTable(below.columns, below.units, points.box)
@@ -129,7 +129,7 @@ def _checked(columns: Mapping[str, NDArray[np.generic]]) -> Columns:
 
 @dataclass(frozen=True, slots=True)
 class Derived:
-    """A finished segment's header, and what was read for it.
+    """Header of a finished segment, and states of the files that were read for it.
 
     ``neighbours`` are the stamps of the neighbours' files, in the job's order.
     """
@@ -157,16 +157,16 @@ def derive(
     Parameters
     ----------
     fd
-        Empty file, open for writing; after an error its contents mean nothing.
+        Empty file, open for writing; after an error its content is undefined.
     source
-        The cell's points, where they are at hand; else its file is read.
+        The cell's points, if already in memory; None: the cell's file is read.
     reserve
         Called with the segment's size in bytes before anything is written; it refuses by raising.
 
     Raises
     ------
     MapDataError
-        If a file cannot be read, or its points cannot become this layer.
+        A file cannot be read, or the layer cannot be computed from its points.
     OSError
         ENOSPC if the file system is full.
     """
@@ -213,9 +213,9 @@ class Halo:
     xyz
         (M, 3), of the cell's dtype.
     seen
-        Each neighbour's stamp and digest.
+        Stamp and digest of each neighbour.
     warnings
-        Which neighbours have no points here, and why.
+        The neighbours that could not be read, and why.
     """
 
     xyz: NDArray[Any]
@@ -228,20 +228,20 @@ def read_halo(
 ) -> Halo:
     """Read the neighbours' points within ``halo_m`` of a cell's box, as ``dtype``.
 
-    One that cannot be read has no points, the stamp of before the attempt and a digest of zeros: it must
-    not cost its neighbours their layers.
+    A neighbour that cannot be read contributes no points, the stamp from before the attempt and a digest of
+    zeros, so that the cell still gets its layer.
 
     Raises
     ------
     MapDataError
-        If there is not enough memory for a neighbour: another time there may be, so that no layer is
-        made without it.
+        There is not enough memory for a neighbour.  As a later attempt may succeed, no layer is made without
+        that neighbour.
     """
     found: list[NDArray[Any]] = [np.empty((0, 3), dtype)]
     seen: list[tuple[SourceStamp, bytes]] = []
     warnings: list[str] = []
     for neighbour in sources:
-        stamp = reader.stamp(neighbour)  # afterwards it may be that of a file that was never read
+        stamp = reader.stamp(neighbour)  # before reading: later it may be that of another file
         before = SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
         try:
             source = reader.read(neighbour, box, ("xyz",))
@@ -273,11 +273,11 @@ class Made:
     Attributes
     ----------
     version
-        Of the layer, for the states of the sources that it was made from.
+        Version of the layer, for the states of the sources that it was made from.
     neighbours
-        States of the neighbours' sources that it stands for.
+        States of the neighbours' sources that the version covers.
     cached
-        It came out of the cache.
+        Whether the layer was read from the cache.
     """
 
     header: SegmentHeader
@@ -288,7 +288,7 @@ class Made:
 
 
 def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
-    """Key of a layer for the sources as they are now; None where the cell's own cannot be looked at."""
+    """Return a layer's key for the present state of its sources; None if the cell's file cannot be read."""
     source = _state(job, job.source)
     if source is NO_SOURCE:
         return None
@@ -296,7 +296,7 @@ def cache_key(spec: LayerSpec, job: CellJob) -> CacheKey | None:
 
 
 def _state(job: CellJob, source: Source) -> SourceStamp:
-    """State of a source as it is now; zeros where it cannot be looked at."""
+    """Return the present state of a source; zeros if it cannot be read."""
     stamp = job.reader.stamp(source)
     return SourceStamp.from_token(stamp) if stamp is not None else NO_SOURCE
 
@@ -316,23 +316,23 @@ def make_layer(
     Parameters
     ----------
     fd
-        Empty file, open for reading and writing; after an error its contents mean nothing.
+        Empty file, open for reading and writing; after an error its content is undefined.
     cache, keep
-        Where to look first, and whether to store what was built.
+        Cache that is searched first, and whether to store a built layer in it.
     source
-        Returns the cell's points where they are at hand, else None; asked only for computed layers.
+        Returns the cell's points if they are in memory, else None; called only for computed layers.
     reserve
         Called with the segment's size in bytes before anything is written; it refuses by raising.
 
     Raises
     ------
     MapDataError
-        If a file cannot be read, or its points cannot become this layer.
+        A file cannot be read, or the layer cannot be computed from its points.
     OSError
         ENOSPC if the file system is full.
     """
     if job.ready:
-        cache = None  # its origin keeps it
+        cache = None  # published layers are kept by their origin
     key = cache_key(spec, job) if cache is not None else None
     if cache is not None and key is not None:
         header = cache.load(key, fd, reserve=reserve)
@@ -357,18 +357,18 @@ def _keep(cache: LayerCache, key: CacheKey, header: SegmentHeader, fd: int) -> N
         return
     try:
         cache.store(key, header, fd)
-    except OSError as error:  # the cache is a convenience: a full disk costs no layer
+    except OSError as error:  # a layer does not fail because the cache's disk is full
         cache.writable = False
         log.warning("layers not kept on disk", cache_dir=cache.directory, error=error)
 
 
 def compile_kernels(*, wait: bool = True) -> None:
-    """Compile what is not compiled yet, if it can be kept.
+    """Compile the kernels that are not compiled yet, if the result can be kept on disk.
 
     Parameters
     ----------
     wait
-        For another process that is at it; else it is left to that.
+        Wait for another process that is compiling them; else return at once.
 
     Raises
     ------
@@ -382,9 +382,9 @@ def compile_kernels(*, wait: bool = True) -> None:
         try:
             lock = stack.enter_context(mark.with_suffix(".lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except OSError:  # another process is at it, or nothing can be kept: each process compiles its own
+        except OSError:  # another process compiles, or nothing can be kept: then each process compiles
             return
-        from shmmap.layers import kernels  # compiled as they are imported
+        from shmmap.layers import kernels  # the import compiles them
 
         del kernels
         if all_kept():

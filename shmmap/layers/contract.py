@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a layer kind is: parameters, columns, and a builder from points to a table.
+"""Interface of layer kinds: parameters, columns, and a builder from points to a table.
 
-A new kind is one module that makes a `LayerKind`, and one registration: a line in
-`shmmap.layers.spec` for a kind of shmmap's own, an entry point of the group ``shmmap.layers``
-(its object a `LayerKind`) for any other.  `shmmap.testing.layer_conformance` checks any kind.
+A new kind needs one module that creates a `LayerKind`, and one registration: a line in
+`shmmap.layers.spec` for shmmap's own kinds, an entry point of the group ``shmmap.layers``
+(whose object is a `LayerKind`) for others.  `shmmap.testing.layer_conformance` checks any kind.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class Parameter:
     kind
         ``float`` or ``int``.
     default
-        Value where a spec does not name it; None: it has none, and the kind's ``resolve`` decides
-        whether it may be left out.
+        Value if a spec does not name the parameter; None: no default, and the kind's ``resolve`` decides
+        whether the parameter may be left out.
     required
         Whether every spec must name it.
     minimum, maximum
-        Closed bounds; a float must be finite besides.
+        Closed bounds; a float must also be finite.
     above
         An open lower bound: the value must be greater.
     """
@@ -78,7 +78,7 @@ class Parameter:
         Raises
         ------
         BadRequest
-            If it is no such number or lies outside the bounds.
+            The value is of another type or out of bounds.
         """
         whole = self.kind is int
         if isinstance(value, bool) or not math.isfinite(value) or (whole and value != int(value)):
@@ -90,7 +90,7 @@ class Parameter:
         return self.kind(value)
 
     def describe(self) -> str:
-        """One line for people: name, unit, bounds, default, meaning."""
+        """Return one line of text: name, unit, bounds, default, meaning."""
         bounds = [
             *([f"> {self.above:g}"] if self.above > -math.inf else []),
             *([f">= {self.minimum:g}"] if self.minimum > -math.inf else []),
@@ -104,16 +104,16 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class LayerColumn:
-    """One column that a kind promises.
+    """One column that a kind's layers have.
 
     Attributes
     ----------
     name
         ``*`` stands for every other column of the source.
     dtype
-        None: that of the source's column of the same name.
+        Dtype; None: that of the source's column of the same name.
     shape
-        In words, such as ``(rows, 3)``; documentation.
+        Text for documentation, such as ``(rows, 3)``.
     """
 
     name: str
@@ -125,7 +125,7 @@ class LayerColumn:
 
 @dataclass(slots=True)
 class PointTable:
-    """The points of one cell, as builders get them.
+    """The points of one cell, as passed to builders.
 
     Attributes
     ----------
@@ -135,10 +135,10 @@ class PointTable:
     units
         Unit of each column, empty where unknown.
     box
-        The cell's (min_x, min_y, max_x, max_y), metres; infinite where the points are no cell's.
+        The cell's (min_x, min_y, max_x, max_y), metres; infinite if the points are not those of a cell.
     halo
-        For a kind with a halo: (M, 3) coordinates of the neighbouring cells' points within it, dtype
-        as ``xyz``; None where there are no neighbours.
+        For a kind with a halo: (M, 3) coordinates of the neighbouring cells' points within the halo, dtype
+        as ``xyz``; None if there are no neighbours.
     """
 
     columns: Columns
@@ -155,30 +155,30 @@ class PointTable:
         return len(self.columns["xyz"])
 
     def finite(self) -> NDArray[np.bool_]:
-        """Which points have finite coordinates, (N,)."""
+        """Return a mask of the points with finite coordinates, (N,)."""
         found: NDArray[np.bool_] = np.isfinite(self.xyz).all(axis=1)
         return found
 
     def selected(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> LayerTable:
-        """Return the table of some points, every column of them; a mask or row numbers."""
+        """Return a table of selected points with every column; ``rows`` is a mask or row numbers."""
         columns = {name: np.ascontiguousarray(column[rows]) for name, column in self.columns.items()}
         return LayerTable(columns, len(columns["xyz"]), {**self.units, "xyz": "m"})
 
 
 @dataclass(slots=True)
 class LayerTable:
-    """One layer of one cell: named arrays and what belongs to them.
+    """One layer of one cell: named arrays, their units and lattice.
 
     Attributes
     ----------
     columns
-        In order; C-contiguous, little-endian, up to four dimensions.
+        Arrays by name, in order; C-contiguous, little-endian, up to four dimensions.
     rows
-        What a handle's ``points`` counts: rows of the table (points, voxels, columns of ground).
+        Number of rows of the table (points, voxels, columns of ground), given as ``points`` in a handle.
     units
         Unit of each column, empty where unknown.
     lattice
-        The lattice that the rows or tables lie on; None where there is none.
+        The lattice of the rows or tables; None if there is none.
     """
 
     columns: Columns
@@ -191,7 +191,7 @@ class LayerTable:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all columns together."""
+        """Total bytes of all columns."""
         return sum(column.nbytes for column in self.columns.values())
 
 
@@ -211,30 +211,30 @@ class LayerKind:
     Attributes
     ----------
     name
-        ASCII identifier; what specs say before the parenthesis.
+        ASCII identifier, the part of a spec before the parenthesis.
     builder_version
-        1 to 255; raise it when the same points would give other bytes: caches then build again.
+        1 to 255; increase it when the same points would give other bytes, so that caches build again.
     summary, borders
-        For people: what it holds, and what happens where two cells meet.
+        Texts for users: content of the layer, and its behaviour at the border of two cells.
     parameters, columns
-        What it takes, what it gives.
+        Parameters of the builder, and columns of its result.
     build
-        From points and checked parameters to the table.  Must be a pure function of them: the same
-        bytes in every process.  Points that are not finite are left out.
+        Function from points and checked parameters to the table.  It must be pure: the same bytes in every
+        process.  It leaves out points that are not finite.
     resolve
         Called with the checked parameters that a spec named (defaults filled in); returns the
-        canonical ones, or raises `BadRequest`.
+        canonical parameters, or raises `BadRequest`.
     halo_m
-        How far beyond the cell's box the builder looks, metres; 0: not at all.
+        Distance beyond the cell's box from which the builder uses points, metres; 0: none.
     gives_points
-        The result has ``xyz`` and can be the source of another layer (``of=``).
+        Whether the result has ``xyz`` and so can be the source of another layer (``of=``).
     takes_layers
-        May be built of another layer; kinds with a halo always take the source.
+        Whether the layer may be built of another layer; kinds with a halo always use the source.
     needs
-        Columns of the source that it reads, None for all of them.
+        Columns of the source that the builder reads; None for all.
     bytes_ratio
-        About how many bytes it has per byte of source: what is reserved before a build; a build
-        that needs more asks.
+        Approximate bytes of the layer per byte of its source.  As much memory is reserved before a build; a
+        build that needs more reserves more.
     """
 
     name: str

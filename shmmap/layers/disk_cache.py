@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished layers on disk, so that nothing is computed twice: not after a restart, not by another daemon.
+"""Cache of finished layers on disk, so that neither a restart nor another daemon computes them again.
 
-An entry is the bytes of a segment, its publish block empty.  It has two names, both hard links to one
+An entry is the bytes of a segment whose publish block is empty.  It has two names, both hard links to one
 file: one for the *content* it was computed from (digest of the source, layer, builder version, box),
-one for the *version* that the layer of the cell has.  Loading asks by version and reads no
-source; where a map was copied or touched, `LayerCache.recognise` finds the entry by content and gives
-it its new version.  ::
+one for the *version* of the cell's layer.  Loading looks up the version and reads no source.  If a
+map was copied or touched, `LayerCache.recognise` finds the entry by content and links it under its new
+version.  ::
 
     DIRECTORY/layers/content/ab/<digest><hash>.layer
     DIRECTORY/layers/version/cd/<version>.layer
 
-Entries appear whole, by renaming; nothing is synced, since every column is compared with its checksum
-when it is loaded, and an entry that does not match is removed and built again.  Entries that others could
-have written are not used.  How much is kept, and what goes first, is in `shmmap.disk_budget`.
+Entries appear complete, by renaming.  They are not flushed to the disk: every column is compared with its
+checksum when it is loaded, and an entry that does not match is removed and built again.  Entries that other
+accounts could have written are not used.  The size limit and the eviction order are in `shmmap.disk_budget`.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ from shmmap.segment.writer import write_all
 __all__ = ["CacheKey", "LayerCache"]
 
 
-_BLOCK_BYTES: Final = 1 << 18  # stays in the second-level cache while it is hashed and written
+_BLOCK_BYTES: Final = 1 << 18  # a block stays in the L2 cache while it is hashed and written
 
 
 @dataclass(frozen=True, slots=True)
 class CacheKey:
-    """What an entry is of: a layer of a cell at a version, or computed from some content.
+    """Key of an entry: a layer of a cell, with the states of its sources.
 
     Attributes
     ----------
     source, neighbours
-        State of the cell's file, and of those around it for a layer with a halo.
+        State of the cell's file, and for a layer with a halo, of the neighbouring cells' files.
     """
 
     spec: LayerSpec
@@ -63,12 +63,12 @@ class CacheKey:
         return self.job.version(self.spec, self.source, self.neighbours)
 
     def version_name(self) -> str:
-        """Name of the entry for this version, in the present layout of segments."""
+        """Return the name of the entry for this version, in the current layout of segments."""
         major, minor = LAYOUT_VERSION
         return f"{self.version:016x}-{major}.{minor}"
 
     def content_name(self, digest: bytes) -> str:
-        """Name of the entry for what was computed from, by `shmmap.layers.build.combined_digest`."""
+        """Return the name of the entry for a `shmmap.layers.build.combined_digest` of its inputs."""
         made = struct.pack("<IHH4d", self.spec.builder_version, *LAYOUT_VERSION, *self.job.box)
         name: str = digest.hex() + xxhash.xxh3_64_hexdigest(str(self.spec).encode() + b"\0" + made)
         return name
@@ -80,14 +80,14 @@ class LayerCache:
     Parameters
     ----------
     directory
-        Made when the first entry is stored.
+        Created when the first entry is stored.
     limit_bytes
-        Most bytes of all that is kept there, objects of published maps included.
+        Size limit of all files in it, objects of published maps included.
 
     Attributes
     ----------
     writable
-        Whether storing is worth another try; for its users to say.
+        Whether to try to store entries; set by the users of this cache.
     """
 
     def __init__(self, directory: str, *, limit_bytes: int) -> None:
@@ -101,14 +101,14 @@ class LayerCache:
     def _content_path(self, name: str) -> str:
         return os.path.join(self.directory, "content", name[:2], f"{name}.layer")
 
-    # --- looking --------------------------------------------------------------------------------
+    # --- lookup ---------------------------------------------------------------------------------
 
     def has(self, key: CacheKey) -> bool:
-        """Whether there is an entry for this version, whole by its header and size."""
+        """Whether an entry exists for this version whose header and size are valid."""
         return self.size_of(key) > 0
 
     def size_of(self, key: CacheKey) -> int:
-        """Bytes of the entry for this version; 0 where there is none."""
+        """Return the bytes of the entry for this version; 0 if there is none."""
         opened = self._open(key)
         if opened is None:
             return 0
@@ -136,19 +136,19 @@ class LayerCache:
     def load(
         self, key: CacheKey, fd: int, *, reserve: Callable[[int], None] | None = None
     ) -> SegmentHeader | None:
-        """Copy an entry into an empty segment file, compared with its checksums on the way.
+        """Copy an entry into an empty segment file, and verify its checksums.
 
         Parameters
         ----------
         fd
-            Empty file, open for writing; empty again where there is no entry to load.
+            Empty file, open for writing; empty again if no entry is loaded.
         reserve
             Called with the segment's size in bytes before anything is written; it refuses by raising.
 
         Returns
         -------
-        The segment's header, publish block empty; None where there is no entry, or a damaged one,
-        which is removed.
+        The segment's header, publish block empty; None if there is no entry, or a damaged one, which is
+        removed.
 
         Raises
         ------
@@ -165,7 +165,7 @@ class LayerCache:
             )
             needed = header_size(len(header.columns), header.cell_id, header.layer, header.frame_id)
             if needed != found.header_bytes:
-                return None  # the columns would have to move
+                return None  # the header has another length, so the columns would have to move
             if reserve is not None:
                 reserve(header.total_bytes)
             os.ftruncate(fd, header.total_bytes)
@@ -183,14 +183,14 @@ class LayerCache:
             os.close(entry)
 
     def recognise(self, key: CacheKey, digest: bytes) -> bool:
-        """Give an entry computed from the same content, if there is one, the name of this version."""
+        """Link an entry computed from the same content, if there is one, under this version's name."""
         with contextlib.suppress(OSError):
             self._link(self._content_path(key.content_name(digest)), self._version_path(key.version_name()))
         return self.has(key)
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to recognise."""
+        """Whether the cache has no entries that `recognise` could find."""
         try:
             return not os.listdir(os.path.join(self.directory, "content"))
         except OSError:
@@ -199,12 +199,12 @@ class LayerCache:
     # --- storing --------------------------------------------------------------------------------
 
     def make(self) -> None:
-        """Make the directory, and see whether files can be made in it.
+        """Create the directory, and check that files can be created in it.
 
         Raises
         ------
         CannotWrite
-            They cannot.
+            The directory or files in it cannot be created.
         """
         try:
             os.makedirs(self.directory, mode=0o755, exist_ok=True)
@@ -216,12 +216,12 @@ class LayerCache:
             ) from error
 
     def store(self, key: CacheKey, header: SegmentHeader, fd: int) -> bool:
-        """Keep a finished segment whose publish block is still empty; False where there is no room for it.
+        """Store a finished segment whose publish block is still empty; return False if there is no room.
 
         Raises
         ------
         OSError
-            If it cannot be written.
+            The entry cannot be written.
         """
         os.makedirs(self.directory, mode=0o755, exist_ok=True)
         if not self.budget.has_room(header.total_bytes):
@@ -235,7 +235,7 @@ class LayerCache:
                 os.close(interim_fd)
             version = self._version_path(key.version_name())
             content = self._content_path(key.content_name(header.source_digest))
-            with contextlib.suppress(OSError):  # a file system without hard links: found by version alone
+            with contextlib.suppress(OSError):  # without hard links, the entry is found only by version
                 self._remove(content)
                 self._link(interim, content)
             os.makedirs(os.path.dirname(version), mode=0o755, exist_ok=True)
@@ -259,7 +259,7 @@ class LayerCache:
 
 
 def _is_of(header: SegmentHeader, key: CacheKey) -> bool:
-    """Whether an entry is what its name says; a cell's id may differ: a copied map's entries are used."""
+    """Whether an entry matches its key; the cell's id may differ, as entries of a copied map are used."""
     same_layer = header.layer == str(key.spec) and header.builder_version == key.spec.builder_version
     return same_layer and header.box == key.job.box
 

@@ -1,33 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers of columns over the ground, ``elevation``, ``ground`` and ``search``; the ground's height.
+"""The layers ``elevation``, ``ground`` and ``search``, made of columns over the ground; the ground's height.
 
 Each table of ``elevation`` and ``ground`` is (ny, nx): the column of a point (x, y) is ``[j - j0, i - i0]``
 with ``i = floor(x * (1 / resolution))``, ``j`` likewise (in the points' own precision, see
 `shmmap.layers.kernels`), and ``(i0, j0)`` the header's ``lattice_first``.  ``elevation`` has several
-numbers of each column, ``ground`` its lowest point alone.
+values for each column, ``ground`` only the lowest z.
 
 Maps have points far below the street: reflections in wet asphalt and glass, gullies, pits.  `ground_height`
-takes the median of the columns' lowest points within 4 m, which half of those columns would have to mislead.
-On a recorded street (154 places, with reflections 4 m below it) it is within 9 cm of the truth everywhere,
-and Autoware's rule up to 4.2 m too low.  A height of each column that leaves out single points, as the
-``surface`` rule of ``shmmap-elevation`` does, would not have helped: reflections are surfaces, too.
+returns the median of the columns' lowest points within 4 m, which is wrong only if half of those columns are.
+On a recorded street (154 positions, with reflections 4 m below the surface) its error is at most 9 cm, while
+Autoware's rule is up to 4.2 m too low.  Ignoring single points in each column, as the ``surface`` rule of
+``shmmap-elevation`` does, would not have helped: reflections form surfaces, too.
 
-Autoware's height fitter (map_height_fitter) takes the horizontal distance d from (x, y) to the
-nearest point, then the lowest z of all points closer than d + 1 m.  ``rule="min"`` asks the same of
-columns instead of points, each standing at its middle.  A point is at most half a diagonal from
-the middle of its column, so the answer is that of the exact rule with its radius d + 1 m changed by at
-most ``resolution * sqrt(2)``: never lower than the lowest point within that much more, never higher
-than the lowest within that much less.  The exact rule stays available from ``points``.
+Autoware's height fitter (map_height_fitter) computes the horizontal distance d from (x, y) to the
+nearest point, then the lowest z of all points closer than d + 1 m.  ``rule="min"`` does the same with
+columns instead of points, using the centre of each column.  A point is at most half a diagonal from
+the centre of its column, so the result is that of the exact rule with its radius d + 1 m changed by at
+most ``resolution * sqrt(2)``: never lower than the lowest point within the enlarged radius, never higher
+than the lowest within the reduced radius.  The exact rule can be computed from ``points``.
 
-``search`` has points sorted so that the neighbours of any place are found without building a tree.
+``search`` has points sorted so that the neighbours of any position are found without building a tree.
 The ground is divided into columns of ``leaf`` x ``leaf``, at multiples of ``leaf`` from the map's origin
 (index ``floor(coordinate * (1 / leaf))`` in float64), and 8 x 8 columns make a tile.  ``tile[ty, tx]``
 numbers the tiles that have points; the rows of column (cx, cy) are ``start[n] : start[n + 1]`` with
 ``n = tile[cy // 8, cx // 8] * 64 + (cy % 8) * 8 + cx % 8``, cx and cy counted from the lattice's first
-column, and within a column z ascends.  All points within r of a place are then found in the columns
-that its square of half-side r touches, by bisection of z.
+column, and within a column z ascends.  All points within r of a position lie in the columns that touch
+the square of half-side r around it, where bisection of z finds them.
 
-Two levels keep the table small where a map is mostly empty: 4 bytes per 64 columns, and 256 bytes
+Two levels keep the table of a mostly empty map small: 4 bytes per 64 columns, and 256 bytes
 more for each tile that has points.
 """
 
@@ -66,17 +66,17 @@ __all__ = [
 
 GroundRule = Literal["median", "min"]
 
-# how much farther than the nearest column others count, metres; that of min is the height fitter's
+# distance beyond the nearest column within which other columns count, metres; for min as in the height fitter
 _MARGIN_M: Final[dict[GroundRule, float]] = {"median": 4.0, "min": 1.0}
 
 
 def build_elevation(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Lowest, highest and mean z of each column, and how many points it has.
+    """Compute lowest, highest and mean z of each column, and its number of points.
 
     Raises
     ------
     MapDataError
-        If the grid cannot hold the coordinates.
+        The coordinates exceed the range of the grid.
     """
     from shmmap.layers.kernels import heights
 
@@ -124,12 +124,12 @@ ELEVATION: Final = LayerKind(
 
 
 def build_ground(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Lowest z of each column.
+    """Compute the lowest z of each column.
 
     Raises
     ------
     MapDataError
-        If the grid cannot hold the coordinates.
+        The coordinates exceed the range of the grid.
     """
     table = build_elevation(points, parameters)
     return LayerTable({"min": table["min"]}, table.rows, {"min": "m"}, table.lattice)
@@ -144,30 +144,31 @@ def ground_height(
     reach_m: float = 50.0,
     margin_m: float | None = None,
 ) -> float | None:
-    """Height of the ground at a place.
+    """Return the height of the ground at a position.
 
     Parameters
     ----------
     grids
-        ``min`` (ny, nx) and lattice of the ``ground`` (or ``elevation``) layers around the place.
+        Column ``min`` (ny, nx) and lattice of the ``ground`` (or ``elevation``) layers around the position.
     x, y
-        Metres, map frame.
+        Position, metres, map frame.
     rule
-        ``median``: of the columns near by, the upper one of an even number.  ``min``: the lowest of them, as
-        Autoware's height fitter answers.
+        ``median``: median of the nearby columns, the upper one if their number is even.  ``min``: the lowest
+        of them, as in Autoware's height fitter.
     reach_m
-        How far away the nearest column may be (the fitter asks for points within 50 m).
+        Maximum distance of the nearest column, metres (the fitter uses points within 50 m).
     margin_m
-        How much farther than the nearest one columns count; None: 4 m for ``median``, 1 m for ``min``.
+        Distance beyond the nearest column within which columns count, metres; None: 4 m for ``median``, 1 m
+        for ``min``.
 
     Returns
     -------
-    z, metres, map frame; None where there is nothing within reach, or x or y is not finite.
+    z, metres, map frame; None if no column is within reach, or x or y is not finite.
 
     Raises
     ------
     BadRequest
-        There is no such rule.
+        The rule is unknown.
     """
     if rule not in _MARGIN_M:
         raise BadRequest(f"unknown rule of the ground {rule!r}", hint=f"rules are: {', '.join(_MARGIN_M)}")
@@ -182,7 +183,7 @@ def ground_height(
     least = float(distance.min())
     if least > reach_m:
         return None
-    # a margin of zero leaves the nearest column
+    # with a margin of zero, the nearest column remains
     counted = np.sort(low[(distance < least + margin) | (distance == least)])
     return float(counted[0 if rule == "min" else len(counted) // 2])
 
@@ -190,7 +191,7 @@ def ground_height(
 def _window(
     low: NDArray[np.float32], lattice: Lattice, x: float, y: float, radius: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]] | None:
-    """Distance and height of the occupied columns whose middles are near; None without any."""
+    """Return distance and height of the occupied columns whose centres are near; None if there are none."""
     edge = lattice.leaf[0]
     i, j = lattice.first[0], lattice.first[1]
     at_x = (np.arange(i, i + low.shape[1]) + 0.5) * edge - x
@@ -219,22 +220,22 @@ GROUND: Final = LayerKind(
 
 
 TILE_COLUMNS: Final = 8
-"""Columns of a tile along x and along y."""
+"""Columns per tile along x and along y."""
 
 _MAX_TILES: Final = 1 << 24  # 64 MiB of table: 16 km x 16 km in tiles of 4 m
 
 
 def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Sort points by tile, then column, then z; equal ones stay in the source's order.
+    """Sort points by tile, then column, then z; equal points stay in the source's order.
 
     Raises
     ------
     MapDataError
-        If the points lie too far apart for the table (cause ``coordinate_range``).
+        The points lie too far apart for the table (cause ``coordinate_range``).
     """
     leaf = float(parameters["leaf"])
     units = {"xyz": "m", "tile": "", "start": ""}
-    # in float64 also where the points are float32
+    # in float64 even if the points are float32
     grouping = group_points(np.ascontiguousarray(points.xyz, np.float64), (leaf, leaf, math.inf))
     finite = grouping.rows >= 0
     xyz, rows = np.ascontiguousarray(points.xyz[finite]), grouping.rows[finite]
@@ -246,7 +247,7 @@ def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
         }
         return LayerTable(empty, 0, units, Lattice((leaf, leaf, math.inf), (0, 0, 0), (0, 0, 0)))
     column = grouping.indices[:, :2]
-    first = column.min(axis=0) // TILE_COLUMNS * TILE_COLUMNS  # whole tiles of one lattice for all cells
+    first = column.min(axis=0) // TILE_COLUMNS * TILE_COLUMNS  # tiles are aligned across all cells
     column_x, column_y = (column - first).T
     tiles_x, tiles_y = int(column_x.max()) // TILE_COLUMNS + 1, int(column_y.max()) // TILE_COLUMNS + 1
     if tiles_x * tiles_y > _MAX_TILES:
@@ -261,7 +262,7 @@ def build_search(points: PointTable, parameters: Parameters) -> LayerTable:
     key = number * TILE_COLUMNS**2 + column_y % TILE_COLUMNS * TILE_COLUMNS + column_x % TILE_COLUMNS
     key = key[rows]
     order = np.argsort(xyz[:, 2], kind="stable")
-    # numpy sorts 16 bits by their digits, in no time
+    # numpy uses its fast radix sort for 16-bit integers
     narrow = key if len(used) * TILE_COLUMNS**2 > 1 << 16 else key.astype(np.uint16)
     order = order[np.argsort(narrow[order], kind="stable")]
     start = np.zeros(len(used) * TILE_COLUMNS * TILE_COLUMNS + 1, np.int32)

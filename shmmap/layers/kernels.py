@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of layers: which voxel of a global lattice each point lies in, and sums over each one's points.
+"""Kernels of layers: voxel of a global lattice for each point, and sums over the points of each voxel.
 
 The index along an axis is ``floor(x * (1 / leaf))``, computed in the points' own precision: in
-float32 for float32 points, as PCL's VoxelGrid and VoxelGridCovariance do, so that points on a voxel's
-face fall where they fall there.
+float32 for float32 points, as in PCL's VoxelGrid and VoxelGridCovariance, so that points on a voxel's
+face are in the same voxel as there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["bounds", "count_points", "heights", "inverse_covariances", "moments"
 
 
 _POINTS: Final = tuple((read_only(real, 2), real) for real in (float32, float64))
-"""Types of points, and of one coordinate."""
+"""Numba types of a point array, and of one coordinate."""
 _INDICES: Final = read_only(int32, 1)
 _HEIGHTS: Final = float64[::1]
 _TABLE: Final = float64[:, ::1]
@@ -28,10 +28,9 @@ _TABLE: Final = float64[:, ::1]
 
 @compiled(*(types.int64(xyz, real, real, real, float64[::1]) for xyz, real in _POINTS))
 def bounds(xyz: Any, inverse_x: Any, inverse_y: Any, inverse_z: Any, result: Any) -> Any:
-    """Find the extent of finite points on the lattice.
+    """Find the extent of finite points on the lattice, and return the number of finite points.
 
-    ``result`` (6,) receives the least and then the greatest index along x, y, z.  Returns how many
-    points are finite.
+    ``result`` (6,) receives the least and then the greatest index along x, y, z.
     """
     kept = 0
     low_x, low_y, low_z = np.inf, np.inf, np.inf
@@ -41,7 +40,7 @@ def bounds(xyz: Any, inverse_x: Any, inverse_y: Any, inverse_z: Any, result: Any
         if not (np.isfinite(x) and np.isfinite(y) and np.isfinite(z)):
             continue
         kept += 1
-        # floor is monotonic: it can wait until the extreme is known
+        # floor is monotonic, so it is applied to the extremes only
         a, b, c = x * inverse_x, y * inverse_y, z * inverse_z
         low_x = min(low_x, a)
         low_y = min(low_y, b)
@@ -63,10 +62,10 @@ def bounds(xyz: Any, inverse_x: Any, inverse_y: Any, inverse_z: Any, result: Any
 def count_points(
     xyz: Any, inverse_x: Any, inverse_y: Any, inverse_z: Any, first: Any, shape: Any, place: Any, table: Any
 ) -> Any:
-    """Count the points of each voxel of a table.
+    """Count the points of each voxel of a table, and return the number of voxels with points.
 
     ``table`` (voxels,) is zero on entry, x fastest; ``place`` (N,) receives each point's position in
-    it, -1 for a point that is not finite.  Returns how many voxels have points.
+    ``table``, -1 for a point that is not finite.
     """
     occupied = 0
     first_x, first_y, first_z = first[0], first[1], first[2]
@@ -91,10 +90,10 @@ def count_points(
 
 @compiled(types.int64(int32[::1], int32, int32[::1], int32[::1]))
 def number_voxels(table: Any, least: Any, counts: Any, places: Any) -> Any:
-    """Assign rows to the voxels that have at least ``least`` points, in the order of the table.
+    """Assign rows to the voxels with at least ``least`` points, and return the number of rows.
 
-    ``table`` holds counts on entry, row numbers or -1 afterwards; ``counts`` and ``places`` (at least
-    as long as there are occupied voxels) receive each row's count and position.  Returns the rows.
+    Rows are in the order of the table.  ``table`` contains counts on entry, row numbers or -1 afterwards;
+    ``counts`` and ``places`` (with room for all occupied voxels) receive each row's count and position.
     """
     rows = 0
     for at in range(table.shape[0]):
@@ -111,7 +110,7 @@ def number_voxels(table: Any, least: Any, counts: Any, places: Any) -> Any:
 
 @compiled(*(types.void(xyz, _INDICES, _INDICES, _HEIGHTS, _HEIGHTS, _HEIGHTS) for xyz, _ in _POINTS))
 def heights(xyz: Any, rows: Any, counts: Any, low: Any, high: Any, mean: Any) -> None:
-    """Fill in the lowest, highest and mean z of each row; means are summed about the row's first z."""
+    """Compute lowest, highest and mean z of each row; the mean is summed relative to the row's first z."""
     first = np.empty(low.shape[0])
     low[:] = np.inf
     high[:] = -np.inf
@@ -132,13 +131,13 @@ def heights(xyz: Any, rows: Any, counts: Any, low: Any, high: Any, mean: Any) ->
 
 @compiled(*(types.void(xyz, _INDICES, _INDICES, _TABLE, _TABLE) for xyz, _ in _POINTS))
 def moments(xyz: Any, rows: Any, counts: Any, mean: Any, scatter: Any) -> None:
-    """Mean and scatter about the mean of each voxel's points.
+    """Compute mean and scatter about the mean of each voxel's points.
 
-    Everything is summed in float64 about the voxel's first point: no digits are lost at large
-    coordinates, and points that are all the same scatter by exactly 0.
+    All sums are in float64 relative to the voxel's first point: large coordinates lose no digits, and
+    identical points have a scatter of exactly 0.
 
     ``mean`` (V, 3) receives the mean, ``scatter`` (V, 6) the sums xx, xy, xz, yy, yz, zz of products of
-    differences to it.
+    differences to the mean.
     """
     sums = np.zeros((counts.shape[0], 12))  # origin, sums, sums of products
     seen = np.zeros(counts.shape[0], np.uint8)
@@ -179,7 +178,7 @@ def moments(xyz: Any, rows: Any, counts: Any, mean: Any, scatter: Any) -> None:
 
 @inlined
 def _jacobi(a: Any, v: Any) -> None:
-    """Eigenvalues (on the diagonal of ``a``) and eigenvectors (columns of ``v``), cyclic Jacobi."""
+    """Compute eigenvalues (diagonal of ``a``) and eigenvectors (columns of ``v``) by cyclic Jacobi."""
     for i in range(3):
         for j in range(3):
             v[i, j] = 1.0 if i == j else 0.0
@@ -216,7 +215,7 @@ def _jacobi(a: Any, v: Any) -> None:
 
 @inlined
 def _least_and_greatest(c: Any) -> Any:
-    """Least and greatest eigenvalue of (xx, xy, xz, yy, yz, zz), good to about 1e-8 of the greatest."""
+    """Return least and greatest eigenvalue of (xx, xy, xz, yy, yz, zz), accurate to 1e-8 of the greatest."""
     q = (c[0] + c[3] + c[5]) / 3.0
     x, y, z = c[0] - q, c[3] - q, c[5] - q
     off = c[1] * c[1] + c[2] * c[2] + c[4] * c[4]
@@ -231,7 +230,7 @@ def _least_and_greatest(c: Any) -> Any:
 
 @inlined
 def _raise_eigenvalues(c: Any, least_ratio: Any, a: Any, v: Any) -> None:
-    """Raise eigenvalues of (xx, xy, xz, yy, yz, zz) to ``least_ratio`` times the greatest, at least.
+    """Raise eigenvalues of (xx, xy, xz, yy, yz, zz) to at least ``least_ratio`` times the greatest.
 
     ``a`` and ``v``, (3, 3), are scratch.
     """
@@ -265,12 +264,12 @@ def _raise_eigenvalues(c: Any, least_ratio: Any, a: Any, v: Any) -> None:
 def inverse_covariances(
     counts: Any, scatter: Any, convention: Any, least_ratio: Any, covariance: Any, inverse: Any
 ) -> Any:
-    """Covariances after the smallest eigenvalues were raised, and their inverses.
+    """Compute covariances with raised smallest eigenvalues, and their inverses.
 
     ``convention`` 0: Autoware, (S + I) / (n - 1); 1: ndt_omp, (S + I) / n (n - 1) / n; 2: PCL,
-    S / (n - 1).  A least eigenvalue under ``least_ratio`` times the greatest is raised to that, and
-    only then is the middle one.  ``covariance`` may have no rows: then only inverses are written.
-    Rows that cannot be inverted are zero in both; returns how many.
+    S / (n - 1).  A least eigenvalue below ``least_ratio`` times the greatest is raised to that limit; only
+    in this case, the middle one is raised likewise.  ``covariance`` may have no rows: then only inverses
+    are written.  Rows that cannot be inverted are zero in both; returns the number of these rows.
     """
     refused = 0
     keep = covariance.shape[0] > 0

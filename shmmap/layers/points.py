@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``points`` layer: the source itself, every field a column, the bits unchanged."""
+"""The ``points`` layer: the source's points, with every field as a column, bits unchanged."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shmmap.segment.writer import SegmentWriter
 __all__ = ["BUILDER_VERSION", "LAYER", "POINTS", "OutsideBox", "build_points"]
 
 LAYER: Final = "points"
-BUILDER_VERSION: Final = 1  # raise it when the same source would give other bytes
+BUILDER_VERSION: Final = 1  # increase it when the same source would give other bytes
 
 
 def build_points(
@@ -34,8 +34,8 @@ def build_points(
 ) -> SegmentHeader:
     """Stream a PCD file into an empty segment file.
 
-    Blocks go from the source through a buffer into the segment, so memory does not grow with the
-    cell.  A file with points that are not finite is read twice: the first pass counts what stays.
+    The file is copied block by block through a buffer, so memory does not grow with the cell.  A file with
+    points that are not finite is read twice: the first pass counts the finite points.
 
     Parameters
     ----------
@@ -43,13 +43,13 @@ def build_points(
         Path or open descriptor of the PCD file.
     segment_fd
         Empty file on the shared-memory file system, open for reading and writing.  After an error
-        its contents mean nothing.
+        its content is undefined.
     cell_id, box, frame_id
-        For the segment's header; ``box`` is (min_x, min_y, max_x, max_y) in metres.
+        Values for the segment's header; ``box`` is (min_x, min_y, max_x, max_y) in metres.
     reserve
         Called with the segment's size in bytes before anything is allocated; it refuses by raising.
     warn
-        Called with each oddity of the file.
+        Called with a message for each oddity of the file.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def build_points(
     Raises
     ------
     MapDataError
-        If the file cannot be read, or changed meanwhile (cause ``changed``).
+        The file cannot be read, or changed while it was read (cause ``changed``).
     OSError
         ENOSPC if the file system is full.
     """
@@ -69,7 +69,7 @@ def build_points(
         outside = OutsideBox(box)
         for block in reader.blocks():
             outside.add(block[0], *reader.extremes)
-            if not reader.dropped:  # else this pass can only count
+            if not reader.dropped:  # after a dropped point, this pass only counts
                 _append(writer, block)
         if reader.dropped:
             rows = reader.kept
@@ -118,7 +118,7 @@ def _append(writer: SegmentWriter, block: Block) -> None:
 
 
 def _from_arrays(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Build the layer from arrays: points that are finite, every column."""
+    """Build the layer from arrays: the finite points, with every column."""
     del parameters
     return points.selected(points.finite())
 
@@ -142,7 +142,7 @@ POINTS: Final = LayerKind(
 
 
 class OutsideBox:
-    """Counts points farther outside a box than float32 steps there; next to nothing where there are none.
+    """Counts points outside a box by more than float32 rounding; nearly free if there are none.
 
     Attributes
     ----------
@@ -152,14 +152,14 @@ class OutsideBox:
 
     def __init__(self, box: tuple[float, float, float, float]) -> None:
         self._box = box
-        # what wrote the file may have rounded to float32 on either side of the border
+        # the writer of the file may have rounded to float32 across the border
         step = float(np.spacing(np.float32(max(map(abs, box)))))
         self._low = box[0] - step, box[1] - step
         self._high = box[2] + step, box[3] + step
         self.count = 0
 
     def add(self, xyz: NDArray[Any], low: Sequence[float], high: Sequence[float]) -> None:
-        """Count those of a block (N, 3); the bounds are of all points up to now, this block's included."""
+        """Count the outside points of a block (N, 3); the bounds are of all points so far, this block too."""
         inside_x = low[0] >= self._low[0] and high[0] <= self._high[0]
         if inside_x and low[1] >= self._low[1] and high[1] <= self._high[1]:
             return
@@ -168,7 +168,7 @@ class OutsideBox:
             column = np.ascontiguousarray(xyz[:, axis])
             if column.dtype.kind != "f":
                 column = column.astype(np.float64)
-            # limits in the points' own type, rounded outwards: a comparison of two types is much slower
+            # limits in the points' dtype, rounded outwards, as comparing different dtypes is much slower
             least = np.nextafter(column.dtype.type(self._low[axis]), column.dtype.type(-np.inf))
             most = np.nextafter(column.dtype.type(self._high[axis]), column.dtype.type(np.inf))
             outside |= column < least

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers whose rows are the source's points, all or some, in its order and with every column.
+"""Layers whose rows are all or some of the source's points, in its order and with every column.
 
-``crop`` keeps those between two heights, ``sample`` every n-th or a random choice that is the same
-everywhere, ``denoise`` those that are no statistical outliers (as in PCL, with Open3D's neighbour
-search); ``normals`` adds the direction of the surface at each, by Open3D.
+``crop`` keeps the points between two heights, ``sample`` every n-th point or a reproducible random choice,
+``denoise`` the points that are not statistical outliers (as in PCL, with Open3D's neighbour search).
+``normals`` adds the surface normal at each point, computed by Open3D.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _SOURCE_COLUMNS: Final = (_XYZ, LayerColumn("*", None, "as in the source", "", "
 _QUERIES_PER_BATCH: Final = 1 << 16
 SYSTEM_PACKAGES: Final = (
     "libegl1", "libgl1", "libx11-6", "libusb-1.0-0",
-    *(() if platform.machine() == "x86_64" else ("libgfortran5",)),  # its build for others links to it
+    *(() if platform.machine() == "x86_64" else ("libgfortran5",)),  # Open3D for other machines links to it
 )  # fmt: skip
-"""Of Debian and Ubuntu, which Open3D needs where there is no desktop."""
+"""Packages of Debian and Ubuntu that Open3D needs on a machine without a desktop."""
 
 
 def build_crop(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Keep points of ``z_min <= z <= z_max``, with every column."""
+    """Keep the points with ``z_min <= z <= z_max``, with every column."""
     z = points.xyz[:, 2]
     inside = points.finite()
     inside &= z >= float(parameters.get("z_min", -math.inf))
@@ -81,8 +81,7 @@ CROP: Final = LayerKind(
 def _mixed(rows: int, seed: int) -> NDArray[np.uint64]:
     """Return a random number for each row: SplitMix64 (Steele, Lea, Flood 2014) of seed and row.
 
-    numpy's generators may give other streams in other versions of numpy; this always
-    gives the same choice.
+    Unlike numpy's generators, it gives the same numbers in every version of numpy.
     """
     with np.errstate(over="ignore"):
         state = np.arange(1, rows + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
@@ -94,7 +93,7 @@ def _mixed(rows: int, seed: int) -> NDArray[np.uint64]:
 
 
 def build_sample(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Choose points; they stay in the source's order, with every column."""
+    """Sample points, in the source's order and with every column."""
     rows = np.flatnonzero(points.finite())
     if "every" in parameters:
         return points.selected(rows[:: int(parameters["every"])])
@@ -142,8 +141,8 @@ def build_denoise(points: PointTable, parameters: Parameters) -> LayerTable:
     """Drop points that lie far from their neighbours.
 
     Each point's mean distance to its ``neighbors`` nearest other points is compared with the mean of
-    these means plus ``std_ratio`` standard deviations (n - 1), over the cell's own points.  Where
-    there are fewer other points, all of them count; a point without any stays.
+    these means plus ``std_ratio`` standard deviations (n - 1), over the cell's own points.  If there are
+    fewer than ``neighbors`` other points, all of them count; a point without neighbours is kept.
     """
     finite = points.finite()
     rows = np.flatnonzero(finite)
@@ -157,7 +156,7 @@ def build_denoise(points: PointTable, parameters: Parameters) -> LayerTable:
 
 
 def _mean_distances(xyz: NDArray[np.float64], queries: int, neighbours: int) -> NDArray[np.float64]:
-    """Mean distance of the first ``queries`` points to their nearest others."""
+    """Return the mean distance of each of the first ``queries`` points to its nearest other points."""
     o3d = load_open3d("the layer denoise")
     core = o3d.core
     search = core.nns.NearestNeighborSearch(core.Tensor(xyz))
@@ -167,7 +166,7 @@ def _mean_distances(xyz: NDArray[np.float64], queries: int, neighbours: int) -> 
     for at in range(0, queries, _QUERIES_PER_BATCH):
         end = min(queries, at + _QUERIES_PER_BATCH)
         _, squared = search.knn_search(core.Tensor(np.ascontiguousarray(xyz[at:end])), wanted)
-        # the nearest is the point itself, or one that lies where it does: 0 away either way
+        # the nearest point is the point itself or a duplicate, at distance 0 in both cases
         means[at:end] = np.sqrt(squared.numpy()[:, 1:]).mean(axis=1)
     return means
 
@@ -198,10 +197,10 @@ DENOISE: Final = LayerKind(
 
 
 def build_normals(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Direction of least spread of the nearest ``neighbors`` points within ``radius`` of each point.
+    """Compute normals: the direction of least spread of the nearest points within ``radius`` of each point.
 
-    Normals have length 1 and point up.  As in Open3D, a point with fewer than three points around it,
-    itself included, has the normal (0, 0, 1).
+    At most ``neighbors`` points are used.  Normals have length 1 and point up.  As in Open3D, a point with
+    fewer than three points around it, itself included, has the normal (0, 0, 1).
     """
     o3d = load_open3d("the layer normals")
     finite = points.finite()
@@ -250,9 +249,9 @@ NORMALS: Final = LayerKind(
 
 
 def _local_coordinates(points: PointTable, finite: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Coordinates of a cell's finite points, then of its halo, (N + M, 3) float64, about the first point.
+    """Return a cell's finite points, then its halo, (N + M, 3) float64, relative to the first point.
 
-    Open3D's own sums would lose digits far from the map's origin.
+    With absolute coordinates, Open3D's sums would lose digits far from the map's origin.
     """
     own = points.xyz[finite].astype(np.float64)
     if points.halo is None or not len(points.halo) or not len(own):
@@ -263,19 +262,19 @@ def _local_coordinates(points: PointTable, finite: NDArray[np.bool_]) -> NDArray
 
 
 def load_open3d(purpose: str) -> Any:
-    """Return the open3d module; the first time in a process it takes 1-2 s and 100-200 MB.
+    """Return the open3d module; its first import in a process takes 1-2 s and 100-200 MB.
 
     Parameters
     ----------
     purpose
-        What needs it, as the subject of a sentence: ``"the layer normals"``.
+        The user of Open3D, as the subject of a sentence: ``"the layer normals"``.
 
     Raises
     ------
     PackageMissing
-        It, or a package that it needs, is not installed; the hint says how to install it.
+        Open3D or a package that it needs is not installed; the hint shows how to install it.
     ShmmapError
-        It cannot be loaded; the hint says what the system lacks.
+        Open3D cannot be loaded; the hint names what the system lacks.
     """
     try:
         import open3d

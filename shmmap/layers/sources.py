@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cell's points as builders need them, and what reads them in loaders and preparing processes.
+"""A cell's points as builders need them, and their readers in loaders and preparing processes.
 
-Points come from the cell's file, from its ``points`` segment in memory, or from whatever another
-`SourceReader` reads; files are one kind.
+Points are read from the cell's file, from its ``points`` segment in memory, or by any other `SourceReader`,
+such as that of a published map.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ __all__ = [
 
 
 MAX_SOURCE_BYTES: Final = 1 << 30
-"""Points of one cell, uncompressed, that a layer is computed of: all of them are in a process's memory then.
+"""Size limit of one cell's uncompressed points, as a layer's builder holds all of them in memory.
 
-A compressed file of a few megabytes may claim more.  A cloud that is served as one cell has fewer."""
+The header of a compressed file of a few megabytes may claim more.  A cloud served as one cell has fewer."""
 
 SMALLER: Final = "divide the map into smaller cells"
 
 
 @dataclass(slots=True)
 class CellSource:
-    """The finite points of a cell, and what is known of the file they come from."""
+    """The finite points of a cell, with stamp, digest and statistics of their source."""
 
     points: PointTable
     stamp: SourceStamp
@@ -69,7 +69,7 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
     Raises
     ------
     MapDataError
-        If the file cannot be read, is too large (cause ``too_large``), or changed meanwhile (``changed``).
+        The file cannot be read, is too large (cause ``too_large``), or changed meanwhile (``changed``).
     """
     with PcdReader(path) as reader:
         _check_size(reader.header.points * reader.header.point_bytes, path)
@@ -111,21 +111,21 @@ def read_source(path: str, box: Box, needs: Sequence[str] | None) -> CellSource:
 def read_segment(
     fd: int, box: Box, needs: Sequence[str] | None, header: SegmentHeader | None = None
 ) -> CellSource:
-    """Read them from an open ``points`` segment; nothing of it stays mapped.
+    """Read the columns that a layer needs from an open ``points`` segment, which does not stay mapped.
 
     Parameters
     ----------
     header
-        Header of a segment that is not published yet; None: read it from the segment.
+        Header of a segment that is not published yet; None: it is read from the segment.
 
     Raises
     ------
     MapDataError
-        If it is too large (cause ``too_large``).
+        The segment is too large (cause ``too_large``).
     SegmentCorrupt
-        If its header is not whole, or it is shorter than that says.
+        The header is incomplete, or the segment is shorter than its header says.
     OSError
-        If it cannot be read.
+        The segment cannot be read.
     """
     if header is None:
         header, _ = read_header(fd)
@@ -169,34 +169,34 @@ REPLACED: Final = "another directory has the map's name now: `shmmap reload` rea
 
 
 class Fetcher(Protocol):
-    """Fetches what several jobs need at once, before they are worked on one after the other.
+    """Fetches the sources of several jobs concurrently, before the jobs run one after the other.
 
-    What cannot be fetched is an error of whatever reads it then.
+    A source that cannot be fetched raises its error when the job reads it.
     """
 
     @property
     def fd(self) -> int:
-        """Readable when `done` may have an answer."""
+        """File descriptor that is readable when `done` may return a job."""
 
     def begin(self, number: int, spec: LayerSpec, job: CellJob) -> None:
-        """Begin to fetch what a layer of a cell is made from; returns at once."""
+        """Begin to fetch the sources of a cell's layer, without waiting."""
 
     def done(self) -> int | None:
-        """Return the number of a job for which all is fetched, or will not come; None: there is none."""
+        """Return the number of a job whose fetches have succeeded or failed; None if there is none."""
 
 
 class SourceReader(Protocol):
-    """Reads sources by the words of the origin that named them.
+    """Reads sources, which the map's origin names.
 
-    What cannot be reached at present raises `shmmap.errors.Offline`.
+    A source that cannot be reached at present raises `shmmap.errors.Offline`.
     """
 
     @property
     def fetcher(self) -> Fetcher | None:
-        """Fetches for several jobs at once; None: each is read when it is worked on."""
+        """Fetcher for several jobs at once; None: each job reads its sources when it runs."""
 
     def stamp(self, source: Source) -> Stamp | None:
-        """Return the state that a source is in; None where that cannot be found out."""
+        """Return the present state of a source; None if it cannot be read."""
 
     def read(self, source: Source, box: Box, needs: Sequence[str] | None) -> CellSource:
         """Read the columns that a layer needs (None: all) of a cell's points.
@@ -204,7 +204,7 @@ class SourceReader(Protocol):
         Raises
         ------
         MapDataError
-            It cannot be read, or is too large.
+            The source cannot be read, or is too large.
         """
 
     def fill(
@@ -216,19 +216,20 @@ class SourceReader(Protocol):
         reserve: Callable[[int], None] | None,
         warn: Callable[[str], None],
     ) -> SegmentHeader | None:
-        """Fill an empty segment file with a layer that is there as it is; None: it has to be computed.
+        """Fill an empty segment file with a layer that the source contains; None: it must be computed.
 
-        ``points`` always are.  Parameters and errors are those of `shmmap.layers.build.make_layer`.
+        Sources always contain ``points``.  Parameters and errors are as in
+        `shmmap.layers.build.make_layer`.
         """
 
     def named(self, message: str) -> str:
-        """Name sources in a message as a person knows them."""
+        """Return a message in which sources have the names that users know."""
 
     def explain(self, source: Source, message: str) -> str:
-        """Say why a source could not be read, in such words."""
+        """Return a message that explains why a source could not be read, with names that users know."""
 
     def take_counts(self) -> tuple[int, ...]:
-        """Return counts of objects read since the last call, in the order of `OBJECTS_READ`; empty: none."""
+        """Return counts of objects read since the last call, in the order of `OBJECTS_READ`, or ()."""
 
 
 class Files:
@@ -237,9 +238,9 @@ class Files:
     Parameters
     ----------
     at
-        Says where to find what a path names.
+        Translates a path into the path under which this process can open the file.
     named
-        Names paths in a message as they were given.
+        Replaces such paths in a message by the original ones.
     """
 
     fetcher = None
@@ -248,7 +249,7 @@ class Files:
         self._at, self._named = at, named
 
     def stamp(self, source: Source) -> Stamp | None:
-        """State of the file, as ``stat`` gives it; None where it cannot be looked at."""
+        """Return the state of the file from ``stat``; None if that fails."""
         try:
             return SourceStamp.of(os.stat(self._at(source.name))).token
         except OSError:
@@ -281,27 +282,27 @@ class Files:
         )
 
     def named(self, message: str) -> str:
-        """Name files by their paths."""
+        """Return a message with the files' original paths."""
         return self._named(message)
 
     def explain(self, source: Source, message: str) -> str:
-        """Name files by their paths, and say whether another directory has the map's name now."""
+        """Return a message with original paths; it adds whether the map's path now is another directory."""
         place = self._at(source.name)
         if place != source.name and self.stamp(source) is None and os.path.exists(source.name):
             return f"{source.name}: {REPLACED}"
         return self._named(message)
 
     def take_counts(self) -> tuple[int, ...]:
-        """Return nothing: files are not objects."""
+        """Return (), as files are not objects."""
         return ()
 
 
 FILES: Final = Files()
-"""Files by their paths."""
+"""Reader of files by their unchanged paths."""
 
 
 class Neighbour(NamedTuple):
-    """A cell that a layer of another one looks into: source, box in metres, id (empty: the source's name)."""
+    """A neighbouring cell whose points a layer uses: source, box in metres, id (empty: the source's name)."""
 
     source: Source
     box: Box
@@ -309,16 +310,16 @@ class Neighbour(NamedTuple):
 
     @classmethod
     def of(cls, cell_id: str, source: Source, box: Box) -> Neighbour:
-        """Return the cell of this id."""
+        """Return the neighbour with this id."""
         return cls(source, box, "" if cell_id == source.name else cell_id)
 
 
 @dataclass(frozen=True, slots=True)
 class CellJob:
-    """Which cell: id, source, box (metres), frame, and for a layer with a halo the cells around it.
+    """Cell of a job: id, source, box (metres), frame, and for a layer with a halo the cells around it.
 
-    ``reader`` reads the sources; ``ready`` is the version of a layer that the origin has ready made, 0 of
-    one that is computed.
+    ``reader`` reads the sources.  ``ready`` is the version of a published layer; 0 for a layer that is
+    computed.
     """
 
     cell_id: str
@@ -330,7 +331,7 @@ class CellJob:
     ready: int = 0
 
     def version(self, spec: LayerSpec, source: SourceStamp, around: Sequence[SourceStamp]) -> int:
-        """Version of a layer of the cell for these states of its file and of its neighbours'."""
+        """Return a layer's version for these states of the cell's source and of its neighbours' sources."""
         cell = cell_version(self.cell_id, source.token, self.box)
         if spec.kind.name == LAYER:
             return cell

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers by name: which kinds there are, and specs in one canonical form.
+"""Registry of layer kinds, and parser of layer specs with their canonical form.
 
 ::
 
     spec     = name [ "(" argument { "," argument } ")" ]
     argument = number | name "=" number | "of" "=" spec
 
-``ndt(2)``, ``ndt( leaf = 2.0, min_points=6 )`` and ``ndt(leaf=2.0)`` are one layer; the last is its
-canonical form: parameters by name in the kind's order, defaults left out, floats as Python prints
-them.  ``of`` names the layer it is built of: ``ndt(leaf=2.0,of=voxel(leaf=0.1))``.
+``ndt(2)``, ``ndt( leaf = 2.0, min_points=6 )`` and ``ndt(leaf=2.0)`` name the same layer; the last spec is
+its canonical form: parameters by name in the kind's order, defaults left out, floats as Python prints
+them.  ``of`` names the layer that a layer is built of: ``ndt(leaf=2.0,of=voxel(leaf=0.1))``.
 
 Another package offers a kind by an entry point of the group ``shmmap.layers`` whose object is a
 `LayerKind`::
@@ -57,12 +57,12 @@ _registered: Final[dict[str, LayerKind]] = {}
 
 
 def register(kind: LayerKind) -> None:
-    """Make a kind known to this process; an entry point makes it known to all of them.
+    """Register a kind in this process; an entry point registers it in all processes.
 
     Raises
     ------
     ValueError
-        If another kind has its name.
+        Another kind has the same name.
     """
     if (find_kind(kind.name) or kind) is not kind or not kind.name.isidentifier() or not kind.name.isascii():
         raise ValueError(f"a layer kind cannot be called {kind.name!r}")
@@ -73,8 +73,8 @@ def register(kind: LayerKind) -> None:
 
 @lru_cache(maxsize=1)
 def _offered() -> dict[str, LayerKind]:
-    """Kinds of other packages; one that cannot be loaded is left out and logged."""
-    from importlib.metadata import entry_points  # a tenth of the time that a loader's imports take
+    """Return the kinds of other packages; a kind that cannot be loaded is left out and logged."""
+    from importlib.metadata import entry_points  # imported late: a tenth of a loader's import time
 
     found: dict[str, LayerKind] = {}
     for entry in entry_points(group=GROUP):
@@ -91,12 +91,12 @@ def _offered() -> dict[str, LayerKind]:
 
 
 def find_kind(name: str) -> LayerKind | None:
-    """Return the kind of that name; other packages are looked at only for names that are not ours."""
+    """Return the kind of that name; other packages are searched only for names that shmmap does not have."""
     return _own.get(name) or _registered.get(name) or _offered().get(name)
 
 
 def kinds() -> tuple[LayerKind, ...]:
-    """Return every kind there is: our own first."""
+    """Return all kinds, shmmap's own first."""
     return (*_own.values(), *_registered.values(), *_offered().values())
 
 
@@ -110,7 +110,7 @@ _TOKEN: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class LayerSpec:
-    """One layer: its kind, every parameter that has a value, and what it is built of (None: the source)."""
+    """One layer: its kind, its parameters with a value, and the layer it is built of (None: the source)."""
 
     kind: LayerKind
     values: tuple[tuple[str, Value], ...]
@@ -123,17 +123,17 @@ class LayerSpec:
 
     @property
     def halo_m(self) -> float:
-        """How far beyond the cell the layer looks, metres, the layers that it is built from included."""
+        """Distance beyond the cell from which points are used, metres, including layers it is built of."""
         return self.kind.halo_m(self.parameters) + (self.of.halo_m if self.of is not None else 0.0)
 
     @property
     def builder_version(self) -> int:
-        """Builder versions along the chain, one byte each, this layer's in the lowest."""
+        """Builder versions of this layer (lowest byte) and of the layers it is built of, one byte each."""
         return self.kind.builder_version | (self.of.builder_version << 8 if self.of is not None else 0)
 
     @property
     def source_columns(self) -> tuple[str, ...] | None:
-        """The source's columns that the chain reads; None for all."""
+        """Columns of the source that this layer and the layers it is built of read; None for all."""
         return self.of.source_columns if self.of is not None else self.kind.needs
 
     def __str__(self) -> str:
@@ -145,7 +145,7 @@ class LayerSpec:
 
 
 class _Words:
-    """The tokens of a spec, one ahead."""
+    """Tokens of a spec, with a look-ahead of one."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -172,7 +172,7 @@ class _Words:
         return self._tokens[self._at]
 
     def take(self, kind: str, value: str | None = None) -> str | None:
-        """Take the next token if it is this one, else return None."""
+        """Consume and return the next token if it matches, else return None."""
         found, text = self._tokens[self._at]
         if found != kind or (value is not None and text != value):
             return None
@@ -195,8 +195,8 @@ def parse_layer(text: str) -> LayerSpec:
     Raises
     ------
     BadRequest
-        If the kind or a parameter is unknown (the hint lists what exists), a value out of range,
-        or the text no spec.
+        The kind or a parameter is unknown (the hint lists those that exist), a value is out of range,
+        or the text is not a spec.
     """
     if len(text) > MAX_SPEC_CHARACTERS:
         raise BadRequest(f"a layer spec has at most {MAX_SPEC_CHARACTERS} characters")
@@ -247,7 +247,7 @@ def _spec(words: _Words, depth: int) -> LayerSpec:
 
 def _source(words: _Words, kind: LayerKind, depth: int) -> LayerSpec:
     of = _spec(words, depth + 1)
-    if not kind.takes_layers:  # kinds with a halo do not: their neighbours' layers would be needed too
+    if not kind.takes_layers:  # e.g. kinds with a halo, which would need the neighbours' layers, too
         raise BadRequest(f"{kind.name} is built of the source, not of another layer")
     if not of.kind.gives_points:
         raise BadRequest(f"{kind.name} cannot be built of {of.kind.name}, which has no points")
@@ -280,7 +280,7 @@ def _checked(kind: LayerKind, given: dict[str, Value], of: LayerSpec | None) -> 
     return LayerSpec(kind, ordered, of)
 
 
-@lru_cache(maxsize=1024)  # requests have few specs, and repeat them
+@lru_cache(maxsize=1024)  # requests repeat a few specs
 def canonical_layer(spec: str) -> str:
     """Return the canonical form of a layer spec; errors are those of `parse_layer`."""
     return str(parse_layer(spec))
@@ -288,12 +288,12 @@ def canonical_layer(spec: str) -> str:
 
 @lru_cache(maxsize=1024)
 def layer_spec(canonical: str) -> LayerSpec:
-    """Return the spec of a canonical form, remembered."""
+    """Return the spec of a canonical form; results are cached."""
     return parse_layer(canonical)
 
 
 def canonical_layers(specs: Sequence[str]) -> tuple[str, ...]:
-    """Return the canonical forms of several layer specs, duplicates left out; there must be one."""
+    """Return the canonical forms of one or more layer specs, without duplicates."""
     if not specs:
         raise BadRequest("a request must name at least one layer")
     return tuple(dict.fromkeys(map(canonical_layer, specs)))

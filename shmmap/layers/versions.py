@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Versions of the layers of a map's cells, and which cells a layer looks into.
+"""Versions of the layers of a map's cells, and the neighbouring cells that a layer uses.
 
-A layer with a halo has its neighbours in its version.  Finding them takes some 40 us, so those versions are
-remembered until one of the cells changes, and a caller that needs many asks first which are `unknown`.
+The version of a layer with a halo includes its neighbours' versions.  Finding the neighbours takes about
+40 us, so these versions are cached until one of the cells changes, and a caller that needs many of them first
+checks which are `unknown`.
 """
 
 from __future__ import annotations
@@ -24,55 +25,55 @@ from shmmap.segment.version import layer_version
 __all__ = ["MAX_NEIGHBOURS", "Cells", "LayerVersions"]
 
 MAX_NEIGHBOURS: Final = 64
-"""Most files that a layer with a halo reads beside its own."""
+"""Maximum number of neighbouring files that a layer with a halo reads."""
 MAX_REMEMBERED: Final = 1 << 18
-"""Versions, about 100 bytes each; requests for always new layers must not fill the daemon's memory."""
+"""Maximum number of cached versions, about 100 bytes each; it limits the memory that requests can fill."""
 
 
 _SLACK_M: Final = 1e-3
-"""Cells are looked for a little farther than a halo reaches, and then compared as `neighbours` does it."""
+"""Distance by which the search for cells exceeds the halo; `neighbours` then compares exactly."""
 
 
 class ReadyLayer(Protocol):
-    """A layer that the origin has ready made."""
+    """A layer that the origin has computed."""
 
     @property
     def version(self) -> int:
-        """The version."""
+        """Version of the layer."""
 
 
 class Cells(Protocol):
-    """What is asked of a map's catalogue: its cells by index."""
+    """The methods of a map's catalogue that are used here: its cells by index."""
 
     def __len__(self) -> int:
-        """How many cells there are."""
+        """Return the number of cells."""
 
     @property
     def bounds(self) -> tuple[float, float, float, float] | None:
-        """Box around all cells, metres, map frame; None where there are none."""
+        """Box around all cells, metres, map frame; None if there are no cells."""
 
     @property
     def mean_size(self) -> tuple[float, float]:
         """Mean extent of the cells along x and y, metres."""
 
     def boxes_of(self, indices: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(K, 4) float64, ``min_x, min_y, max_x, max_y`` of these cells, metres, map frame."""
+        """Return (K, 4) float64, ``min_x, min_y, max_x, max_y`` of these cells, metres, map frame."""
 
     def version(self, index: int) -> int:
-        """64-bit version of a cell."""
+        """Return the 64-bit version of a cell."""
 
     def ready(self, index: int, layer: str) -> ReadyLayer | None:
-        """Return what is known of a layer that the origin has computed; None: it is computed here."""
+        """Return a layer that the origin has computed; None if it is computed here."""
 
     def box(self, index: int) -> tuple[float, float, float, float]:
-        """``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
+        """Return ``min_x, min_y, max_x, max_y`` of a cell, metres, map frame."""
 
     def query(self, area: Area) -> tuple[NDArray[np.intp], bool]:
-        """Cells whose box touches ``area``, ascending; whether these are all."""
+        """Return the cells whose box touches ``area``, ascending, and whether these are all."""
 
 
 class _Kind(NamedTuple):
-    """What a layer's versions depend on beside cells."""
+    """The values that a layer's versions depend on besides cells."""
 
     builder_version: int
     halo_m: float
@@ -85,7 +86,7 @@ def _kind(layer: str) -> _Kind:
 
 
 class LayerVersions:
-    """Answers for the layers of one daemon's map.
+    """Computes and caches layer versions of one daemon's map.
 
     Parameters
     ----------
@@ -95,13 +96,13 @@ class LayerVersions:
 
     def __init__(self, catalogue: Callable[[], Cells]) -> None:
         self._catalogue = catalogue
-        self._known: dict[str, ShardedDict[int, int]] = {}  # by layer with a halo, by cell
+        self._known: dict[str, ShardedDict[int, int]] = {}  # by layer (only with a halo), then by cell
         self._count = 0
 
     def version(self, index: int, layer: str) -> int:
         """Return the current version of one layer of a cell, see `shmmap.segment.version`.
 
-        0 where it is not known yet: not all of the cells are that it looks into.
+        0 if it is not known yet, because a cell that the layer uses is not known.
         """
         catalogue = self._catalogue()
         cell = catalogue.version
@@ -124,16 +125,16 @@ class LayerVersions:
         return version
 
     def unknown(self, indices: Iterable[int], layers: Iterable[str]) -> Iterator[tuple[int, str]]:
-        """Cells and layers whose `version` would take long now: neighbours have to be found."""
+        """Yield cells and layers whose `version` is not cached, so that neighbours have to be searched."""
         for layer in layers:
             if _kind(layer).halo_m:
                 known = self._known.get(layer)
                 yield from ((index, layer) for index in indices if known is None or index not in known)
 
     def neighbours(self, index: int, layer: str) -> list[int]:
-        """Catalogue indices of the cells that a layer of this one looks into, in id order.
+        """Return the catalogue indices of the neighbouring cells that a cell's layer uses, in id order.
 
-        Of more than `MAX_NEIGHBOURS` the first ones, one more than that: such a layer cannot be made.
+        At most `MAX_NEIGHBOURS` + 1 are returned: a layer with more than `MAX_NEIGHBOURS` cannot be made.
         """
         halo_m = _kind(layer).halo_m
         if not halo_m or self._catalogue().ready(index, layer) is not None:
@@ -142,7 +143,7 @@ class LayerVersions:
         return around
 
     def halo_m(self, layers: Iterable[str]) -> float:
-        """How far the farthest-looking of some layers looks beyond a cell, metres."""
+        """Return the largest halo of several layers, metres."""
         return max((_kind(layer).halo_m for layer in layers if layer != LAYER), default=0.0)
 
     def is_computed(self, index: int, layer: str) -> bool:
@@ -150,7 +151,7 @@ class LayerVersions:
         return layer != LAYER and self._catalogue().ready(index, layer) is None
 
     def looks_into(self, index: int, layer: str) -> Box | None:
-        """Where a layer of a cell looks; None if it takes that cell alone."""
+        """Return the box of points that a cell's layer uses; None if it uses only that cell."""
         halo_m = _kind(layer).halo_m if self.is_computed(index, layer) else 0.0
         return self._reach(index, halo_m) if halo_m else None
 
@@ -159,20 +160,20 @@ class LayerVersions:
         return Box(min_x - halo_m, min_y - halo_m, max_x + halo_m, max_y + halo_m)
 
     def _around(self, index: int, halo_m: float) -> tuple[NDArray[np.intp], bool]:
-        """Known cells around one, in id order, and whether these are all."""
+        """Return the known cells around a cell, in id order, and whether these are all."""
         found, known = self._catalogue().query(self._reach(index, halo_m))
         return np.delete(found, found == index), known
 
     def check_reach(self, layer: str) -> None:
-        """Refuse a layer that would look into too many cells of this map.
+        """Refuse a layer that would use too many neighbouring cells of this map.
 
-        Judged by the mean cell, had the map cells everywhere within its bounds.  A single cell with too
-        many others around it passes here, and cannot be loaded.
+        The number is estimated from the mean size of a cell, as if cells filled the map's bounds.  A single
+        cell with too many neighbours passes this check, but cannot be loaded.
 
         Raises
         ------
         BadRequest
-            They would be more than `MAX_NEIGHBOURS`.
+            A cell would have more than `MAX_NEIGHBOURS` neighbours.
         """
         halo_m = _kind(layer).halo_m
         if not halo_m:
@@ -195,7 +196,7 @@ class LayerVersions:
     # --- changes --------------------------------------------------------------------------------
 
     def dependents(self, index: int, layers: Iterable[str]) -> Iterator[tuple[str, list[int]]]:
-        """For each of these layers, the cells whose version has this one's in it, itself first."""
+        """Yield, for each of these layers, the cells whose version depends on a cell, itself first."""
         halos = [(layer, _kind(layer).halo_m) for layer in layers]
         widest_m = max((halo_m for _, halo_m in halos), default=0.0)
         around = self._around(index, widest_m + _SLACK_M)[0] if widest_m else np.zeros(0, np.intp)
@@ -220,7 +221,7 @@ class LayerVersions:
         self._count += 1
 
     def cell_changed(self, index: int) -> None:
-        """Forget the versions of layers that look into a cell: it has another version."""
+        """Drop the cached versions of layers that use a cell, whose version has changed."""
         for layer, cells in self.dependents(index, list(self._known)):
             known = self._known[layer]
             for cell in cells:
@@ -229,6 +230,6 @@ class LayerVersions:
                 del self._known[layer]
 
     def forget(self) -> list[ShardedDict[int, int]]:
-        """Forget all versions, as indices now mean other cells; return them: freeing them takes time."""
+        """Drop all versions, as indices now name other cells; return them, since freeing them takes time."""
         known, self._known, self._count = list(self._known.values()), {}, 0
         return known

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points sorted into the voxels of a global lattice, and the layers ``voxel`` and ``ndt`` made from them.
 
-Rows are numbered with x fastest, then y, then z.  ``voxel`` has one point for each voxel, the mean of those
-in it; ``ndt`` a Gaussian for each voxel of at least ``min_points`` points, ready for scan matching.  Its
-``table`` finds a voxel's row without a tree: a point at ``(x, y, z)`` is in row
+Rows are numbered with x fastest, then y, then z.  ``voxel`` has one point for each voxel, the mean of its
+points.  ``ndt`` has a Gaussian for each voxel of at least ``min_points`` points, ready for scan matching, and
+a ``table`` that gives a voxel's row without a tree search: a point at ``(x, y, z)`` is in row
 ``table[k - k0, j - j0, i - i0]`` with ``i = floor(x * (1 / leaf))`` and so on (in the points' own precision,
 see `shmmap.layers.kernels`), and ``(i0, j0, k0)`` the header's ``lattice_first``; -1: no row.
 """
@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 MAX_TABLE_VOXELS: Final = 1 << 24
-"""Voxels of a dense table that is written out: 64 MiB of int32, a 512 m cube at 2 m."""
+"""Maximum number of voxels of a stored dense table: 64 MiB of int32, a 512 m cube at 2 m."""
 
 _INDEX_LIMIT: Final = float(1 << 31)
 _DENSE_POINTS: Final = 64
@@ -46,7 +46,7 @@ _SMALL_TABLE: Final = 1 << 21
 
 @dataclass(slots=True)
 class Grouping:
-    """Which voxel each point lies in.
+    """Assignment of points to voxels.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Grouping:
         (N,) int32: row of each point's voxel; -1 for a point that is not finite, or whose voxel has
         too few points.
     counts
-        (V,) int32: points of each row's voxel.
+        (V,) int32: number of points in each row's voxel.
     indices
         (V, 3) int64: lattice index x, y, z of each row.
     leaf
@@ -68,7 +68,7 @@ class Grouping:
 
     @property
     def lattice(self) -> Lattice:
-        """The lattice, and the box of it that the rows occupy."""
+        """The lattice, with the index range that the rows occupy."""
         if not len(self.indices):
             return Lattice(self.leaf, (0, 0, 0), (0, 0, 0))
         low = self.indices.min(axis=0)
@@ -80,14 +80,14 @@ class Grouping:
         )
 
     def spread(self, values: NDArray[Any], empty: float) -> NDArray[Any]:
-        """Return a value of each row on the lattice, (nz, ny, nx) over the box that the rows occupy.
+        """Arrange values per row as a table on the lattice, (nz, ny, nx) over the box that the rows occupy.
 
         Voxels without a row have the value ``empty``.
 
         Raises
         ------
         MapDataError
-            If the box is too large for a table (cause ``coordinate_range``).
+            The box is too large for a table (cause ``coordinate_range``).
         """
         lattice = self.lattice
         nx, ny, nz = lattice.shape
@@ -109,7 +109,7 @@ def group_points(xyz: NDArray[np.generic], leaf: tuple[float, float, float], *, 
     Parameters
     ----------
     xyz
-        (N, 3) float32 or float64, C-contiguous, metres; the lattice index is computed in this
+        (N, 3) float32 or float64, C-contiguous, metres; the lattice index is computed in the same
         precision.
     leaf
         Edge lengths of a voxel, metres; infinite: that axis is not divided.
@@ -119,7 +119,7 @@ def group_points(xyz: NDArray[np.generic], leaf: tuple[float, float, float], *, 
     Raises
     ------
     MapDataError
-        If coordinates are too large for the lattice (cause ``coordinate_range``).
+        Coordinates are too large for the lattice (cause ``coordinate_range``).
     """
     from shmmap.layers.kernels import bounds, count_points, number_voxels
 
@@ -149,7 +149,7 @@ def group_points(xyz: NDArray[np.generic], leaf: tuple[float, float, float], *, 
         counts, places = np.empty(occupied, np.int32), np.empty(occupied, np.int32)
         row_count = number_voxels(table, least, counts, places)
         counts, places = counts[:row_count], places[:row_count].astype(np.int64)
-        rows = table[place]  # -1 reads the last entry
+        rows = table[place]  # place -1 (point not finite) reads the last entry
         if kept < len(xyz):
             rows[place < 0] = -1
         indices = np.empty((row_count, 3), np.int64)
@@ -165,7 +165,7 @@ def _by_sorting(
     inverse: NDArray[Any],
     least: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-    """Group points that lie far apart: no table over all of their box."""
+    """Group points by sorting, for points too far apart for a dense table."""
     finite = np.isfinite(xyz).all(axis=1)
     index = np.floor(xyz[finite] * inverse).astype(np.int64)
     order = np.lexsort((index[:, 0], index[:, 1], index[:, 2]))
@@ -193,7 +193,7 @@ _EDGES: Final = ("leaf_x", "leaf_y", "leaf_z")
 def _means(column: NDArray[np.generic], grouping: Grouping) -> NDArray[np.float64]:
     """Return the mean of a column over the points of each row, (V,) or (V, components) float64.
 
-    Summed about each voxel's first value, so that large values lose no digits.
+    Sums are relative to each voxel's first value, so that large values lose no digits.
     """
     wide = column.reshape(len(column), math.prod(column.shape[1:]))
     kept = grouping.rows >= 0
@@ -205,30 +205,30 @@ def _means(column: NDArray[np.generic], grouping: Grouping) -> NDArray[np.float6
     about = np.empty(len(result))
     for component in range(wide.shape[1]):
         values = (wide[:, component] if every else wide[kept, component]).astype(np.float64)
-        about[rows[::-1]] = values[::-1]  # the last assignment stands: the first value
-        with np.errstate(invalid="ignore"):  # infinity minus infinity
+        about[rows[::-1]] = values[::-1]  # reversed: the first value of a row is assigned last and stays
+        with np.errstate(invalid="ignore"):  # infinity minus infinity may occur
             sums = np.bincount(rows, weights=values - about[rows], minlength=len(result))
         result[:, component] = sums / grouping.counts + about
     return result.reshape(len(result), *column.shape[1:])
 
 
 def _kept_dtype(dtype: np.dtype[np.generic]) -> np.dtype[np.generic]:
-    """Means of floats keep their dtype; those of integers are float32, float64 where that is too short."""
+    """Return the dtype of a mean: that of the floats; float32 for integers up to 16 bits, else float64."""
     if dtype.kind == "f":
         return dtype
     return np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64)
 
 
 def build_voxel(points: PointTable, parameters: Parameters) -> LayerTable:
-    """Average the points of each voxel, every numeric column of them.
+    """Average the points of each voxel, in every numeric column.
 
-    A value that is not finite makes the mean of its column in its voxel not finite; a coordinate
-    that is not finite leaves out its point.
+    A value that is not finite makes the mean of its column in its voxel not finite; a point with a
+    coordinate that is not finite is left out.
 
     Raises
     ------
     MapDataError
-        If the lattice cannot hold the coordinates.
+        The coordinates exceed the range of the lattice.
     """
     leaf = _edges(parameters)
     grouping = group_points(points.xyz, leaf)
@@ -292,7 +292,7 @@ VOXEL: Final = LayerKind(
 Convention: TypeAlias = Literal["autoware", "pclomp", "pcl"]
 CONVENTIONS: Final[tuple[Convention, ...]] = ("autoware", "pclomp", "pcl")
 _LEAST_EIGENVALUE_RATIO: Final = 0.01
-"""``min_covar_eigvalue_mult_`` of PCL's VoxelGridCovariance and of its descendants."""
+"""``min_covar_eigvalue_mult_`` of PCL's VoxelGridCovariance and of its derivatives."""
 
 
 def build_ndt(points: PointTable, parameters: Parameters) -> LayerTable:
@@ -306,7 +306,7 @@ def build_ndt(points: PointTable, parameters: Parameters) -> LayerTable:
     Raises
     ------
     MapDataError
-        If the lattice cannot hold the coordinates.
+        The coordinates exceed the range of the lattice.
     """
     from shmmap.layers.kernels import inverse_covariances, moments
 
@@ -338,20 +338,21 @@ def voxel_covariances(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return covariance and inverse covariance of each voxel in one convention.
 
-    Of one set of moments, n points and their scatter S (sum of outer products of differences to the mean),
-    they are exactly those of PCL, ndt_omp or Autoware:
+    Computed from the number of points n and their scatter S (sum of outer products of differences to the
+    mean), they are exactly those of PCL, ndt_omp or Autoware:
 
     ========== ============================== ==========================================================
-    convention covariance before regularising whose
+    convention covariance before regularising used by
     ========== ============================== ==========================================================
     autoware   (S + I) / (n - 1)              autoware_core, ndt_scan_matcher's multi-grid NDT since 2025
     pclomp     (S + I) / n * (n - 1) / n      koide3/ndt_omp; Autoware before
     pcl        S / (n - 1)                    PCL 1.12 and later
     ========== ============================== ==========================================================
 
-    The identity comes from a leaf whose covariance starts as one and is summed into; it widens small
-    voxels, and with it the basin of convergence.  Then all three raise a least eigenvalue below 0.01
-    times the greatest to that, and only if they did so the middle one too (Magnusson 2009, 6.2).
+    The identity matrix I arises because these implementations initialise a voxel's covariance with it and
+    then add to it.  It widens voxels of few points, and so the basin of convergence.  Then all three raise a
+    least eigenvalue below 0.01 times the greatest to that limit, and only in this case also the middle one
+    (Magnusson 2009, 6.2).
 
     Parameters
     ----------
@@ -365,8 +366,8 @@ def voxel_covariances(
     covariance : (V, 6) float64, m^2
         After regularising; xx, xy, xz, yy, yz, zz.
     inverse : (V, 6) float64, 1/m^2
-        Both are 0 where the originals refuse a voxel: it has one point, or (``pcl``) all of its
-        points are the same.
+        Both are 0 for a voxel that the originals refuse: it has one point, or (``pcl``) all its points are
+        identical.
     """
     with needed_packages("voxel_covariances()"):
         from shmmap.layers.kernels import inverse_covariances

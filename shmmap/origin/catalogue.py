@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of one map at one moment: ids, boxes, stamps, versions, what touches an area; and map origins."""
+"""The cells of one map at one moment (ids, boxes, stamps, versions, area queries), and map origins."""
 
 from __future__ import annotations
 
@@ -54,15 +54,16 @@ class Catalogue:
     problems
         Oddities found while reading the map, one sentence each, for the log and `shmmap status`.
     before
-        An earlier state; what was made for its very ``names`` or ``boxes`` is used for them here, too.
+        An earlier state.  What was computed from its ``names`` or ``boxes`` is reused if these are the same
+        arrays.
     by_base, made, fixed_digest
-        What was made of the same names and boxes before: `CellNames.by_base`, `SpatialIndex.made` and
+        Earlier results for the same names and boxes: `CellNames.by_base`, `SpatialIndex.made` and
         `fixed_digest`.
 
     Attributes
     ----------
     opened
-        Directories that its cells are to be read through; None: their paths have to do.
+        Open directories through which the cells' files are read; None: they are read by path.
 
     Raises
     ------
@@ -141,12 +142,12 @@ class Catalogue:
 
     @property
     def id_prefix(self) -> str:
-        """What all ids start with, e.g. ``/maps/city/pointcloud_map.pcd/``."""
+        """Directory that all ids start with, e.g. ``/maps/city/pointcloud_map.pcd/``."""
         return self._names.prefix
 
     @property
     def names(self) -> NDArray[np.bytes_]:
-        """(N,) bytes, what follows `id_prefix` in each id; do not write."""
+        """(N,) bytes, the rest of each id after `id_prefix`; do not write."""
         return self._names.names
 
     @property
@@ -171,17 +172,17 @@ class Catalogue:
 
     @property
     def by_base(self) -> NDArray[np.int32]:
-        """In which order base names ascend, see `shmmap.origin.cell_names.order_by_base`; do not write."""
+        """Indices in order of base names, see `shmmap.origin.cell_names.order_by_base`; do not write."""
         return self._names.by_base
 
     @property
     def made_of_boxes(self) -> MadeOfBoxes:
-        """What areas are looked up in."""
+        """Search structure for area queries."""
         return self._index.made
 
     @property
     def nbytes(self) -> int:
-        """Memory of the tables (names, boxes, stamps, index), without what is remembered of some cells."""
+        """Memory of the tables (names, boxes, stamps, index) in bytes, without cached lookups."""
         tables = (self.names, self.by_base, self._stamps)
         return sum(int(table.nbytes) for table in tables) + self._index.nbytes
 
@@ -216,19 +217,19 @@ class Catalogue:
         return boxes
 
     def source(self, index: int) -> Source:
-        """Where a cell's points come from: the file whose path is its id."""
+        """Source of a cell's points: the file whose path is the cell's id."""
         return Source(self.id(index))
 
     def ready(self, index: int, layer: str) -> None:
-        """None: all layers are made here, of files."""
+        """Return None: no layer of these cells is published, all are computed from files."""
         del index, layer
 
     def stamp(self, index: int) -> Stamp:
-        """Stamp of a cell's file as last known."""
+        """Last known stamp of a cell's file."""
         return bytes(self._stamps[index].astype("<i8", copy=False).tobytes())
 
     def source_bytes(self, index: int) -> int:
-        """Size of a cell's file as last known."""
+        """Last known size of a cell's file in bytes."""
         return int(self._stamps[index, 0])
 
     def set_stamp(self, index: int, stamp: Stamp) -> None:
@@ -250,7 +251,7 @@ class Catalogue:
 
     @property
     def map_version(self) -> int:
-        """64-bit version of the whole catalogue: equal after a restart, other after any change.
+        """64-bit version of the whole catalogue: the same after a restart, different after any change.
 
         The recipe (XXH3, 64 bit, seed 0, little-endian throughout): *fixed* is the hash of
         ``b"shmmap map 1"``, a zero byte, `id_prefix`, a zero byte, all `names` padded with zero bytes
@@ -269,7 +270,7 @@ class Catalogue:
 
     @property
     def fixed_digest(self) -> int:
-        """Hash of what never changes, *fixed* of `map_version`: equal where all names and boxes are equal."""
+        """Hash of names and boxes, *fixed* in `map_version`: equal if all names and boxes are equal."""
         if self._fixed_digest is None:
             fixed = xxh3_64(b"shmmap map 1\0" + os.fsencode(self.id_prefix) + b"\0")
             for table in (self.names, self.boxes.T):
@@ -284,20 +285,21 @@ class Catalogue:
         return xxh3_64_intdigest(np.ascontiguousarray(cells).data)
 
     pages = None
-    """All cells of the map are here, see `shmmap.daemon.map.catalogue_view.CatalogueView`."""
+    """None: the whole catalogue is in memory, see `shmmap.daemon.map.catalogue_view.CatalogueView`."""
     complete = True
 
     def changes_from(self, before: object) -> CatalogueChange:
-        """Find what differs from an earlier catalogue of the map."""
+        """Return the differences from an earlier catalogue of the map."""
         if not isinstance(before, Catalogue):
             raise TypeError(f"{type(before).__name__} is no catalogue of the same kind")
         return compare(before, self)
 
     def query(self, area: Area, most: int | None = None) -> tuple[Indices, bool]:
-        """Cells whose box touches ``area``, ascending (which is id order), and that the map is known: True.
+        """Return the cells whose box touches ``area``, ascending (which is id order), and True.
 
-        Borders are closed.  The area's z range plays no part: heights are known only after loading.  If there
-        are more than ``most``, some of them, more than ``most``, in no order.
+        True says that the cells in the area are known.  Borders are closed.  The area's z range is ignored,
+        since heights are known only after loading.  If more than ``most`` cells match, the result may be
+        incomplete and unordered, but still has more than ``most`` cells.
         """
         return self._index.query(area, most), True
 
@@ -305,31 +307,31 @@ class Catalogue:
 class MapOrigin(Protocol):
     """Where the cells of one map come from.
 
-    A cell is read by a loader.  What cannot be reached at present raises `Offline` there: the cell is
-    ``offline`` until it is tried again.
+    A loader reads each cell.  It raises `Offline` if the source cannot be reached at present: the cell stays
+    ``offline`` until the next attempt.
     """
 
     @property
     def path(self) -> str:
-        """The map as a person would name it."""
+        """Path or URL of the map, as users write it."""
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
-        """Find out which cells there are now.
+        """Read the catalogue of the map's present state.
 
-        ``fresh`` looks at every file's stamp, where a cached catalogue might do otherwise.  What has not
-        changed since ``before``, an earlier state, may be shared with it.
+        ``fresh`` reads every file's stamp instead of using a cached catalogue.  The result may share
+        unchanged tables with ``before``, an earlier state.
 
         Raises
         ------
         MapMissing, MapDataError
-            There is no map, or none that can be served.
+            The map does not exist, or cannot be served.
         Offline
-            Where it comes from cannot be reached at present.
+            The map's storage cannot be reached at present.
         """
 
 
 class NoMap:
-    """An origin without cells: whatever is asked for is not there."""
+    """An origin without cells."""
 
     path = ""
 

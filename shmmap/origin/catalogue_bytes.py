@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A catalogue as bytes: in a file of the cache or a pipe (`shmmap.origin.reading_apart`).
+"""Writes and reads a catalogue as bytes, for a cache file or a pipe (`shmmap.origin.reading_apart`).
 
 Layout, little-endian::
 
@@ -12,20 +12,20 @@ Layout, little-endian::
     ..  boxes     float64: all min_x, all min_y, all max_x, all max_y
     ..  stamps    int64: size, mtime_ns, ctime_ns of each cell
     ..  by_base   int32, as many as the header says: `shmmap.origin.cell_names.order_by_base`
-    ..  grids     of each grid of the header: keys, int64; cells, int32 (`shmmap.origin.spatial_index.Grid`)
+    ..  grids     for each grid of the header: keys, int64; cells, int32 (`shmmap.origin.spatial_index.Grid`)
 
-Zero bytes follow the header and each column to a multiple of 8.  The last two are what a catalogue would make
-of names and boxes: to sort them takes longer than to read everything.
+Zero bytes pad the header and each column to a multiple of 8.  The last two columns follow from names and
+boxes.  They are stored because computing them takes longer than reading everything.
 
-A reader takes one column after the other.  Names and boxes that equal those of the map's state before are not
-kept a second time: of a million cells whose files have changed, a new state takes 24 bytes a cell.  A reader
-that gives the digest of its names and boxes gets the stamps alone if they are the same.
+A reader takes one column after the other.  Names and boxes that equal those of the map's previous state are
+shared with it: when the files of a million cells have changed, a new state takes 24 bytes a cell.  A reader
+may pass the digest of its names and boxes: if they are the same, it receives only the stamps.
 
-The file in the cache directory, the *sidecar*, is only ever a copy: a missing, old or damaged one costs
-time, nothing else.  It names what it was made from (the metadata file and every directory that was
-listed, each with size, mtime, ctime and inode) and counts only while all of that is unchanged.  A
-file rewritten in place changes no directory, so its stamp here may be old: the loader of the cell
-compares it, and `MapDirectory.load(fresh=True)` looks at every file.
+The file in the cache directory, the *sidecar*, is only a copy: if it is missing, old or damaged, this costs
+time, nothing else.  It lists its sources (the metadata file and every directory that was listed, each with
+size, mtime, ctime and inode) and is valid only while all of them are unchanged.  A file rewritten in place
+changes no directory, so its stamp here may be old: the loader of the cell compares it, and
+`MapDirectory.load(fresh=True)` reads the stamp of every file.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _VERSION: Final = 2
 _START: Final = struct.Struct("<8sIIQ")
 _BLOCK_BYTES: Final = 1 << 18
 _MAX_NAME_BYTES: Final = 1 << 16
-"""Many more than any path has."""
+"""Limit of a name's length in bytes, far above that of any path."""
 _FLOAT64, _INT64, _INT32 = np.dtype("<f8"), np.dtype("<i8"), np.dtype("<i4")
 
 
@@ -79,34 +79,34 @@ class Source(msgspec.Struct, frozen=True, array_like=True):
 
     @classmethod
     def of(cls, path: str, status: os.stat_result) -> Source:
-        """State of ``path`` as `os.stat` gave it.  A directory's size says nothing and counts as 0."""
+        """Return the state of ``path`` from its `os.stat` result; a directory's size is set to 0."""
         size = 0 if stat.S_ISDIR(status.st_mode) else status.st_size
         return cls(path, size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
 
 
 class Header(msgspec.Struct, forbid_unknown_fields=True):
-    """What is written before the columns.
+    """The JSON header in front of the columns.
 
     Attributes
     ----------
     key
-        What the catalogue was asked for by.
+        Parameters of the request that the catalogue answers.
     sources
-        What it was made from.
+        Files and directories that the catalogue was made from.
     prefix, problems
         As in `Catalogue`.
     cells, name_bytes
-        How many cells; how many bytes the longest name has.
+        Number of cells; length of the longest name in bytes.
     by_base
-        How many entries that column has: none, or one a cell.
+        Number of entries in column ``by_base``: 0, or one per cell.
     bounds, mean_size
         As in `Catalogue`.
     grids
-        Where each grid lies, and how many cells it has; none of few cells.
+        Position of each grid, and its number of cells; empty for a map of few cells.
     fixed_digest
         As in `Catalogue`.
     stamps_only
-        The reader has names and boxes already: all columns but the stamps are left out.
+        Only the stamps follow, because the reader already has names and boxes.
     """
 
     key: str
@@ -123,7 +123,7 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
     stamps_only: bool
 
     def columns(self) -> list[tuple[np.dtype[Any], tuple[int, ...]]]:
-        """Type and shape of each column that follows."""
+        """Return dtype and shape of each column that follows."""
         if self.stamps_only:
             return [(_INT64, (self.cells, 3))]
         names = np.dtype(f"S{self.name_bytes}"), (self.cells,)
@@ -138,12 +138,12 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
         return found
 
     def check(self) -> None:
-        """Refuse what no catalogue has.
+        """Check that the header can describe a catalogue.
 
         Raises
         ------
         ValueError
-            It makes no sense.
+            The header is inconsistent.
         """
         in_grids = [cells for _, cells in self.grids]
         if (
@@ -155,7 +155,7 @@ class Header(msgspec.Struct, forbid_unknown_fields=True):
             raise ValueError("its header makes no sense")
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _HEADER: Final = msgspec.json.Decoder(Header)
 
 
@@ -166,9 +166,9 @@ def write_catalogue(
     catalogue: Catalogue,
     known_digest: int | None = None,
 ) -> None:
-    """Write a catalogue, and what it was made from.
+    """Write a catalogue and its sources.
 
-    ``known_digest`` is `Catalogue.fixed_digest` of what the reader has.
+    ``known_digest`` is `Catalogue.fixed_digest` of the catalogue that the reader already has.
     """
     made, stamps_only = catalogue.made_of_boxes, catalogue.fixed_digest == known_digest
     header = msgspec.json.encode(
@@ -211,14 +211,14 @@ def read_catalogue(
     Parameters
     ----------
     size_bytes
-        Bytes of the file; None where they are not known, and the writer is to be trusted.
+        Size of the file; None for a pipe, whose writer is trusted.
     before
         An earlier state: columns that have not changed are shared with it.
 
     Raises
     ------
     ValueError, msgspec.MsgspecError, MapDataError
-        It is damaged, or not whole.
+        The data is damaged or truncated.
     """
     columns = _Columns(file)
     start = bytearray(_START.size)
@@ -268,14 +268,14 @@ def read_catalogue(
 
 
 class _Columns:
-    """Takes columns from a file or pipe, one after the other, and hashes them."""
+    """Reads columns from a file or pipe, one after the other, and hashes them."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
         self.digest = xxh3_64()
 
     def fill(self, buffer: memoryview) -> None:
-        """Take as many bytes as there is room for."""
+        """Read bytes until ``buffer`` is full."""
         for begin in range(0, len(buffer), _BLOCK_BYTES):
             block = buffer[begin : begin + _BLOCK_BYTES]
             if self._file.readinto(block) != len(block):  # type: ignore[attr-defined]
@@ -283,7 +283,7 @@ class _Columns:
             self.digest.update(block)
 
     def take(self, dtype: np.dtype[Any], shape: tuple[int, ...], before: NDArray[Any] | None) -> NDArray[Any]:
-        """Take one column; ``before`` itself where that has the same bytes."""
+        """Read one column; return ``before`` itself if it has the same bytes."""
         size = dtype.itemsize * math.prod(shape)
         column: NDArray[np.uint8] | None = None
         done = 0
@@ -311,17 +311,17 @@ class _Columns:
 
 
 def _padding(size: int) -> int:
-    """Zero bytes from an end to the next multiple of 8."""
+    """Return the zero bytes that pad ``size`` bytes to a multiple of 8."""
     return -size % 8
 
 
 # File systems stamp files by the kernel's coarse clock, which ticks every 1 to 10 ms: a change right
-# after a scan can leave a directory's stamp as it was.  Younger sources are not trusted to be done.
+# after a scan can leave a directory's stamp unchanged.  A catalogue of younger sources is not cached.
 _SETTLED_NS = 20_000_000
 
 
 def default_cache_directory() -> str:
-    """``$CACHE_DIRECTORY`` (set by systemd), else ``$XDG_CACHE_HOME/shmmap``, else ``~/.cache/shmmap``."""
+    """Return ``$CACHE_DIRECTORY`` (of systemd), ``$XDG_CACHE_HOME/shmmap`` or ``~/.cache/shmmap``."""
     given = os.environ.get("CACHE_DIRECTORY", "").split(":")[0]
     if given:
         return given
@@ -332,14 +332,14 @@ def default_cache_directory() -> str:
 
 
 def sidecar_file(cache_dir: str, key: str) -> str:
-    """Where the catalogue of the map that ``key`` describes is kept."""
+    """Return the path of the sidecar for the map that ``key`` describes."""
     return os.path.join(cache_dir, xxh3_64_hexdigest(os.fsencode(key)) + ".catalogue")
 
 
 def load_sidecar(path: str, key: str, at: Callable[[str], str] = str) -> Catalogue | None:
-    """Catalogue from the sidecar, or None when there is none, its sources changed, or it is damaged.
+    """Return the catalogue of a sidecar; None if it is missing or damaged, or its sources have changed.
 
-    ``at`` says where to find what a source's path names.
+    ``at`` translates a source's path into the path under which this process can open it.
     """
     try:
         with open(path, "rb") as file:
@@ -365,9 +365,9 @@ def _unchanged(sources: Sequence[Source], at: Callable[[str], str]) -> bool:
 def save_sidecar(
     path: str, key: str, sources: Sequence[Source], catalogue: Catalogue, scanned_ns: int
 ) -> bool:
-    """Write the sidecar in one step; False (and a line in the log) if that was not possible.
+    """Write the sidecar atomically; return False if a source is too young, or (logged) if writing fails.
 
-    ``sources`` were looked at before the scan, which began at ``scanned_ns`` (`time.time_ns`).
+    The state of ``sources`` was read before the scan, which began at ``scanned_ns`` (`time.time_ns`).
     """
     newest = max(max(source.mtime_ns, source.ctime_ns) for source in sources)
     if newest > scanned_ns - _SETTLED_NS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What changed from one state of a map to the next, found without a further table as long as the map."""
+"""Finds the changes from one state of a map to the next, without another table as long as the map."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class CellIds(Protocol):
 
 
 class Tables(CellIds, Protocol):
-    """What is compared of two catalogues; each as in `Catalogue`."""
+    """The tables of a catalogue that are compared; each as in `Catalogue`."""
 
     @property
     def id_prefix(self) -> str:
-        """What all ids begin with."""
+        """Directory that all ids begin with."""
 
     @property
     def names(self) -> NDArray[np.bytes_]:
-        """(N,) bytes, what follows `id_prefix` in each id."""
+        """(N,) bytes, the rest of each id after `id_prefix`."""
 
     @property
     def boxes(self) -> NDArray[np.float64]:
@@ -48,42 +48,42 @@ class Tables(CellIds, Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CatalogueChange:
-    """What differs between two catalogues of a map; indices ascending, which is id order."""
+    """Differences between two catalogues of a map; indices ascending, which is id order."""
 
     old: CellIds
     new: CellIds
     added: Indices
-    """In the new one only."""
+    """Cells in the new catalogue only."""
     removed: Indices
-    """In the old one only; these are indices of the old one."""
+    """Cells in the old catalogue only, as indices of the old catalogue."""
     changed: Indices
-    """In both with different stamps: another version."""
+    """Cells in both with different stamps, so with different versions."""
     moved: Indices
-    """In both with different boxes (the metadata was edited): another version, too."""
+    """Cells in both with different boxes (the metadata was edited), so with different versions."""
     known: bool = True
-    """These are all: the cells of both were known wherever the two differ."""
+    """True if these are all differences: both catalogues were known wherever they differ."""
 
     def __bool__(self) -> bool:
         return self.count > 0
 
     @property
     def count(self) -> int:
-        """How many cells there are in all of them."""
+        """Total number of cells added, removed, changed and moved."""
         return len(self.added) + len(self.removed) + len(self.changed) + len(self.moved)
 
     @property
     def same_cells(self) -> bool:
-        """Whether indices mean the same cells as before."""
+        """Whether an index names the same cell in both catalogues."""
         return self.known and not len(self.added) and not len(self.removed)
 
     def ids(self, how: str, most: int | None = None) -> tuple[str, ...]:
-        """Ids of the cells that were ``how``: added, removed, changed or moved; the first ``most``."""
+        """Return ids of cells, at most ``most``; ``how`` is added, removed, changed or moved."""
         cells = self.old if how == "removed" else self.new
         return tuple(cells.ids(getattr(self, how)[:most]))
 
 
 def compare(old: Tables, new: Tables) -> CatalogueChange:
-    """Find what changed from ``old`` to ``new``, without visiting every cell in Python."""
+    """Return the changes from ``old`` to ``new``, without a Python loop over all cells."""
     kept = np.zeros(len(old.names), np.bool_)
     nothing = np.empty(0, np.intp)
     added, changed, moved = [nothing], [nothing], [nothing]
@@ -105,7 +105,7 @@ def compare(old: Tables, new: Tables) -> CatalogueChange:
 
 
 def _matched(old: Tables, new: Tables) -> Iterator[tuple[Indices, Indices]]:
-    """Yield indices in the old one, -1 where it has no such cell, and in the new one, block by block."""
+    """Yield matching indices of old (-1: no such cell) and new catalogue, block by block."""
     names = new.names
     same = old.id_prefix == new.id_prefix and (names is old.names or np.array_equal(names, old.names))
     for begin in range(0, len(names), _BLOCK_CELLS):
@@ -117,7 +117,7 @@ def _matched(old: Tables, new: Tables) -> Iterator[tuple[Indices, Indices]]:
 
 
 def _below(directory: str, prefix: str, names: Names) -> Names:
-    """Return the paths ``prefix + name`` as seen from a directory; empty for those that are not below it."""
+    """Return the paths ``prefix + name`` relative to a directory; empty for a path outside it."""
     if prefix.startswith(directory):
         between = os.fsencode(prefix[len(directory) :])
         return np.char.add(between, names) if between else names
@@ -130,10 +130,10 @@ def _below(directory: str, prefix: str, names: Names) -> Names:
 
 
 def _places(ascending: Names, wanted: Names) -> Indices:
-    """Where in an ascending table each name stands; -1 where it does not."""
+    """Return the index of each wanted name in an ascending table; -1 if it is missing."""
     if not len(ascending):
         return np.full(len(wanted), -1, np.intp)
-    # compared with longer names, the whole table would be copied to make it wider
+    # numpy would copy the whole table to widen it if the wanted names were longer
     narrow = wanted.astype(ascending.dtype)
     places = np.minimum(ascending.searchsorted(narrow), len(ascending) - 1)
     places[ascending[places] != wanted] = -1

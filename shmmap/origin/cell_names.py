@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ids of up to millions of cells, without a Python string for each.
 
-All ids begin with the same directory; what follows is kept in one numpy bytes array in ascending
+All ids begin with the same directory.  The rest of each id is kept in one numpy bytes array in ascending
 byte order, which is the order of a C++ ``std::map<std::string, ...>`` and hence Autoware's.
 """
 
@@ -20,11 +20,11 @@ __all__ = ["CellNames", "base_names", "common_directory", "order_by_base"]
 
 Names = NDArray[np.bytes_]
 
-# Lookups remembered; a differential request asks for the same few hundred ids every time.
+# Number of cached lookups; differential requests repeat the same few hundred ids.
 _REMEMBERED = 1 << 16
 _NAMED_IN_ERRORS = 3
 
-# Names that are Python objects at the same time; ten million would take a gigabyte.
+# Names converted to Python objects at a time; ten million would take a gigabyte.
 _BLOCK_NAMES = 1 << 15
 
 
@@ -34,11 +34,11 @@ class CellNames:
     Parameters
     ----------
     prefix
-        What every id starts with, ending in "/" (or empty when there are no cells).
+        Directory that every id starts with, ending in "/"; empty if there are no cells.
     names
         (N,) bytes, ascending and unique.
     by_base
-        (M,) int32, what `order_by_base` returned for them; None: it is found now.
+        (M,) int32, the result of `order_by_base` for ``names``; None: it is computed now.
     """
 
     def __init__(self, prefix: str, names: Names, by_base: NDArray[np.int32] | None = None) -> None:
@@ -64,7 +64,8 @@ class CellNames:
     def find(self, wanted: str) -> int | None:
         """Index of the cell with this id, in full or without the prefix, or with this base name.
 
-        A base name must be unique, unless a cell right below the prefix has it: that is its id then.
+        A base name must be unique.  Exception: a cell directly below the prefix is found by its base name in
+        any case, because that is its id without the prefix.
 
         Raises
         ------
@@ -92,7 +93,7 @@ class CellNames:
         key, order = _encoded(wanted), self.by_base
         if key is None or not len(order):
             return None
-        # not a table of its own: of ten million names it would take 200 MB
+        # without a separate table of base names, which would take 200 MB for ten million cells
         places = range(len(order))
         first = bisect_left(places, key, key=self._base)
         last = bisect_right(places, key, lo=first, key=self._base)
@@ -105,12 +106,12 @@ class CellNames:
         return int(order[first]) if last > first else None
 
     def _base(self, place: int) -> bytes:
-        """Return the base name at a place in the order of base names."""
+        """Return the base name at position ``place`` in the order of base names."""
         return bytes(self.names[self.by_base[place]]).rpartition(b"/")[2]
 
 
 def base_names(names: Names) -> Names:
-    """Return what follows the last "/" in each name; ``names`` itself if there is none in any."""
+    """Return the part of each name after its last "/"; ``names`` itself if no name has a "/"."""
     if not len(names) or int(np.char.find(names, b"/").max()) < 0:
         return names
     blocks = []
@@ -121,9 +122,9 @@ def base_names(names: Names) -> Names:
 
 
 def order_by_base(names: Names) -> NDArray[np.int32]:
-    """Return in which order the base names ascend, those that are equal in that of ``names``.
+    """Return the indices that sort ``names`` by base name; equal base names keep their order.
 
-    Empty if no name has a "/": each is its own base name.
+    Empty if no name has a "/", since each name is then its own base name.
     """
     bases = base_names(names)
     if bases is names:
@@ -132,17 +133,17 @@ def order_by_base(names: Names) -> NDArray[np.int32]:
 
 
 def common_directory(paths: Sequence[str]) -> str:
-    """Longest directory, with its final "/", that all ``paths`` start with; empty if none."""
+    """Return the longest directory, with its final "/", that all ``paths`` start with; empty if none."""
     if not paths:
         return ""
-    # what the least and the greatest share, all share
+    # a prefix of the least and the greatest path is a prefix of all
     least, greatest = min(paths), max(paths)
     shared = next((i for i, (a, b) in enumerate(zip(least, greatest, strict=False)) if a != b), len(least))
     return least[: least.rfind("/", 0, shared) + 1]
 
 
 def _encoded(wanted: str) -> bytes | None:
-    """Encode a name as the tables have it; None if no file is called that."""
+    """Encode a name as in the tables; None if no file can have this name."""
     try:
         key = os.fsencode(wanted)
     except UnicodeEncodeError:
@@ -151,9 +152,9 @@ def _encoded(wanted: str) -> bytes | None:
 
 
 def _positions(names: Names, wanted: str) -> range:
-    """Where ``wanted`` stands in ascending ``names``."""
+    """Return the range of positions of ``wanted`` in ascending ``names``."""
     key = _encoded(wanted)
-    # numpy pads with zero bytes, and would widen the whole table to compare it with a longer key
+    # numpy pads names with zero bytes, and would widen the whole table to compare it with a longer key
     if key is None or len(key) > names.dtype.itemsize:
         return range(0)
     exact = np.array(key, dtype=names.dtype)

@@ -35,9 +35,9 @@ class ScannedFiles:
     stamps
         (N, 3) int64, size in bytes, mtime_ns, ctime_ns.
     directories
-        Every directory that was listed, absolute, with its status just before.
+        Absolute path of every directory that was listed, with its status from just before.
     problems
-        What was passed over, one sentence each.
+        Files and directories that were skipped, one sentence each.
     """
 
     prefix: str
@@ -69,7 +69,7 @@ class _Found:
 
 
 def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> ScannedFiles:
-    """List the PCD files in ``root``, the absolute path of a directory; of a file that one.
+    """List the PCD files in ``root``, the absolute path of a directory or of a single file.
 
     ``at`` turns a path into the one under which this process can open it.
 
@@ -88,7 +88,7 @@ def scan(root: str, *, recursive: bool, at: Callable[[str], str] = str) -> Scann
     problems: dict[str, list[str]] = {}
     directories: dict[str, os.stat_result] = {}
     seen: set[tuple[int, int]] = set()
-    pending: list[tuple[bytes, bytes]] = []  # where a directory is found, and its path
+    pending: list[tuple[bytes, bytes]] = []  # path to open a directory by, and its path in the map
     root_place, path = os.fsencode(at(root)), os.fsencode(root)
     try:
         status = os.stat(root_place)
@@ -128,7 +128,7 @@ def _list_directory(
     """Add a directory's PCD files to ``found``; return the names of the directories in it."""
     inner: list[bytes] = []
     below = os.path.join(directory, b"")[skip:]
-    with _opened(place) as fd, os.scandir(fd) as entries:  # names in there are quicker to look at than paths
+    with _opened(place) as fd, os.scandir(fd) as entries:  # stat by name is quicker than by path
         for entry in entries:
             name = os.fsencode(entry.name)
             try:
@@ -136,7 +136,7 @@ def _list_directory(
                 if name.startswith(b".") if is_directory else not is_pcd(name):
                     continue
                 status = entry.stat()
-            except OSError as error:  # a link to itself, say, or to where this user may not look
+            except OSError as error:  # e.g. a link to itself, or to a path this user may not read
                 problem = f"cannot be read ({error.strerror})"
             else:
                 if not _is_utf8(name):
@@ -163,7 +163,7 @@ def _opened(place: bytes) -> Iterator[int]:
 
 
 def _is_utf8(name: bytes) -> bool:
-    """Whether clients can name it."""
+    """Whether a file name is UTF-8, so that clients can name the file."""
     try:
         name.decode()
     except UnicodeDecodeError:

@@ -40,11 +40,11 @@ from shmmap.segment.layout import SourceStamp
 
 __all__ = ["MAX_SINGLE_PCD_BYTES", "MapDirectory", "is_served_whole", "load_single_pcd", "open_map"]
 
-# Smaller maps are scanned in a few milliseconds: a cached catalogue would only be less fresh.
+# Smaller maps are scanned in a few milliseconds, so a cached catalogue would only be older, not quicker.
 _CACHED_FROM_CELLS = 2000
 
-# Longer metadata, of some 2000 cells, is read in a process of its own: a parser is not interrupted in the
-# midst of a number or a name, and all threads here would wait for it.
+# Longer metadata, from about 2000 cells, is read in a separate process: a parser holds the interpreter lock
+# while it parses one number or name, and all threads here would wait.
 _READ_HERE_BYTES = 64 << 10
 
 
@@ -62,7 +62,7 @@ def open_map(
     path
         A map directory, a directory of cells, one PCD file, or a metadata file.
     metadata
-        The metadata file, where it is not beside or among the cells.
+        The metadata file, if it is not beside or among the cells.
     strict
         Behave like Autoware's loader: integer corners only, no unknown keys, an entry without its
         file is an error, directories are not searched recursively.
@@ -96,17 +96,17 @@ class MapDirectory:
     cached_from_cells: int = _CACHED_FROM_CELLS
 
     def checked(self) -> MapDirectory:
-        """Return self, or raise `MapMissing` if there is no map."""
+        """Return self; raise `MapMissing` if there is no map at this path."""
         find_layout(self.path, self.metadata)
         return self
 
     def load(self, *, fresh: bool = False, before: object | None = None) -> Catalogue:
-        """Read which cells there are now, with their boxes and their files' stamps.
+        """Read the map's present cells, with their boxes and their files' stamps.
 
         A large map's catalogue comes from the cache while the metadata and the directories are
-        unchanged; stamps may then be older than the files.  ``fresh`` looks at every file.  Long metadata
-        is read in a process of its own (`shmmap.origin.reading_apart`); what has not changed since
-        ``before`` is shared with that.
+        unchanged; stamps may then be older than the files.  ``fresh`` reads the stamp of every file.  Long
+        metadata is read in a separate process (`shmmap.origin.reading_apart`).  The result shares unchanged
+        tables with ``before``, an earlier state.
 
         Raises
         ------
@@ -144,9 +144,9 @@ class MapDirectory:
     def scanned(
         self, max_bytes: int = MAX_METADATA_BYTES, opened: OpenedDirectories | None = None
     ) -> Catalogue:
-        """Read the catalogue from metadata and files, and keep a large one in the cache; see `load`.
+        """Read the catalogue from metadata and files, and cache it if it is large; see `load`.
 
-        Metadata of more bytes is refused before anything else is looked at.
+        Metadata of more than ``max_bytes`` is refused before any file is scanned.
         """
         opened = opened or OpenedDirectories()
         layout = find_layout(self.path, self.metadata, opened)
@@ -155,7 +155,7 @@ class MapDirectory:
         scanned_ns = time.time_ns()
         data, sources = b"", []
         if layout.metadata is not None:
-            # looked at before it is read: a change meanwhile then differs from what is written down
+            # status taken before reading: a change in between then differs from the recorded status
             sources = [Source.of(layout.metadata, _status(layout.metadata, opened))]
             data = metadata_bytes(layout.metadata, max_bytes, at=opened.at(layout.metadata))
         files = scan(layout.root, recursive=not self.strict, at=opened.at)
@@ -167,7 +167,7 @@ class MapDirectory:
         if layout.metadata is None:
             return _without_metadata(files)
         entries = parse_metadata(data, path=layout.metadata, strict=self.strict)
-        del data  # of ten million cells it is the largest table of all
+        del data  # with ten million cells it is the largest table of all
         catalogue = _joined(layout, layout.metadata, files, entries, strict=self.strict)
         if len(catalogue) >= self.cached_from_cells and os.path.isdir(opened.at(layout.root)):
             sources += [Source.of(path, status) for path, status in files.directories.items()]
@@ -229,7 +229,7 @@ def _joined(
     sides[2:] = sides[:2] + np.array([[entries.x_resolution], [entries.y_resolution]])
     return Catalogue(
         id_prefix=files.prefix,
-        # as narrow as the longest: the catalogue's version covers the padded table
+        # as narrow as the longest name, because the catalogue's version covers the padded table
         names=names.astype(f"S{int(np.char.str_len(names).max())}", copy=False),
         boxes=sides.T,
         stamps=stamps,
@@ -238,33 +238,33 @@ def _joined(
 
 
 MAX_SINGLE_PCD_BYTES = 256 << 20
-"""A larger file is refused: loading all of a map to use a part of it is what dividing avoids."""
+"""Size limit of a map that is one PCD file; a larger one has to be divided."""
 
-# What a compressed file of that size may hold; point clouds shrink to a half or a third.
+# Size limit of its points once decompressed; point clouds shrink to a half or a third.
 _MAX_POINT_BYTES = 4 * MAX_SINGLE_PCD_BYTES
 
 
 def is_served_whole(path: str) -> bool:
-    """Whether the PCD file at ``path`` is small enough to be one cell; also if it is no sound file."""
+    """Whether the PCD file at ``path`` is small enough to be one cell; True for a damaged file, too."""
     try:
         if os.stat(path).st_size > MAX_SINGLE_PCD_BYTES:
             return False
         with PcdReader(path) as reader:
             return reader.header.points * reader.header.point_bytes <= _MAX_POINT_BYTES
     except (OSError, MapDataError):
-        return True  # loading it says what is wrong
+        return True  # loading it reports what is wrong
 
 
 def load_single_pcd(path: str) -> Catalogue:
-    """Catalogue of one cell whose box is the bounds of the points in ``path`` (read whole).
+    """Return a catalogue of one cell, its box the bounds of the points in ``path`` (read whole).
 
     Raises
     ------
     MapMissing
         The file vanished or may not be read.
     MapDataError
-        The file is larger than 256 MiB (or its points than 1 GiB), is no sound PCD, or has no finite
-        point.
+        The file is larger than 256 MiB (or its points than 1 GiB), is not a valid PCD file, or has no
+        finite point.
     """
     try:
         status = os.stat(path)
@@ -285,7 +285,7 @@ def load_single_pcd(path: str) -> Catalogue:
 
 
 def _opened_pcd(path: str) -> PcdReader:
-    """Open a PCD file; a file of another kind is refused for what it is called, with what is readable."""
+    """Open a PCD file; the error for another file type names the readable types."""
     try:
         return PcdReader(path)
     except MapDataError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds a map's PCD files and its metadata, in every layout that is in use, and holds its directories open.
+"""Finds a map's PCD files and metadata in every layout in use, and holds its directories open.
 
 ========================================================  =============================================
 ``map/pointcloud_map.pcd/*.pcd``, YAML beside the folder  Autoware's; the divider writes it
@@ -13,9 +13,10 @@ Paths become absolute as `os.path.abspath` does it: relative spellings, ``.``, `
 slashes vanish.  Symbolic links stay as given, as in Autoware: a link such as ``maps/current`` can be
 switched to another map, and a reload then finds the cells changed rather than renamed.
 
-``maps/current`` may lead to another map at any moment, or ``..data`` inside a Kubernetes volume may.  So each
-directory of a state of the map is opened once, when it is found, and all of that state is read through these
-descriptors: no link on the way can mix two maps.  A later state (`MapDirectory.load`) opens them again.
+A link such as ``maps/current``, or ``..data`` inside a Kubernetes volume, may be switched to another map at
+any moment.  So each directory of a state of the map is opened once, when it is found, and all files of that
+state are read through these descriptors: no link on the path can mix two maps.  A later state
+(`MapDirectory.load`) opens the directories again.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from shmmap.errors import MapDataError, MapMissing
 __all__ = ["KUBERNETES_LINK", "MapLayout", "OpenedDirectories", "absolute_path", "find_layout", "is_pcd"]
 
 KUBERNETES_LINK: Final = "..data"
-"""In a Kubernetes volume every visible name is a link through this one, which is switched in one step."""
+"""In a Kubernetes volume, every visible name is a link through this link, which is switched atomically."""
 
 
 class OpenedDirectories:
@@ -40,7 +41,7 @@ class OpenedDirectories:
     Parameters
     ----------
     inherited
-        Descriptors by path, of a process that has opened them.
+        Descriptors by path, inherited from the process that opened them.
     """
 
     def __init__(self, inherited: Mapping[str, int] | None = None) -> None:
@@ -52,13 +53,13 @@ class OpenedDirectories:
                 os.close(fd)
 
     def open(self, path: str) -> None:
-        """Open a directory, through one that is open if it lies below that; what is none is passed over."""
+        """Open a directory, relative to an open parent if there is one; skip a path that is no directory."""
         if path in self.descriptors:
             return
         flags = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
         try:
             fd = os.open(self.at(path), flags)
-        except OSError:  # an error later says what is wrong
+        except OSError:  # reading the directory reports the error later
             return
         if _is_volume(fd):
             volume = fd
@@ -69,12 +70,12 @@ class OpenedDirectories:
         self.descriptors[path] = fd
 
     def at(self, path: str) -> str:
-        """Where to find what a path names: below the innermost directory that is open."""
+        """Return the path by which this process can open ``path``: below the innermost open directory."""
         above, fd = self.innermost(path)
         return f"/proc/self/fd/{fd}{path[len(above.rstrip('/')) :]}" if fd >= 0 else path
 
     def innermost(self, path: str) -> tuple[str, int]:
-        """Path and descriptor of the innermost directory that is open and has ``path`` in it; -1: none."""
+        """Return path and descriptor of the innermost open directory that contains ``path``; -1: none."""
         above = path
         while above not in self.descriptors:
             if above in ("", "/"):
@@ -83,14 +84,14 @@ class OpenedDirectories:
         return above, self.descriptors[above]
 
     def named(self, text: str) -> str:
-        """Name paths in a message as they were given."""
+        """Return a message with descriptor paths replaced by the original paths."""
         for path, fd in self.descriptors.items():
             text = text.replace(f"/proc/self/fd/{fd}/", path.rstrip("/") + "/")
         return text
 
 
 def _is_volume(fd: int) -> bool:
-    """Whether all that is visible in a directory are links through `KUBERNETES_LINK`."""
+    """Whether all visible entries of a directory are links through `KUBERNETES_LINK`."""
     place = f"/proc/self/fd/{fd}"
     if not (os.path.islink(f"{place}/{KUBERNETES_LINK}") and os.path.isdir(f"{place}/{KUBERNETES_LINK}")):
         return False
@@ -103,20 +104,20 @@ def _is_volume(fd: int) -> bool:
 
 
 _CELLS_NAME = "pointcloud_map.pcd"
-# the second is how the divider's own README calls it
+# the second name is that in the README of Autoware's divider
 _METADATA_NAMES = ("pointcloud_map_metadata.yaml", "pointcloud_data_metadata.yaml")
 
 
 @dataclass(frozen=True, slots=True)
 class MapLayout:
-    """Where the parts of a map are.
+    """Paths of the parts of a map.
 
     Attributes
     ----------
     root
         Absolute path of the directory that holds the cells, or of the one file.
     metadata
-        Absolute path of the metadata file, or None when there is none.
+        Absolute path of the metadata file; None if the map has none.
     """
 
     root: str
@@ -129,19 +130,19 @@ def is_pcd(name: bytes) -> bool:
 
 
 def absolute_path(path: str | os.PathLike[str]) -> str:
-    """Return ``path`` absolute and normalised, links kept.
+    """Return ``path`` absolute and normalised; symbolic links are kept.
 
     Raises
     ------
     MapDataError
-        The path is no UTF-8, so that no client could name the cells.
+        The path is not UTF-8, so no client could name the cells.
     """
     text = os.path.abspath(os.fspath(path))
     try:
         text.encode()
     except UnicodeEncodeError as error:
         raise MapDataError("the path is not UTF-8", path=ascii(text), cause="bad_path") from error
-    # "link/.." is where the link leads, not where it lies
+    # "link/.." is the parent of the link's target, not of the link
     misled = os.path.exists(path) and not (os.path.exists(text) and os.path.samefile(path, text))
     return os.path.realpath(path) if misled else text
 
@@ -154,14 +155,14 @@ def find_layout(path: str, metadata: str | None, opened: OpenedDirectories | Non
     path
         A map directory, a directory of cells, one PCD file, or a metadata file.
     metadata
-        The metadata file, where it is somewhere else.
+        The metadata file, if it is elsewhere.
     opened
-        Is given the map's directories to open; all that is looked at is looked at through these.
+        Opens the map's directories; all files are accessed through its descriptors.
 
     Raises
     ------
     MapMissing
-        There is nothing at ``path``, or nothing that could be a map.
+        Nothing exists at ``path``, or it is not a map.
     """
     opened = opened or OpenedDirectories()
     opened.open(os.path.dirname(path))

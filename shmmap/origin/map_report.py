@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report beside a divided map, ``shmmap_divide.json``: its frame, what it was made of, notes.
+"""The report beside a divided map, ``shmmap_divide.json``: the map's frame, its inputs, and notes.
 
-`shmmap.dividing` writes it; other tools' maps have none, and their frame is what it is.
+`shmmap.dividing` writes it.  Maps of other tools have no report, so their frame is unknown.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ __all__ = [
 
 REPORT_NAME: Final = "shmmap_divide.json"
 REPORT_HEAD: Final = {"format": "shmmap divided map", "version": 1}
-_MAX_BYTES: Final = 64 << 20  # it names each input file
+_MAX_BYTES: Final = 64 << 20  # the report lists every input file
 
 
 class MapFrame(msgspec.Struct, frozen=True):
-    """How to come back from the map frame to the coordinates of the files that the map was made of.
+    """Transform from the map frame to the coordinates of the files that the map was made of.
 
     ``(point + origin) / unit_m`` is the point in the coordinate system ``crs``.
 
@@ -50,8 +50,8 @@ class MapFrame(msgspec.Struct, frozen=True):
         x, y, z of the map frame's origin in the frame of the inputs, metres, float64: what `divide`
         subtracted from each point.
     crs
-        Name of the inputs' coordinate system with its EPSG code where they say, such as
-        ``WGS 84 / UTM zone 32N (EPSG:32632)``; empty where they do not.
+        Name of the inputs' coordinate system with its EPSG code, such as
+        ``WGS 84 / UTM zone 32N (EPSG:32632)``; empty if the inputs do not give it.
     unit_m
         Metres per unit of that system, in the plane and in height: (1, 1) unless `divide` converted feet.
     """
@@ -62,11 +62,11 @@ class MapFrame(msgspec.Struct, frozen=True):
 
 
 UNKNOWN_FRAME: Final = MapFrame()
-"""Of a map beside which nothing is written: the frame is the files' own."""
+"""Frame of a map without a report: that of its files."""
 
 
 def _frame_of(report: dict[str, Any]) -> MapFrame:
-    """Return the frame that a report speaks of; what it lacks or garbles counts as not said."""
+    """Return the frame that a report describes; missing or malformed values get their defaults."""
     try:
         frame = msgspec.convert(
             {key: report[key] for key in ("origin", "crs", "unit_m") if key in report}, MapFrame
@@ -79,7 +79,7 @@ def _frame_of(report: dict[str, Any]) -> MapFrame:
 
 
 def read_map_frame(directory: str | os.PathLike[str]) -> MapFrame:
-    """Return where the frame of the map whose metadata is in ``directory`` lies.
+    """Return the frame of the map whose metadata is in ``directory``.
 
     Never raises: a map whose report is missing or unreadable is still served, with an unknown frame.
     """
@@ -91,12 +91,12 @@ def read_map_frame(directory: str | os.PathLike[str]) -> MapFrame:
 
 
 def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """Return what `divide` left about a map, or None for a map made by others.
+    """Return the report that `divide` wrote beside a map; None for a map of another tool.
 
     Raises
     ------
     MapDataError
-        It cannot be read, or another version of shmmap has written it.
+        The report cannot be read, or was written by another version of shmmap.
     """
     path = os.path.join(map_dir, REPORT_NAME)
     try:
@@ -115,37 +115,38 @@ def read_report(map_dir: str | os.PathLike[str]) -> dict[str, Any] | None:
 
 
 LINK_NAME: Final = "map"
-"""Beside the divisions of a served cloud, this leads to the one in service."""
+"""Link beside the divisions of a served cloud; it leads to the division in service."""
 
 
 @dataclass(frozen=True, slots=True)
 class DividedMap:
-    """What was made; also kept in the map as ``shmmap_divide.json``.
+    """Result of a division; also kept in the map as ``shmmap_divide.json``.
 
     Attributes
     ----------
     path
         The map directory.
     cells, points
-        Files, and points in them.
+        Number of cell files, and of points in them.
     points_read, dropped
-        Points in the inputs, and how many were not finite.
+        Number of points in the inputs, and of those dropped because they are not finite.
     origin
-        Where the map's frame lies in that of the inputs: add it to a point to come back, metres.
+        Origin of the map frame in the frame of the inputs, metres: adding it to a point of the map gives
+        the point of the input.
     crs, unit_m
         The inputs' coordinate system and unit, as in `shmmap.origin.map_report.MapFrame`.
     cell_size, leaf, encoding
         As in `DivideSettings`.
     fields
-        Names and dtypes of what each point has.
+        Names and dtypes of each point's fields.
     bounds
         Least and greatest coordinates of the points that were divided, in the frame of the map.
     sources
-        The inputs: path, bytes, mtime_ns, points.
+        Path, bytes, mtime_ns and points of each input.
     notes
-        What a person should know.
+        Remarks for the user.
     resumed_points
-        Points that an earlier, killed run had divided.
+        Points that an earlier, interrupted run had already divided.
     """
 
     path: str
@@ -169,13 +170,13 @@ class DividedMap:
 def write_report(directory: str | os.PathLike[str], report: DividedMap) -> None:
     """Write ``report`` into a map's directory."""
     content = {**REPORT_HEAD, **asdict(report)}
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"  # ASCII: a path may be no Unicode
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"  # ASCII: a path may not be valid Unicode
     Path(directory, REPORT_NAME).write_text(text, encoding="ascii")
 
 
-_APART_M: Final = 200.0  # cells this far apart, and ten times their size, are not one map's
+_APART_M: Final = 200.0  # cells this far apart, and ten times their size, belong to different groups
 _APART_CELLS: Final = 10
-_FEW: Final = 3  # cells, or one in a hundred of all: more are another part of the map
+_FEW: Final = 3  # a group of more cells, and of more than 1 % of all, is another part of the map
 _NAMED: Final = 3
 
 
@@ -191,7 +192,7 @@ def far_cells_notes(
     size
         Side of a cell, metres.
     names, points
-        Of each cell.
+        File name and number of points of each cell.
     """
     if len(corners) < 2 or not np.isfinite(corners).all():
         return []
@@ -220,7 +221,7 @@ def far_cells_notes(
 
 
 def _groups(squares: dict[tuple[int, int], list[int]]) -> list[list[int]]:
-    """Cells by whether their squares touch."""
+    """Group the cells whose squares touch."""
     groups: list[list[int]] = []
     left = dict(squares)
     while left:

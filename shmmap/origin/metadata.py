@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A divided map's metadata, ``pointcloud_map_metadata.yaml``: reads it by lines or as YAML, and writes it.
+"""Reads a divided map's metadata, ``pointcloud_map_metadata.yaml``, by lines or as YAML, and writes it.
 
-It is a YAML mapping: ``x_resolution`` and ``y_resolution`` (metres), and for each PCD file its
+The file is a YAML mapping: ``x_resolution`` and ``y_resolution`` (metres), and for each PCD file its
 base name with the lower left corner of its cell::
 
     x_resolution: 20.0
@@ -9,12 +9,12 @@ base name with the lower left corner of its cell::
     A.pcd: [1200, 2500]
 
 Autoware's loader (autoware_map_loader, ``load_pcd_metadata``) takes every other key for a base name
-and its value for a vector of int, so a float corner or a scalar key ends it.  Here those are
+and its value for a vector of int, so a float corner or a scalar value makes it fail.  Here those are
 *strict* rules; otherwise float corners are read, unknown keys ignored, and both reported.
 
-A YAML parser takes minutes for a million entries.  So `collect_lines` reads files as programs write them,
-one ``name: [x, y]`` a line.  It declines a file with any line that it does not understand, and the parser
-reads that file: what the lines accept means the same to the parser, so nothing is guessed.
+A YAML parser takes minutes for a million entries.  So `collect_lines` reads files with one ``name: [x, y]`` a
+line, as programs write them.  If any line has another form, the YAML parser reads the whole file.  Every line
+that `collect_lines` accepts has the same meaning in YAML.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ _FLUSH_ENTRIES = 1 << 14
 _NAMED_IN_PROBLEMS = 3
 _MAX_DIGITS = 64
 MAX_NAME_BYTES = 255
-"""What a file system takes; the table of names has room for the longest in each row."""
+"""Longest file name that a file system takes; each row of the table of names is as wide as the longest."""
 _SHOWN = 80
 
 
 def _read_corner(text: str, *, strict: bool) -> float | None:
-    """Value of one corner coordinate in metres, or None if these rules do not take it."""
+    """Return one corner coordinate in metres; None if the rules (``strict`` or not) refuse the text."""
     if len(text) > _MAX_DIGITS:
         return None
     if _INTEGER.fullmatch(text):
@@ -87,7 +87,7 @@ class MapMetadata:
     x_resolution, y_resolution
         Size of every cell, metres, positive.
     problems
-        Oddities that were read over, one sentence each.
+        Oddities that were ignored, one sentence each.
     """
 
     names: NDArray[np.bytes_]
@@ -99,7 +99,7 @@ class MapMetadata:
 
 @dataclass(slots=True)
 class EntryCollector:
-    """Gathers keys and values from whichever parser reads the file; methods return False to refuse."""
+    """Collects the keys and values that either parser reads; methods return False to refuse an entry."""
 
     strict: bool
     resolutions: dict[bytes, float] = field(default_factory=dict)
@@ -110,7 +110,7 @@ class EntryCollector:
     _oddities: dict[str, list[str]] = field(default_factory=dict)
 
     def scalar(self, key: bytes, text: str) -> bool:
-        """Take ``key: text``: a resolution, or an unknown key."""
+        """Add ``key: text``: a resolution, or an unknown key."""
         if key not in _RESOLUTIONS:
             if not self.strict:
                 self.report("unknown key ignored", key)
@@ -122,7 +122,7 @@ class EntryCollector:
         return True
 
     def entry(self, key: bytes, x: str, y: str) -> bool:
-        """Take ``key: [x, y]``."""
+        """Add ``key: [x, y]``."""
         if key in _RESOLUTIONS or len(key) > MAX_NAME_BYTES:
             return False
         corner_x, corner_y = _read_corner(x, strict=self.strict), _read_corner(y, strict=self.strict)
@@ -137,7 +137,7 @@ class EntryCollector:
         return True
 
     def block(self, names: NDArray[np.bytes_], corners: NDArray[np.float64]) -> bool:
-        """Take many entries with integer corners at once: names (N,), corners (N, 2)."""
+        """Add many entries with integer corners at once: names (N,), corners (N, 2)."""
         if any(bool((names == key).any()) for key in _RESOLUTIONS):
             return False
         self._flush()
@@ -150,13 +150,13 @@ class EntryCollector:
         self._oddities.setdefault(what, []).append(shortened(key.decode("utf-8", "replace")))
 
     def metadata(self) -> MapMetadata | None:
-        """Return what was collected, None if a resolution is missing; of repeated keys the last counts."""
+        """Return the metadata; None if a resolution is missing.  The last of repeated keys counts."""
         if len(self.resolutions) < len(_RESOLUTIONS):
             return None
         self._flush()
         names = np.concatenate(self._name_blocks) if self._name_blocks else np.array([], dtype=np.bytes_)
         corners = np.concatenate(self._corner_blocks) if self._corner_blocks else np.empty((0, 2))
-        # unique() finds first occurrences; reversed, they are the last
+        # unique() finds first occurrences; in the reversed array these are the last ones
         _, last = np.unique(names[::-1], return_index=True)
         if len(last) < len(names):
             kept = np.sort(len(names) - 1 - last)
@@ -179,18 +179,18 @@ class EntryCollector:
 
 
 def shortened(text: str) -> str:
-    """Return a text from a file as far as a message needs it."""
+    """Return a text from a file, cut to a length that suits a message."""
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}... ({len(text):,} characters)"
 
 
 def list_some(names: list[str]) -> str:
-    """List the first few of ``names``, and say how many there are when that is not all."""
+    """List the first few of ``names``, with the total number if there are more."""
     some = ", ".join(names[:_NAMED_IN_PROBLEMS])
     return some if len(names) <= _NAMED_IN_PROBLEMS else f"{some}, ... ({len(names)} in all)"
 
 
 MAX_METADATA_BYTES: Final = 1 << 30
-"""A map of ten million cells has half of that."""
+"""Size limit of a metadata file; a map of ten million cells takes half of it."""
 TOO_LARGE: Final = "too_large"
 
 # The C parser where PyYAML was built with it; both report the same events.
@@ -198,16 +198,16 @@ _LOADER: Any = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 # The parser's time grows with the square of the depth; metadata needs two levels.
 _MAX_DEPTH = 64
-# ... libyaml 0.2.6 refuses a depth of 1000, and may do so before it has reported a first event.
+# libyaml 0.2.6 refuses a depth of 1000 itself, possibly before it has reported a first event.
 _TOO_DEEP_FOR_LIBYAML = "exceeded maximum nesting depth"
 
-# It grows with the square of the number of tag directives, too; metadata needs none.
+# The parser's time also grows with the square of the number of tag directives; metadata needs none.
 _TAG_DIRECTIVE = re.compile(rb"^%TAG", re.MULTILINE)
 
-_BLOCK_BYTES = 1 << 17  # so that one odd line sends few others to the slower pattern
+_BLOCK_BYTES = 1 << 17  # small enough that one odd line sends few other lines to the slower pattern
 _PLAIN_NAME = rb"([A-Za-z0-9_.+()/][A-Za-z0-9_.+()/=@-]{0,254})"
 _PLAIN_INTEGER = rb"(-?(?:0|[1-9][0-9]{0,8}))"
-_PLAIN_LINE = re.compile(  # as the divider writes it
+_PLAIN_LINE = re.compile(  # a line as the divider writes it
     rb"^%b: \[%b, %b\]\n" % (_PLAIN_NAME, _PLAIN_INTEGER, _PLAIN_INTEGER), re.MULTILINE
 )
 _LINE = re.compile(
@@ -228,14 +228,14 @@ _LINE = re.compile(
 
 
 def metadata_bytes(path: str, max_bytes: int = MAX_METADATA_BYTES, *, at: str = "") -> bytes:
-    """Return what is in the metadata file at ``path``; ``at`` is where to find it, if not there.
+    """Return the bytes of the metadata file at ``path``, opened by ``at`` if that is given.
 
     Raises
     ------
     MapMissing
-        There is no such file, or it may not be read.
+        The file does not exist, or may not be read.
     MapDataError
-        It has more bytes; the error's cause is `TOO_LARGE`.
+        The file is larger than ``max_bytes``; the error's cause is `TOO_LARGE`.
     """
     try:
         with open(at or path, "rb") as file:
@@ -271,7 +271,7 @@ def parse_metadata(data: bytes, *, path: str, strict: bool = False, lines: bool 
 
 
 def collect_lines(data: bytes, entries: EntryCollector) -> bool:
-    """Read the whole of ``data`` into ``entries``; False if some line needs the real parser."""
+    """Read all lines of ``data`` into ``entries``; return False if a line needs the YAML parser."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     for opening in (b"---\n", b"---\r\n"):
         data = data.removeprefix(opening)
@@ -288,7 +288,7 @@ def collect_lines(data: bytes, entries: EntryCollector) -> bool:
 
 
 def _collect_plain(block: bytes, entries: EntryCollector) -> bool:
-    """Take a block all of whose lines are `_PLAIN_LINE`, in a quarter of the time."""
+    """Read a block if all its lines match `_PLAIN_LINE`, four times as fast; else return False."""
     found = _PLAIN_LINE.findall(block)
     if not found or len(found) != block.count(b"\n"):
         return False
@@ -300,7 +300,7 @@ def _collect_each(block: bytes, entries: EntryCollector) -> bool:
     """Read a block line by line, with quotes, comments, floats, spaces and CRLF; False if that fails."""
     position = 0
     while position < len(block):
-        line = _LINE.match(block, position)  # here or nowhere: to search a long line takes time by its square
+        line = _LINE.match(block, position)  # no search: on a long line that takes quadratic time
         if line is None:
             return False
         position = line.end()
@@ -317,16 +317,16 @@ def _collect_each(block: bytes, entries: EntryCollector) -> bool:
 
 
 class _EventReader:
-    """Reads YAML of any style, from parser events: nothing recurses, however deep the file nests.
+    """Reads YAML of any style from parser events, without recursion however deep the file nests.
 
     Parameters
     ----------
     data
         Bytes of the file.
     entries
-        Takes what is found.
+        Receives the entries.
     path
-        For messages.
+        Path of the file, for messages.
     """
 
     def __init__(self, data: bytes, entries: EntryCollector, path: str) -> None:
@@ -335,7 +335,7 @@ class _EventReader:
         self._path = path
         self._depth = 0
         self._key: str | None = None
-        """Of the entry being read; None between entries."""
+        """Key of the entry being read; None between entries."""
         self._values: list[str] = []
         self._is_nested = False
 
@@ -345,7 +345,7 @@ class _EventReader:
         Raises
         ------
         MapDataError
-            It is no YAML, or no mapping of names to corners.
+            The file is not YAML, or not a mapping of names to corners.
         """
         if tag := _TAG_DIRECTIVE.search(self._data):
             raise MapDataError(
@@ -412,7 +412,7 @@ class _EventReader:
             self._take(self._key, event.value, event.start_mark)
 
     def _take(self, key: str, value: list[str] | str | None, mark: Any) -> None:
-        """Hand on the entry that ends at ``mark``; ``value`` is None if nested."""
+        """Pass the entry that ends at ``mark`` to the collector; ``value`` is None if nested."""
         entries = self._entries
         name, key = key.encode(), shortened(key)
         self._key = None
@@ -461,11 +461,10 @@ _PLAIN_KEY: Final = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.+-]*")
 
 
 def metadata_text(size: str, entries: Iterable[tuple[str, tuple[str, str]]], size_y: str = "") -> str:
-    """Return the file for cells of ``size`` metres, entries being (file name, (x, y) of the corner).
+    """Return the text of a metadata file for cells of ``size`` metres.
 
-    Cells that are not square have ``size_y`` along y.
-
-    Numbers come as text, so that whole ones stay integers; names are quoted where YAML needs it.
+    Each entry is (file name, (x, y) of the corner).  Cells that are not square have ``size_y`` along y.
+    Numbers are given as text, so that whole numbers stay integers; names are quoted where YAML needs it.
     """
     lines = [f"x_resolution: {size}\n", f"y_resolution: {size_y or size}\n"]
     for name, corner in sorted(entries):

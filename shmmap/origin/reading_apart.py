@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading a map in a process of its own (`shmmap.origin.reread`).
+"""Reads a map in a separate process (`shmmap.origin.reread`).
 
-Python's share of reading a million cells takes seconds of the interpreter, and memory that is not given
-back.  A number of ten million digits takes a third of a second to parse, while no other thread runs at all.
-What the process finds comes through a pipe: an error, or the catalogue.
+To read a million cells, Python code holds the interpreter lock for seconds and takes memory that it never
+returns to the system.  To parse a number of ten million digits takes a third of a second, during which no
+other thread runs.  The process writes its result into a pipe: an error, or the catalogue.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from shmmap.processes.start_child import how_ended
 __all__ = ["Outcome", "ended_early", "not_started", "read_apart"]
 
 _PIPE_BYTES: Final = 1 << 20
-"""As much as every user may have: the reader needs a turn each time that the pipe is full."""
+"""The largest pipe that every user may have; a larger pipe needs fewer reads."""
 
 
 class Outcome(msgspec.Struct):
-    """The first line that the process writes: an error, as replies have it, or empty; then the catalogue."""
+    """First line of the process's output: an error as in replies, or empty if the catalogue follows."""
 
     error: str = ""
     message: str = ""
@@ -39,44 +39,44 @@ class Outcome(msgspec.Struct):
 
     @classmethod
     def of(cls, error: ShmmapError) -> Outcome:
-        """Describe an error."""
+        """Return the outcome that describes an error."""
         found = cls(error.code, error.message, error.hint)
         if isinstance(error, MapDataError):
             found.path, found.offset, found.cause = error.path, error.offset, error.cause
         return found
 
     def raised(self) -> ShmmapError:
-        """Return the error that is described."""
+        """Return the error that this outcome describes."""
         error = error_from_wire(self.error, self.message, self.hint)
         if isinstance(error, MapDataError):
             error.path, error.offset, error.cause = self.path, self.offset, self.cause
         return error
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _OUTCOME: Final = msgspec.json.Decoder(Outcome)
 
 
 def read_apart(
     map_path: str, words: str, before: Catalogue | None, descriptors: Sequence[int] = ()
 ) -> Catalogue:
-    """Read a map in a process of its own.
+    """Read a map in a separate process.
 
     Parameters
     ----------
     map_path
-        The map, for messages.
+        Path of the map, for messages.
     words
-        What the process is given, as JSON: a `MapDirectory`, and the descriptors of its directories by path.
+        Argument for the process, as JSON: a `MapDirectory`, and the descriptors of its directories by path.
     before
-        An earlier state: what has not changed is shared with it.
+        An earlier state; unchanged tables are shared with it.
     descriptors
-        Of the directories; the process has them by the same numbers.
+        Descriptors of the directories; the process inherits them under the same numbers.
 
     Raises
     ------
     ShmmapError
-        What the process raised; or there was none, or it ended before it was done.
+        The error that the process reported, or that it could not be started or ended early.
     """
     paths = os.pathsep.join(filter(None, sys.path))
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": paths}
@@ -102,7 +102,7 @@ def read_apart(
                 if outcome.error:
                     raise outcome.raised()
                 return read_catalogue(pipe, before=before)[1]
-    except (ValueError, msgspec.MsgspecError):  # it did not get to the end
+    except (ValueError, msgspec.MsgspecError):  # the process ended before it had written everything
         pass
     finally:
         process.kill()
@@ -111,7 +111,7 @@ def read_apart(
 
 
 def not_started(what: str, does: str, error: OSError) -> ShmmapError:
-    """Return the error that a process that ``does`` something with ``what`` cannot be started."""
+    """Return the error for a process that cannot be started; it ``does`` something with ``what``."""
     return ShmmapError(
         f"{what}: cannot start a process that {does} it: {error.strerror}",
         hint="raise the limit of processes or memory (TasksMax=, ulimit -u, MemoryMax=)",
@@ -119,7 +119,7 @@ def not_started(what: str, does: str, error: OSError) -> ShmmapError:
 
 
 def ended_early(what: str, does: str, code: int) -> ShmmapError:
-    """Return the error that such a process ended before it had answered."""
+    """Return the error for a process that ended with ``code`` before it had answered."""
     return ShmmapError(
         f"{what}: the process that {does} it ended with {how_ended(code)}",
         hint="was it killed, or is its memory too small?",

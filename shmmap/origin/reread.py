@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``python -m shmmap.origin.reread PARENT_PID MAP KNOWN``: read a map, given as JSON, for another process.
 
-See `shmmap.origin.reading_apart`.  KNOWN is empty, or the digest of the names and boxes that the other one
-has, as 16 hex digits.  The catalogue goes into the cache, too.
+See `shmmap.origin.reading_apart`.  KNOWN is empty, or the digest of the names and boxes that the other
+process has, as 16 hex digits.  The catalogue is also written into the cache.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from shmmap.processes.end_with_parent import die_with
 
 __all__ = ["main"]
 
-_NICENESS: Final = 10  # clients of the daemon go first
+_NICENESS: Final = 10  # the daemon's clients have priority
 _MAX_BYTES: Final = 8 << 30
 _MAX_CPU_S: Final = 600
-"""Memory and processor time for a map; ten million cells take 2.4 GB and 70 s."""
+"""Limits of memory and processor time for a map; ten million cells take 2.4 GB and 70 s."""
 
 
 def main(arguments: list[str]) -> int:
-    """Read the map and write what was found, errors included."""
+    """Read the map and write the catalogue or the error."""
     die_with(int(arguments[0]), signal.SIGTERM)
     os.nice(_NICENESS)
     _limit(resource.RLIMIT_DATA, _MAX_BYTES)
@@ -50,7 +50,7 @@ def main(arguments: list[str]) -> int:
     except MemoryError:
         said = f"{origin.path}: to read it takes more than {_MAX_BYTES >> 30} GiB of memory"
         outcome = Outcome.of(ShmmapError(said, hint="is its metadata sound?"))
-    except Exception as error:  # noqa: BLE001  standard error goes nowhere
+    except Exception as error:  # noqa: BLE001  reported in the pipe: standard error is discarded
         outcome = Outcome.of(InternalError(f"{origin.path}: {type(error).__name__}: {error}"))
     with open(sys.stdout.fileno(), "wb", closefd=False) as out:
         out.write(msgspec.json.encode(outcome) + b"\n")
@@ -60,7 +60,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _limit(what: int, value: int) -> None:
-    """Lower one of this process's limits, unless it is low enough."""
+    """Lower one of this process's resource limits to ``value``, unless it is lower already."""
     lower = [
         value if limit == resource.RLIM_INFINITY else min(value, limit) for limit in resource.getrlimit(what)
     ]

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells touch an area, in time that does not grow with the number of cells.
+"""Finds the cells that touch an area, in time that does not grow with the number of cells.
 
 Every cell is filed under the bucket ``floor(min corner / bucket size)`` of a grid whose buckets are
 as large as the largest cell; the buckets are sorted integer keys ``iy << 32 | ix``.  A cell that
 touches a query has its min corner at most one cell size before the query's, so each bucket row holds
 its candidates in one contiguous run that two binary searches find.  The area's exact test then runs
-on the candidates, of very many on some at a time.  Cells need not form a lattice.  Cells of very
-different sizes go into several such grids, one per power of two, so that one huge cell does not widen
+on the candidates, in batches if there are many.  Cells need not form a lattice.  Cells of very
+different sizes are filed in several such grids, one per power of two, so that one huge cell does not widen
 the search for all others.
 
-To sort ten million keys takes as long as to read all else of such a map: what is made of the boxes can be
-kept (`SpatialIndex.made`) and given back.
+Sorting ten million keys takes as long as reading the rest of such a map.  So the search structure can be
+kept (`SpatialIndex.made`) and passed to a new index.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ Indices = NDArray[np.intp]
 Floats = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]
 
-# Below this many cells the exact test on all of them is faster than any search.
+# For fewer cells, the exact test on all of them is faster than a search.
 _LINEAR_CELLS = 5000
 
-# Candidates that are tested at a time where there are very many.
+# Candidates that are tested at a time.
 _CELLS_PER_BATCH = 1 << 15
 
-# Rows of buckets whose ends are sooner found than how much of each lies in a circle.
+# For fewer rows of buckets, clipping each row to the circle takes longer than it saves.
 _FEW_ROWS = 128
 
 # float32 keeps 24 bits: an area test on float32-rounded values (Autoware's) may move a border by half
 # a unit in the last place, 2**-24 of its magnitude; twice that on the box and on the query side.
 _ROUNDING = 2.0**-22
 
-# The square of a shorter distance is 0: to an area test it is none.
+# The square of a shorter distance underflows to 0 in an area test.
 _NO_DISTANCE = 1e-150
 
-# What the rounding of float64 may move the border of a row by, of the magnitude of the grid; generous.
+# Upper bound of the float64 rounding error of a row's border, relative to the magnitude of the grid.
 _ROW_ROUNDING = 2.0**-45
 
-# Wider than this no cell counts for the mean.
+# Extent to which wider cells are clipped for the mean.
 _LARGEST = float(np.finfo(np.float64).max)
 
 # Keys hold 31 bits per axis; wider extents get larger buckets.
@@ -58,7 +58,7 @@ _MAX_BUCKETS = 2**31 - 2
 
 
 class GridFrame(NamedTuple):
-    """Where a grid lies: its corner, its largest cell and its buckets in metres, and how many buckets."""
+    """Corner of a grid, size of its largest cell and of its buckets (metres), and number of buckets."""
 
     min_x: float
     min_y: float
@@ -79,7 +79,7 @@ class Grid:
     keys
         (N,) int64, ascending: ``iy << 32 | ix``.
     cells
-        (N,) int32, whose keys these are: rows of all boxes of the map.
+        (N,) int32, the cell of each key: a row of the map's boxes.
     """
 
     frame: GridFrame
@@ -88,7 +88,7 @@ class Grid:
 
     @classmethod
     def of(cls, cells: Indices, boxes: Floats) -> Grid:
-        """Sort ``cells``, rows of ``boxes``, (N, 4), into a grid."""
+        """Return the grid of ``cells``, which are rows of ``boxes`` (N, 4)."""
         lows, highs, sizes = [], [], []
         for _, (min_x, min_y, max_x, max_y) in _blocks(cells, boxes):
             lows.append((min_x.min(), min_y.min()))
@@ -114,19 +114,19 @@ class Grid:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the arrays."""
+        """Memory of the arrays in bytes."""
         return int(self.keys.nbytes + self.cells.nbytes)
 
     def runs(self, bounds: Bounds, slack: float, circle: Circle | None = None) -> tuple[Indices, Indices]:
-        """Begins and ends of the runs of `cells` whose box may touch an area.
+        """Return begins and ends of the runs of `cells` whose box may touch an area.
 
         Parameters
         ----------
         bounds, slack
-            Around the area, and what rounding may move a border by.
+            Bounds of the area, and the distance by which rounding may move a border.
         circle
-            The area, if it is one.  Of very many cells around it only those near the circle are found: the
-            corners may have all of a map, and the circle none.
+            The area, if it is a circle.  If it spans many rows, each row is clipped to the circle: the
+            corners of its bounds may contain a whole map, and the circle no cell.
         """
         at, nothing = self.frame, np.empty(0, np.intp)
         x0 = (bounds[0] - slack - at.width - at.min_x) / at.bucket_x
@@ -151,7 +151,7 @@ class Grid:
     def _within(
         self, circle: Circle, slack: float, iy0: int, iy1: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and last column of each row whose cells may touch a circle."""
+        """Return first and last column of each row whose cells may touch a circle."""
         at = self.frame
         low_y = at.min_y + np.arange(iy0, iy1 + 1) * at.bucket_y
         rounding = _ROW_ROUNDING * max(abs(at.min_y), abs(at.min_y + at.rows * at.bucket_y), at.height)
@@ -169,12 +169,12 @@ class Grid:
 
 
 class MadeOfBoxes(NamedTuple):
-    """What is made of the boxes once.
+    """Search structure computed once from the boxes.
 
     Attributes
     ----------
     grids
-        None of few cells.
+        Empty if there are few cells.
     bounds
         Box around all boxes, metres, map frame; None where there are none.
     mean_size
@@ -187,7 +187,7 @@ class MadeOfBoxes(NamedTuple):
 
     @classmethod
     def of(cls, boxes: Floats) -> MadeOfBoxes:
-        """Make it of boxes, (N, 4)."""
+        """Compute the search structure of boxes, (N, 4)."""
         if not len(boxes):
             return cls((), None, (0.0, 0.0))
         low_x, low_y = boxes[:, :2].min(axis=0).tolist()
@@ -201,7 +201,7 @@ class MadeOfBoxes(NamedTuple):
             mean_y += float((np.minimum(height, _LARGEST) / len(boxes)).sum())
             level[block] = np.frexp(np.maximum(width, height))[1]
         grids: list[Grid] = []
-        # no grid spans more than a number can say
+        # limits the extent of a grid to finite numbers
         if len(boxes) > _LINEAR_CELLS and math.isfinite(high_x - low_x) and math.isfinite(high_y - low_y):
             levels = np.flatnonzero(np.bincount(level - level.min())) + level.min()
             grids = [Grid.of(np.flatnonzero(level == one), boxes) for one in levels]
@@ -209,7 +209,7 @@ class MadeOfBoxes(NamedTuple):
 
 
 class SpatialIndex:
-    """Answers which of a fixed set of boxes touch an area.
+    """Finds the boxes of a fixed set that touch an area.
 
     Parameters
     ----------
@@ -226,14 +226,14 @@ class SpatialIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the boxes and the search structure."""
+        """Memory of the boxes and the search structure in bytes."""
         return int(self.boxes.nbytes) + sum(grid.nbytes for grid in self.made.grids)
 
     def query(self, area: Area, most: int | None = None) -> Indices:
-        """Rows of ``boxes`` that touch ``area`` (closed borders, its z range ignored), ascending.
+        """Return the rows of ``boxes`` that touch ``area`` (closed borders, z range ignored), ascending.
 
-        If there are more than ``most``, some of them, more than ``most``, in no order: to find all takes
-        time that grows with their number.
+        If more than ``most`` boxes touch it, the result may be incomplete and unordered, but still has more
+        than ``most`` rows: the time to find all grows with their number.
         """
         grids = self.made.grids
         if not grids:
@@ -254,7 +254,7 @@ class SpatialIndex:
 
 
 def _candidates(cells: NDArray[np.int32], begins: Indices, ends: Indices) -> Iterator[NDArray[np.int32]]:
-    """Return the cells of runs, at most `_CELLS_PER_BATCH` at a time."""
+    """Yield the cells of runs, at most `_CELLS_PER_BATCH` at a time."""
     lengths = ends - begins
     total = int(lengths.sum())
     if total <= _CELLS_PER_BATCH:
@@ -270,14 +270,14 @@ def _candidates(cells: NDArray[np.int32], begins: Indices, ends: Indices) -> Ite
 
 
 def _blocks(cells: Indices, boxes: Floats) -> Iterator[tuple[slice, Floats]]:
-    """Return the columns of rows ``cells`` of boxes, some at a time: nothing as long as the map is made."""
+    """Yield the columns of rows ``cells`` of boxes in batches, so that no array is as long as the map."""
     for begin in range(0, len(cells), _CELLS_PER_BATCH):
         block = slice(begin, begin + _CELLS_PER_BATCH)
         yield block, boxes.T.take(cells[block], axis=1)
 
 
 def touches(area: Area, boxes: Floats) -> NDArray[np.bool_]:
-    """Which of boxes, (N, 4), touch an area; (N,) bool."""
-    # squares of distances beyond 1e154 m overflow to infinity, which compares as it should
+    """Return which of the boxes, (N, 4), touch an area; (N,) bool."""
+    # squares of distances beyond 1e154 m overflow to infinity, which compares correctly
     with np.errstate(over="ignore"):
         return area.overlaps(boxes)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map: objects named by their content, in a bucket or a directory; see ``ORIGIN.md``."""
+"""Published maps: objects named by their content, in a bucket or a directory; see ``ORIGIN.md``."""

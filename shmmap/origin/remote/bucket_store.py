@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A published map in a bucket (S3, Google, Azure) or behind a web server, by obstore.
+"""A published map in a bucket (S3, Google, Azure) or behind a web server, accessed with obstore.
 
-What obstore says of an error may hold a URL with what signs it: of that only the kind and the HTTP status
-go into our messages.
+The text of an obstore error may contain a signed URL.  So our messages repeat only the kind of the error and
+the HTTP status.
 """
 
 from __future__ import annotations
@@ -58,14 +58,15 @@ _REASONS: Final = {
     "RequestTimeTooSkewed": "this machine's clock differs from the store's",
     "AccessDenied": "no permission",
 }
-"""Meaning of Amazon's error codes, which other stores use, too."""
+"""Meanings of Amazon's error codes, which other stores use, too."""
 _OBJECTS_PER_PAGE: Final = 1000
 
 
 class BucketStore:
     """A `shmmap.origin.remote.store.Store` below a URL; `opened_store.open_store` makes it.
 
-    Once something was asked of any, a forked process cannot ask: obstore's threads are not in it.
+    After the first request to any store, a forked process cannot make requests: obstore's threads are
+    missing in it.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class BucketStore:
         return self._read(path, max_bytes)
 
     def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
-        """Return a whole object and its ETag, unless that is the one of ``tag``."""
+        """Return a whole object and its ETag; None if the ETag is still that of ``tag``."""
         try:
             return self._read(path, max_bytes, unless=tag.get("e_tag"))
         except exceptions.NotModifiedError:
@@ -126,7 +127,7 @@ class BucketStore:
         return Listed(path, meta["size"], meta["last_modified"].timestamp())
 
     def list(self, prefix: str) -> Iterator[Listed]:
-        """All objects below a prefix."""
+        """Yield all objects below a prefix."""
         refuse_read_only(self)
         stream = self._ask(
             prefix, lambda: obstore.list(self._store, prefix.rstrip("/"), chunk_size=_OBJECTS_PER_PAGE)
@@ -143,7 +144,7 @@ class BucketStore:
         self._put(path, data, None, _IMMUTABLE)
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """Write an object that is not there yet."""
+        """Write an object if none exists at this path."""
         try:
             self._put(path, data, "create", _CHANGES)
         except (exceptions.AlreadyExistsError, exceptions.PreconditionError):
@@ -151,10 +152,10 @@ class BucketStore:
         return True
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
-        """Replace the state of an object that ``tag`` names."""
+        """Replace an object if it is still in the state that ``tag`` names."""
         wanted = dict(tag)
         if self._scheme == "s3":
-            wanted["e_tag"] = wanted["e_tag"].strip('"')  # Ceph's gateway knows no other; Amazon's takes both
+            wanted["e_tag"] = wanted["e_tag"].strip('"')  # Ceph's gateway needs it bare; Amazon takes both
         try:
             self._put(path, data, wanted, _CHANGES)
         except (exceptions.AlreadyExistsError, exceptions.PreconditionError, MapMissing):
@@ -162,7 +163,7 @@ class BucketStore:
         return True
 
     def _has(self, path: str, data: bytes) -> bool:
-        """Whether an object is what was to be written: the answer to a first try may have been lost."""
+        """Whether an object already has ``data``: the reply to an earlier attempt may have been lost."""
         try:
             return bytes(self.get(path, len(data))) == data
         except (MapMissing, MapDataError):
@@ -192,7 +193,10 @@ class BucketStore:
         return f"{self.url}/{path}"
 
     def _ask(self, path: str, ask: Callable[[], _Answer], *, conditional: bool = False) -> _Answer:
-        """Ask obstore, and make its errors ours; refused conditions stay what they are where one was set."""
+        """Make a request and translate obstore's errors.
+
+        With ``conditional``, the error of a failed condition is raised unchanged.
+        """
         try:
             return ask()
         except (exceptions.NotFoundError, FileNotFoundError) as error:
@@ -203,7 +207,7 @@ class BucketStore:
             if conditional:
                 raise
             raise StoreRefused(f"{self._name(path)}: refused (status 412)") from None
-        except exceptions.NotModifiedError:  # asked for by `get_if_changed` alone
+        except exceptions.NotModifiedError:  # only `get_if_changed` sets this condition
             raise
         except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError) as error:
             why = _reason(str(error)) or "no permission"
@@ -215,7 +219,7 @@ class BucketStore:
 
 
 def _out_of_reach(name: str, text: str) -> Offline:
-    """Return the error for what obstore says, of which only what is known to hold no secret is repeated."""
+    """Return our error for the text of an obstore error; only parts without secrets are repeated."""
     found = _STATUS.search(text)
     if found is not None:
         status = found[1] or found[2]
@@ -231,13 +235,13 @@ def _out_of_reach(name: str, text: str) -> Offline:
 
 
 def _reason(text: str) -> str:
-    """Return why a store refuses, if it gives one of the known codes; else an empty string."""
+    """Return the reason of a store's refusal if the text has a known error code; else an empty string."""
     found = _CODE.search(text)
     return _REASONS.get(found[1], "") if found is not None else ""
 
 
 def server_url(where: StoreUrl) -> str:
-    """Return the URL of a store's server, for requests without credentials; empty if it is not known."""
+    """Return the URL of a store's server, for requests without credentials; empty if unknown."""
     if where.scheme in WEB_SCHEMES:
         return where.text
     if endpoint := _endpoint(where.scheme):
@@ -265,7 +269,7 @@ def _opened(where: StoreUrl, timeouts: Timeouts, *, insecure: bool, instance: bo
     client: dict[str, Any] = {
         "connect_timeout": timedelta(seconds=timeouts.connect_s),
         "read_timeout": timedelta(seconds=timeouts.read_s),
-        "timeout": timedelta(days=1),  # of a whole body, whose length is not known beforehand
+        "timeout": timedelta(days=1),  # for a whole body, whose length is not known beforehand
         "allow_http": plain,
         "user_agent": "shmmap",
     }

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Credentials for buckets: from the environment, the service manager or a profile, never from the network.
+"""Credentials for buckets: from the environment, the service manager or a profile.
 
-obstore reads the environment itself.  Without any it would ask the cloud's metadata address, where on a
-vehicle nothing answers, or an unknown machine does: so that is done only if it is configured.
+obstore reads the environment itself.  Without credentials it would ask the cloud's metadata address.  On a
+vehicle, nothing or an unknown machine answers there, so this is done only if it is configured.
 """
 
 from __future__ import annotations
@@ -56,12 +56,14 @@ Provider = Callable[[], dict[str, Any]]
 
 
 def credentials_source(scheme: str, environment: Mapping[str, str], *, instance: bool = False) -> str:
-    """Describe where the credentials of a store come from, never what they are; empty: it needs none.
+    """Return a description of where a store's credentials are read from; empty if it needs none.
+
+    The description never contains the credentials.
 
     Raises
     ------
     ConfigError
-        As `s3_settings` and `azure_settings`; or the credentials' own expiry has passed.
+        See `s3_settings` and `azure_settings`; also if the credentials have expired.
     """
     if scheme == "s3":
         return _s3_source(environment, instance=instance)
@@ -99,12 +101,12 @@ def _s3_source(environment: Mapping[str, str], *, instance: bool) -> str:
 def s3_settings(
     environment: Mapping[str, str], *, instance: bool = False
 ) -> tuple[Settings, Provider | None]:
-    """Return what an S3 store is configured with, and what gives it keys, where the environment does not.
+    """Return an S3 store's settings, and a provider of its keys if the environment does not hold them.
 
     Raises
     ------
     ConfigError
-        The profile's credentials are of a kind that is not read here, or not whole.
+        The profile's credentials are of an unsupported kind, or incomplete.
     """
     settings: Settings = {}
     if not (environment.get("AWS_REGION") or environment.get("AWS_DEFAULT_REGION")):
@@ -140,7 +142,7 @@ def s3_settings(
 
 
 def _static_keys(environment: Mapping[str, str]) -> tuple[dict[str, Any], str] | None:
-    """Read the keys in the service manager's file or the shared credentials file, and which; or None."""
+    """Return the keys in the service manager's or the shared credentials file, and their origin; or None."""
     profile = environment.get("AWS_PROFILE", "")
     files = [
         *_given_file(environment, AWS_FILE),
@@ -195,7 +197,7 @@ def _config_section(profile: str) -> str:
 
 
 def google_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
-    """Return what a store of Google Cloud is configured with."""
+    """Return the settings of a store in Google Cloud."""
     if any(environment.get(name) for name in _GOOGLE):
         return {}
     for path in _given_file(environment, GOOGLE_FILE):
@@ -218,12 +220,12 @@ def _google_source(environment: Mapping[str, str], *, instance: bool) -> str:
 
 
 def azure_settings(environment: Mapping[str, str], *, instance: bool = False) -> Settings:
-    """Return what a store of Azure is configured with.
+    """Return the settings of a store in Azure.
 
     Raises
     ------
     ConfigError
-        The service manager's file is no list of ``NAME=VALUE``.
+        The service manager's file is not a list of ``NAME=VALUE``.
     """
     account = {}
     found = dict(environment)
@@ -267,7 +269,7 @@ def _azure_source(environment: Mapping[str, str], *, instance: bool) -> str:
 
 
 def _named(environment: Mapping[str, str], path: str) -> str:
-    """Name a file by the variable that says where it is."""
+    """Return a file's path for messages, with the service manager's directory as an environment variable."""
     directory = environment.get(_DIRECTORY)
     inside = bool(directory) and os.path.dirname(path) == directory
     return f"${_DIRECTORY}/{os.path.basename(path)}" if inside else path
@@ -292,7 +294,7 @@ def _lines(path: str) -> dict[str, str]:
 
 
 def _section(path: str, name: str) -> Mapping[str, str] | None:
-    """Read a section of an INI file; None where there is no such file or section."""
+    """Return a section of an INI file; None if the file or the section does not exist."""
     parser = configparser.RawConfigParser(default_section="", strict=False)
     try:
         with open(path, encoding="utf-8") as file:
@@ -302,6 +304,6 @@ def _section(path: str, name: str) -> Mapping[str, str] | None:
     except PermissionError:
         raise ConfigError(f"{path} may not be read", origin=path) from None
     except (OSError, UnicodeDecodeError, configparser.Error):
-        # what the parser says repeats the line, and with it the secret
+        # the parser's message repeats the line, and so the secret
         raise ConfigError(f"{path} is no file of profiles", origin=path) from None
     return dict(parser[name]) if parser.has_section(name) else None

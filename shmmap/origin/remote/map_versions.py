@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The versions of a published map: which root each one is, and the one switch from one to the next.
+"""The versions of a published map: the root of each version, and the switch from one version to the next.
 
-``CURRENT`` names the version that is served.  Each version has an entry, made before it becomes current,
-which names the one before it.  So what was current is found by going back from ``CURRENT``; an entry beside
-that chain was never served: its publisher was killed, or another one was quicker.
+``CURRENT`` names the version that is served.  Each version has an entry, written before the version becomes
+current, which names the version before it.  So earlier versions are found by following the entries back from
+``CURRENT``.  An entry outside that chain was never served: its publisher was killed, or another publisher was
+quicker.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ __all__ = [
 
 CURRENT: Final = "CURRENT"
 TIMESTAMP: Final = "timestamp.json"
-"""Of a signed map: `shmmap.origin.remote.signed_metadata`."""
+"""File that names the current version of a signed map, see `shmmap.origin.remote.signed_metadata`."""
 MAX_METADATA_BYTES: Final = 512_000
-"""Most bytes of each object of a signed map's metadata."""
+"""Size limit of each object of a signed map's metadata."""
 ENTRIES: Final = "versions/"
 _ENTRY: Final = re.compile(r"versions/([1-9]\d{0,18})\.json")
 _MAX_JSON_BYTES: Final = 64 << 10
@@ -66,7 +67,7 @@ _Named = TypeVar("_Named", bound=msgspec.Struct)
 
 
 class Current(msgspec.Struct, frozen=True):
-    """What ``CURRENT`` says: a version's number, the SHA-256 of its root's object, and that one's bytes."""
+    """Content of ``CURRENT``: a version's number, and the SHA-256 and the size of its root's object."""
 
     version: int
     root: str
@@ -74,18 +75,18 @@ class Current(msgspec.Struct, frozen=True):
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What ``versions/<n>.json`` says.
+    """Content of ``versions/<n>.json``.
 
     Attributes
     ----------
     version, root, bytes
         As in `Current`.
     created
-        When it was made, UTC, as RFC 3339 writes it.
+        Time at which the entry was made, UTC, in the format of RFC 3339.
     before
-        The version that was current then; 0: none.
+        The version that was current at that time; 0: none.
     restored
-        The version whose content it has again; 0: its own.
+        The earlier version whose content was restored; 0: the version has its own content.
     """
 
     version: int
@@ -97,36 +98,36 @@ class Entry(msgspec.Struct, frozen=True):
 
     @property
     def current(self) -> Current:
-        """What ``CURRENT`` says while this one is served."""
+        """Content of ``CURRENT`` while this version is served."""
         return Current(self.version, self.root, self.bytes)
 
     @property
     def created_s(self) -> float:
-        """The same as Unix time."""
+        """Time at which the entry was made, Unix time."""
         return datetime.datetime.fromisoformat(self.created.replace("Z", "+00:00")).timestamp()
 
 
 class CurrentState(NamedTuple):
-    """What is current, and the tag of ``CURRENT``; None, None where nothing is published yet."""
+    """The current version, and the tag of ``CURRENT``; None, None if nothing is published yet."""
 
     current: Current | None
     tag: Tag | None
 
 
 def entry_path(version: int) -> str:
-    """Return where the entry of a version lies."""
+    """Return the path of a version's entry in the store."""
     return f"{ENTRIES}{version}.json"
 
 
 def read_current(store: Store) -> CurrentState:
-    """Return which version is current.
+    """Return the current version.
 
     Raises
     ------
     MapDataError
         ``CURRENT`` is damaged.
     Offline
-        It cannot be read at present.
+        ``CURRENT`` cannot be read at present.
     """
     try:
         data, tag = store.get_tagged(CURRENT, _MAX_JSON_BYTES)
@@ -136,7 +137,7 @@ def read_current(store: Store) -> CurrentState:
 
 
 def require_current(store: Store) -> Current:
-    """Return which version is current; `MapMissing` where nothing is published."""
+    """Return the current version; raise `MapMissing` if nothing is published."""
     found = read_current(store).current
     if found is None:
         raise MapMissing(f"no map is published at {store.url}", hint="shmmap publish MAP URL publishes one")
@@ -144,7 +145,7 @@ def require_current(store: Store) -> Current:
 
 
 def unpack_current(data: bytes | memoryview, name: str = CURRENT) -> Current:
-    """Read ``CURRENT``; `MapDataError` if it is damaged."""
+    """Decode ``CURRENT``; raise `MapDataError` if it is damaged."""
     found = _decode(data, Current, name)
     _check(found.version, found.root, found.bytes, name)
     return found
@@ -156,16 +157,16 @@ def read_entry(store: Store, version: int) -> Entry:
     Raises
     ------
     MapMissing
-        There is none.
+        There is no such entry.
     MapDataError
-        It is damaged.
+        The entry is damaged.
     """
     path = entry_path(version)
     name = f"{store.url}/{path}"
     entry = _decode(store.get(path, _MAX_JSON_BYTES), Entry, name)
     _check(entry.version, entry.root, entry.bytes, name)
     try:
-        entry.created_s  # noqa: B018  it is a time
+        entry.created_s  # noqa: B018  raises if it is not a time
         right = entry.version == version and 0 <= entry.before < version and entry.created.endswith("Z")
     except (ValueError, OverflowError):
         right = False
@@ -175,13 +176,13 @@ def read_entry(store: Store, version: int) -> Entry:
 
 
 def list_entries(store: Store) -> list[int]:
-    """Return the numbers of all entries, ascending; the store must be one that can be listed."""
+    """Return the numbers of all entries, ascending; the store must support listing."""
     found = (_ENTRY.fullmatch(listed.path) for listed in store.list(ENTRIES))
     return sorted(int(match[1]) for match in found if match is not None)
 
 
 def earlier_versions(store: Store, current: Current) -> Iterator[Entry]:
-    """Yield the entries of what is and was current, latest first, until one's predecessor has no entry."""
+    """Yield the entries of the current and earlier versions, latest first, until one is missing."""
     version = current.version
     for _ in range(_MAX_VERSIONS):
         try:
@@ -200,18 +201,18 @@ def read_root(store: ObjectReader, current: Current) -> Root:
     Raises
     ------
     MapMissing, MapDataError, Offline
-        It is not there, not what its name says, or out of reach.
+        The root is missing, does not match its hash, or is out of reach.
     """
     return unpack_root(read_root_object(store, current), name=f"{store.url}/{root_path(current)}")
 
 
 def root_path(current: Current) -> str:
-    """Return where the object of a version's root lies."""
+    """Return the path of a version's root object in the store."""
     return blob_path(bytes.fromhex(current.root))
 
 
 def read_root_object(store: ObjectReader, current: Current) -> bytes:
-    """Return the object of a version's root, its hash compared; errors are those of `read_root`."""
+    """Return the object of a version's root, hash verified; errors are those of `read_root`."""
     path = root_path(current)
     data = bytes(store.get_exactly(path, current.bytes))
     if sha256(data).hexdigest() != current.root:
@@ -220,18 +221,18 @@ def read_root_object(store: ObjectReader, current: Current) -> bytes:
 
 
 def read_shard_object(store: ObjectReader, root: Root, number: int) -> memoryview:
-    """Return the object of a shard; `unpack_shard` compares its hash."""
+    """Return the object of a shard; `unpack_shard` verifies its hash."""
     return store.get_exactly(blob_path(root.shard_sha256(number)), int(root.sizes[number]))
 
 
 def read_shards(store: ObjectReader, root: Root) -> Iterator[Shard]:
-    """All shards of a root in order, several read at a time; errors are those of `read_root`."""
+    """Yield all shards of a root in order, several read at a time; errors are those of `read_root`."""
 
     def read(number: int) -> Shard:
         return unpack_shard(read_shard_object(store, root, number), root, number)
 
     with ThreadPoolExecutor(_CONCURRENT_READS, "shard") as pool:
-        for begin in range(0, len(root.keys), _CONCURRENT_READS):  # what is decoded does not pile up
+        for begin in range(0, len(root.keys), _CONCURRENT_READS):  # few decoded shards in memory at a time
             yield from pool.map(read, range(begin, min(begin + _CONCURRENT_READS, len(root.keys))))
 
 
@@ -239,12 +240,12 @@ def read_shards(store: ObjectReader, root: Root) -> Iterator[Shard]:
 
 
 def new_entry(store: Store, root: str, nbytes: int, before: Current | None, *, restored: int = 0) -> Entry:
-    """Make the entry of a new version, which is not served yet: `add_version` switches to it.
+    """Write the entry of a new version, which is not served until `add_version` switches to it.
 
     Raises
     ------
     InstanceBusy
-        Another publisher takes every number.
+        Other publishers took every number that was tried.
     """
     for _ in range(100):
         highest = max([*list_entries(store), before.version if before is not None else 0], default=0)
@@ -257,29 +258,29 @@ def new_entry(store: Store, root: str, nbytes: int, before: Current | None, *, r
 
 
 def refuse_if_signed(store: Store, what: str) -> None:
-    """Refuse to change a signed map without signing: vehicles that verify would never take it.
+    """Refuse to change a signed map without signing: vehicles that verify would never accept the change.
 
     Raises
     ------
     BadRequest
-        It is signed.
+        The map is signed.
     """
     if store.head(TIMESTAMP) is not None:
         raise BadRequest(f"the map at {store.url} is signed", hint=what)
 
 
 def new_entry_now(current: Current, before: int) -> Entry:
-    """Make the entry of a version again, as of now."""
+    """Return an entry of a version with the present time."""
     return Entry(current.version, current.root, current.bytes, _now_text(), before)
 
 
 def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:
-    """Switch to a new version, if the one that was seen is still current.
+    """Make a new version current, if the version in ``seen`` is still current.
 
     Raises
     ------
     InstanceBusy
-        Another publisher has switched meanwhile: its version stays.
+        Another publisher has switched meanwhile; its version stays.
     """
     data = pack_json(entry.current)
     step("version.switch")
@@ -289,7 +290,7 @@ def add_version(store: Store, entry: Entry, seen: CurrentState) -> None:
 
 
 def changed_meanwhile(store: Store) -> InstanceBusy:
-    """Return the error of a publisher whose version is not served: another publisher was quicker."""
+    """Return the error for a publisher whose version is not served because another was quicker."""
     return InstanceBusy(
         f"another publisher has changed {store.url} meanwhile: its version stays, this one is not served",
         hint="run the same command again: what was sent is not sent again",
@@ -297,7 +298,7 @@ def changed_meanwhile(store: Store) -> InstanceBusy:
 
 
 def pack_json(value: Current | Entry) -> bytes:
-    """Return the bytes of ``CURRENT`` or of an entry: one line of JSON, keys in the order of the document."""
+    """Return the bytes of ``CURRENT`` or of an entry: one line of JSON, keys in the documented order."""
     return (json.dumps(msgspec.to_builtins(value)) + "\n").encode()
 
 
@@ -306,7 +307,7 @@ def _now_text() -> str:
     return now.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _DECODERS: Final[dict[Any, Any]] = {kind: msgspec.json.Decoder(kind) for kind in (Current, Entry)}
 
 

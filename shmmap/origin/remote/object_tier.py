@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objects of published maps on this machine's disk, so that nothing is fetched twice and no link is needed.
+"""Disk cache of published maps' objects: none is fetched twice, and cached areas need no network.
 
 An object is named by its SHA-256, here as in the store.  Its file is read into memory once and hashed there:
-so neither its writer nor its state matters, nor what becomes of it meanwhile.  A file that is not what its
-name says is removed, and the object fetched again.  Nothing else depends on the disk: it may be full,
-read-only, or emptied at any moment.
+so neither the writer nor later changes of the file matter.  A file that does not match its name is removed,
+and the object fetched again.  Nothing else depends on the disk: it may be full, read-only, or emptied at any
+moment.
 
-All processes of one account share the tier, and none of them is in charge: a file has its name once it is
-whole.  Only index pages are flushed to the disk: what a power cut leaves of the others is noticed by its
-hash.  How much is kept, and what goes first, is in `shmmap.disk_budget`.
+All processes of one account share the tier without a coordinator: a file gets its name once it is complete.
+Only index pages are flushed to the disk; other files that a power cut damages are detected by their hash.
+The size limit and the eviction order are in `shmmap.disk_budget`.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ __all__ = ["KeptObjects", "ObjectCounts", "ObjectTier", "kept_objects"]
 
 _BLOB: Final = re.compile("blobs/sha256/([0-9a-f]{64})")
 _ABSENT: Final = (errno.ENOENT, errno.ESTALE)
-_NEVER_RIGHT: Final = (errno.ELOOP, errno.ENXIO, errno.EIO)  # a link, a socket, a bad block
+_NEVER_RIGHT: Final = (errno.ELOOP, errno.ENXIO, errno.EIO)  # symbolic link, socket, bad block
 _FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class ObjectTier:
-    """The objects kept in one cache directory; may be used in threads.
+    """The objects kept in one cache directory; thread-safe.
 
-    No method raises for what the disk does: an object is then not there, or not kept, and the log says once
-    why.
+    No method raises for disk errors: the object then counts as missing, or is not kept, and the reason is
+    logged once.
 
     Parameters
     ----------
     cache_dir
-        The cache directory, which is made when the first object is kept.
+        The cache directory, created when the first object is kept.
     limit_bytes
-        Most bytes of all files kept in it, computed layers included; 0: no object is kept.
+        Size limit of all files in it, computed layers included; 0: no object is kept.
     quiet
-        Log nothing: another process of the same daemon does.
+        Log nothing, because another process of the same daemon does.
     """
 
     def __init__(self, cache_dir: str, *, limit_bytes: int, quiet: bool = False) -> None:
@@ -70,12 +70,12 @@ class ObjectTier:
 
     @property
     def damaged_objects(self) -> int:
-        """How many objects were found damaged, and removed."""
+        """Number of objects that were damaged and therefore removed."""
         return self._damaged
 
     @property
     def problem(self) -> str:
-        """Why the directory is not used: it is another user's, say; empty if it is, or is not there yet."""
+        """Why the directory is not used, e.g. because of its owner; empty if usable or not yet created."""
         try:
             with self._opened():
                 return ""
@@ -83,12 +83,12 @@ class ObjectTier:
             return "" if error.errno in _ABSENT else self._reason(error)
 
     def get(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bytes | None:
-        """Return an object, its size and hash compared; None if it is not there, or was damaged.
+        """Return an object, its size and hash verified; None if it is missing or was damaged.
 
         Parameters
         ----------
         digest
-            Its SHA-256.
+            SHA-256 of the object.
         """
         path = _path(digest, is_index)
         try:
@@ -109,7 +109,7 @@ class ObjectTier:
         return None
 
     def has(self, digest: bytes, nbytes: int, *, is_index: bool = False) -> bool:
-        """Whether an object's file is there and has its size; its content is checked when it is read."""
+        """Whether an object's file exists with the right size; its content is verified when it is read."""
         try:
             with self._opened() as place:
                 status = os.stat(_path(digest, is_index), dir_fd=place, follow_symlinks=False)
@@ -119,9 +119,9 @@ class ObjectTier:
         return stat.S_ISREG(status.st_mode) and status.st_size == nbytes
 
     def put(self, digest: bytes, data: bytes | memoryview, *, is_index: bool = False) -> bool:
-        """Keep an object whose hash was compared; False if it cannot be kept.
+        """Keep an object whose hash was verified; return False if it cannot be kept.
 
-        Index pages are on the disk when this returns.
+        Index pages are flushed to the disk when this returns.
         """
         nbytes = len(data)
         if nbytes > self._budget.limit_bytes:
@@ -143,17 +143,17 @@ class ObjectTier:
         return True
 
     def _begin_to_trim(self) -> None:
-        """Trim in a thread: fetching does not wait for it."""
+        """Trim the directory in a thread, so that fetching does not wait."""
         with self._lock:
             self._trim_again = True
             if self._trimmer is None or not self._trimmer.is_alive():
                 trimmer = threading.Thread(target=self._trim, name="trim", daemon=True)
-                with contextlib.suppress(RuntimeError):  # there are as many threads as there may be
+                with contextlib.suppress(RuntimeError):  # the limit of threads is reached
                     trimmer.start()
                     self._trimmer = trimmer
 
     def _trim(self) -> None:
-        """Trim until nothing was added meanwhile: a pass may miss what comes while it runs."""
+        """Trim until no object was added during a pass: a pass may miss objects added while it runs."""
         while True:
             with self._lock:
                 if not self._trim_again:
@@ -163,7 +163,7 @@ class ObjectTier:
             self._budget.trim()
 
     def mark_index_used(self, digests: Iterable[bytes]) -> None:
-        """Mark the index pages of the version in use: they are kept before others."""
+        """Mark the index pages of the version in use, which are evicted last."""
         with contextlib.suppress(OSError), self._opened() as place:
             for digest in digests:
                 with contextlib.suppress(OSError):
@@ -171,12 +171,12 @@ class ObjectTier:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[int]:
-        """Open the directory for what is done now: it may be another one, or gone, the next time.
+        """Open the directory for one operation: by the next, it may be replaced or gone.
 
         Raises
         ------
         OSError
-            It is not there, or not this account's alone (`_NotPrivate`).
+            The directory does not exist, or other accounts can write to it (`_NotPrivate`).
         """
         self._require_our_cache()
         if why := why_not_private(os.lstat(self.directory), os.geteuid()):
@@ -190,7 +190,7 @@ class ObjectTier:
             os.close(place)
 
     def _require_our_cache(self) -> None:
-        """Refuse a cache of another user: what root made in it, its service could not use."""
+        """Refuse another user's cache: the owner's service could not use files that root created in it."""
         uid, owner = os.geteuid(), os.stat(self._cache_dir).st_uid
         if owner not in (0, uid):
             raise _NotPrivate(f"{self._cache_dir} belongs to user {owner}, not to user {uid}")
@@ -210,7 +210,7 @@ class ObjectTier:
 
 
 class _NotPrivate(OSError):
-    """The directory is not this account's alone."""
+    """Error for a directory that is not private to this account."""
 
 
 def _path(digest: bytes, is_index: bool) -> str:
@@ -219,7 +219,7 @@ def _path(digest: bytes, is_index: bool) -> str:
 
 
 def _read(place: int, path: str, nbytes: int) -> bytes:
-    """Read a file of ``nbytes`` bytes into memory; anything else gives other bytes, and never waits."""
+    """Read a file of ``nbytes`` bytes without blocking; any other file gives bytes with another hash."""
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=place)
     try:
         status = os.fstat(fd)
@@ -266,9 +266,9 @@ def _write(place: int, path: str, data: memoryview, *, durable: bool) -> None:
 
 
 class ObjectCounts(NamedTuple):
-    """What was read from the tier and from the store, in the order of `counters.OBJECTS_READ`.
+    """Counts of reads from the tier and from the store, in the order of `counters.OBJECTS_READ`.
 
-    Bytes are those of objects; ``failed`` are fetches that failed for any reason.
+    Bytes are sizes of objects; ``failed`` counts fetches that failed for any reason.
     """
 
     disk_objects: int = 0
@@ -280,25 +280,25 @@ class ObjectCounts(NamedTuple):
     failed: int = 0
 
     def since(self, before: ObjectCounts) -> ObjectCounts:
-        """Return what has come since then."""
+        """Return the difference to earlier counts."""
         return ObjectCounts(*(now - then for now, then in zip(self, before, strict=True)))
 
 
 class KeptObjects:
-    """Reads objects of a store: out of the tier where they are there, else fetched, and kept.
+    """Reads objects of a store from the tier, or else fetches and keeps them.
 
-    It reads as a store does, so what fetches need not know which of the two answers; may be used in threads.
+    It has the interface of an `ObjectReader`, so callers need not know where an object is read.  Thread-safe.
 
     Parameters
     ----------
     store
-        Where objects are fetched.
+        Store from which missing objects are fetched.
     tier
-        None: nothing is kept.
+        Disk cache; None: nothing is kept.
     is_index
-        They are index pages.
+        The objects are index pages.
     keep
-        Whether what is fetched is kept.
+        Whether fetched objects are kept in the tier.
     """
 
     def __init__(
@@ -313,24 +313,24 @@ class KeptObjects:
 
     @property
     def url(self) -> str:
-        """Where the store is."""
+        """URL or path of the store."""
         return self._store.url
 
     @property
     def counts(self) -> ObjectCounts:
-        """What was read so far."""
+        """Counts of all reads so far."""
         damaged = self._tier.damaged_objects if self._tier is not None else 0
         return self._counts._replace(damaged_on_disk=damaged)
 
     def read(self, digest: bytes, nbytes: int) -> memoryview:
-        """Return the object of a SHA-256 and a size, both compared: they need not be compared again.
+        """Return the object of a SHA-256 and a size, both verified.
 
         Raises
         ------
         Offline, MapMissing
-            It is not in the tier, and the store does not answer, or does not have it.
+            The object is not in the tier, and the store does not answer, or does not have it.
         MapDataError
-            The store has another one under its name (cause ``damaged``); that is not kept.
+            The store's object does not match its name (cause ``damaged``); it is not kept.
         """
         kept = self.read_kept(digest, nbytes)
         if kept is not None:
@@ -352,7 +352,7 @@ class KeptObjects:
         return data
 
     def read_kept(self, digest: bytes, nbytes: int) -> memoryview | None:
-        """Return the object if it is in the tier; nothing is fetched."""
+        """Return the object if it is in the tier, else None; nothing is fetched."""
         kept = self._tier.get(digest, nbytes, is_index=self._is_index) if self._tier is not None else None
         if kept is None:
             return None
@@ -360,7 +360,7 @@ class KeptObjects:
         return memoryview(kept)
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
-        """Return an object by its path in the store; what is not named by its hash is fetched."""
+        """Return an object by its path in the store; an object not named by its hash is always fetched."""
         blob = _BLOB.fullmatch(path)
         if blob is None:
             return self._store.get_exactly(path, nbytes)
@@ -374,14 +374,14 @@ class KeptObjects:
 def kept_objects(
     store: ObjectReader, cache_dir: str, cache_bytes: int, *, is_index: bool = False, quiet: bool = False
 ) -> KeptObjects:
-    """Return what reads objects: from the disk where they are there, else from the store.
+    """Return a reader of objects that tries the disk cache first, then the store.
 
     Parameters
     ----------
     cache_dir, cache_bytes
-        Where objects are kept, and how much of them, computed layers included; 0: none.
+        Directory of the cache, and its size limit, computed layers included; 0: nothing is kept.
     is_index, quiet
-        As `KeptObjects` and `ObjectTier` have them.
+        As in `KeptObjects` and `ObjectTier`.
     """
     tier = ObjectTier(cache_dir, limit_bytes=cache_bytes, quiet=quiet) if cache_dir and cache_bytes else None
     return KeptObjects(store, tier, is_index=is_index)

@@ -30,23 +30,23 @@ def open_store(
     insecure_http: bool = False,
     instance_credentials: bool = False,
 ) -> Store:
-    """Return the store at a URL or in a directory; nothing is asked of it yet.
+    """Return the store at a URL or in a directory, without a first request.
 
     Parameters
     ----------
     insecure_http
-        Take plain ``http://`` beyond this machine.
+        Allow plain ``http://`` to other machines.
     instance_credentials
-        Ask the cloud's metadata address for credentials where none are given.
+        Ask the cloud's metadata address for credentials if none are given.
 
     Raises
     ------
     BadRequest
-        As `read_url`; or plain ``http://`` beyond this machine.
+        See `read_url`; also for plain ``http://`` to another machine that was not allowed.
     ConfigError
-        The credentials given cannot be used.
+        The credentials cannot be used.
     PackageMissing
-        Without obstore.
+        The package obstore is missing.
     """
     where = read_url(url)
     if where.scheme == "file":
@@ -59,24 +59,24 @@ def open_store(
 
 
 class ServedFrom(NamedTuple):
-    """Where a published map is served from, as the daemon says it to its loaders; see `open_store`."""
+    """Store of a published map, as the daemon passes it to its loaders; see `open_store`."""
 
     url: str
     insecure_http: bool = False
     instance_credentials: bool = False
 
     def words(self) -> tuple[str, ...]:
-        """Return it as texts."""
+        """Return the fields as texts, for a command line."""
         return self.url, *("yes" if one else "" for one in self[1:])
 
     @classmethod
     def from_words(cls, url: str, *flags: str) -> ServedFrom:
-        """Read what `words` has written."""
+        """Return the fields from the result of `words`."""
         return cls(url, *map(bool, flags))
 
 
 def open_for_serving(served: ServedFrom, timeouts: Timeouts = SERVING) -> Store:
-    """Return the store, opened for requests that wait.  Errors are those of `open_store`."""
+    """Return the store, with time limits for requests that clients wait for; errors as `open_store`."""
     return open_store(
         served.url,
         timeouts=timeouts,
@@ -92,7 +92,7 @@ _ABSENT: Final = (errno.ENOENT, errno.ENOTDIR)
 class DirectoryStore:
     """A `shmmap.origin.remote.store.Store` of files below ``root``, an absolute path.
 
-    A file appears whole and flushed to the disk.  What is replaced on a condition is so under a lock.
+    A file appears complete and flushed to the disk.  Conditional replacements hold a lock.
     """
 
     read_only = ""
@@ -107,7 +107,7 @@ class DirectoryStore:
     def _read(self, path: str, max_bytes: int, *, exact: bool = False) -> memoryview:
         full = self._path(path)
         try:
-            # never waits, as opening a FIFO would
+            # non-blocking, as opening a FIFO would block
             fd = os.open(full, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
             with open(fd, "rb") as file:
                 size = os.fstat(fd).st_size
@@ -133,12 +133,12 @@ class DirectoryStore:
         return self._read(path, nbytes, exact=True)
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
-        """Return a whole file, and the hash of it."""
+        """Return a whole file and its hash."""
         data = self._read(path, max_bytes)
         return data, {"sha256": sha256(data).digest(), "size": len(data)}
 
     def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
-        """Return a whole file and its hash, unless that is the one of ``tag``."""
+        """Return a whole file and its hash; None if the hash is still that of ``tag``."""
         found = self.get_tagged(path, max_bytes)
         return None if found[1] == tag else found
 
@@ -153,7 +153,7 @@ class DirectoryStore:
         return Listed(path, status.st_size, status.st_mtime)
 
     def list(self, prefix: str) -> Iterator[Listed]:
-        """All files below a folder, those half written too: their names begin with a dot."""
+        """Yield all files below a folder, including half-written ones, whose names begin with a dot."""
         for folder, _, names in os.walk(self._path(prefix)):
             below = os.path.relpath(folder, self._root)
             for name in names:
@@ -167,11 +167,11 @@ class DirectoryStore:
         self._write(path, data, replace=True)
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """Write a file that is not there yet."""
+        """Write a file if none exists at this path."""
         return self._write(path, data, replace=False)
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
-        """Replace a file whose hash is still that of ``tag``."""
+        """Replace a file if its hash is still that of ``tag``."""
         lock = self._path(_LOCK)
         with writing_errors(lock), locked_file(lock, mode=0o666):
             try:

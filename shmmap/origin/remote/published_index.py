@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells a published map has and which objects they are: a root, and shards of neighbouring cells.
+"""Index of a published map's cells and their objects: a root, and shards of neighbouring cells.
 
 Both are columns in a MessagePack map in a zstd frame.  The root has one row for each shard and is small;
-a shard is read when an area needs it.  ``ORIGIN.md`` is the byte-exact document.
+a shard is read when an area needs it.  ``ORIGIN.md`` specifies both byte by byte.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ MAX_ROOT_BYTES: Final = 16 << 20
 MAX_SHARD_BYTES: Final = 4 << 20
 FORMAT: Final = "shmmap published map"
 READER: Final = 1
-"""The version of this reader: a root that needs a greater one is refused."""
+"""Version of this reader; a root that needs a later reader is refused."""
 EXACT: Final = "exact"
 MILLIMETRES: Final = "mm"
 ENCODINGS: Final = (EXACT, MILLIMETRES)
-"""How points may be published; of those in millimetres some cells are exact."""
+"""Encodings of published points; in a map in millimetres, some cells may still be exact."""
 
 MAX_LAYERS: Final = 64
 _MAX_SPEC_CHARACTERS: Final = 200
 _MAX_TEXT_CHARACTERS: Final = 4096
-_ROUNDING: Final = 2.0**-22  # an area test on values rounded to float32 may move a border by half of it
+_ROUNDING: Final = 2.0**-22  # twice the relative distance by which rounding to float32 may move a border
 _SMALLEST_OBJECT_BYTES: Final = 4096
 
 Box: TypeAlias = tuple[float, float, float, float]
@@ -79,7 +79,7 @@ _Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 
 class _Head(msgspec.Struct, frozen=True):
-    """What says whether the rest of a root can be read."""
+    """The fields that show whether the rest of a root can be read."""
 
     format: str
     min_reader: int
@@ -128,7 +128,7 @@ class ShardFields(msgspec.Struct, frozen=True):
     layers: dict[str, LayerFields]
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _HEAD: Final = msgspec.msgpack.Decoder(_Head)
 _ROOT: Final = msgspec.msgpack.Decoder(RootFields)
 _SHARD: Final = msgspec.msgpack.Decoder(ShardFields)
@@ -145,7 +145,7 @@ class _HasLayers(Protocol):
 
 
 _Columns: TypeAlias = Mapping[str, tuple[str, str, int]]
-"""By attribute of an object: field of its document, dtype, and numbers in a row."""
+"""For each attribute of an object: its field in the document, dtype, and numbers per row."""
 
 _SHARD_COLUMNS: Final[_Columns] = {
     "keys": ("shard_keys", "<i4", 2),
@@ -162,7 +162,7 @@ _LAYER_COLUMNS: Final[_Columns] = {
 
 
 class Damage:
-    """Makes the error of one object."""
+    """Creates errors that name one damaged object."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -173,7 +173,7 @@ class Damage:
 
 
 def decode_map(unpacked: bytes, decoder: msgspec.msgpack.Decoder[_Struct], wrong: Damage) -> _Struct:
-    """Read what is in a frame; the error is ``wrong``'s."""
+    """Decode the unpacked content of a frame; raise the error that ``wrong`` creates if it is malformed."""
     try:
         found: _Struct = decoder.decode(unpacked)
         return found
@@ -182,14 +182,14 @@ def decode_map(unpacked: bytes, decoder: msgspec.msgpack.Decoder[_Struct], wrong
 
 
 def pack_fields(described: _HasLayers, kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the fields of the document of ``kind`` that describe a root, or a part of one."""
+    """Return the fields of a document of type ``kind`` for a root, or a part of one."""
     fields = {name: getattr(described, name) for name in kind.__struct_fields__ if hasattr(described, name)}
     layers = dict(sorted(described.layers.items()))
     return {**fields, "layers": layers, **_pack_columns(described, _SHARD_COLUMNS)}
 
 
 def unpack_fields(found: msgspec.Struct, wrong: Damage) -> dict[str, Any]:
-    """Return the attributes of the root, or of the part of one, that a document describes."""
+    """Return the attributes of the root, or the part of one, that a document describes."""
     fields = msgspec.structs.asdict(found)
     del fields["format"], fields["min_reader"]
     columns = _unpack_columns(found, _SHARD_COLUMNS, len(fields["shard_cells"]) // 4, wrong)
@@ -212,7 +212,7 @@ def _unpack_columns(found: object, columns: _Columns, count: int, wrong: Damage)
 
 
 def _pack_column(column: NDArray[Any], dtype: str) -> bytes:
-    """Return a column's rows, one after the other."""
+    """Return the bytes of a column, row by row."""
     return np.ascontiguousarray(column, np.dtype(dtype)).tobytes()
 
 
@@ -230,14 +230,14 @@ def _unpack_column(data: bytes, dtype: str, count: int, width: int, wrong: Damag
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Root:
-    """What a version of a published map is.
+    """Root of one version of a published map.
 
     Attributes
     ----------
     id_prefix
-        What all ids begin with; begins and ends with ``/``.
+        Directory that all ids begin with; begins and ends with ``/``.
     crs, origin, unit_m
-        Where the frame lies, see `shmmap.origin.map_report.MapFrame`.
+        Position of the map frame, see `shmmap.origin.map_report.MapFrame`.
     encoding
         One of `ENCODINGS`.
     bounds
@@ -245,17 +245,17 @@ class Root:
     shard_m
         Side of a shard, metres.
     largest_m, mean_m
-        Extent of the largest and of the mean cell along x and y, metres.
+        Largest and mean extent of the cells along x and y, metres.
     layers
         Builder version of each published layer by spec, ascending; `POINTS` is one of them.
     keys
         (S, 2) int32, row and column of each shard, ascending.
     counts, sizes
-        (S,) uint32, cells of each shard, bytes of its object.
+        (S,) uint32, number of cells of each shard, and bytes of its object.
     hashes
         (S, 32) uint8, SHA-256 of each shard's object, its name.
     map_version
-        Of what is in this root.
+        Map version of this root's content.
     """
 
     id_prefix: str
@@ -278,17 +278,18 @@ class Root:
 
     @property
     def first_indices(self) -> NDArray[np.int64]:
-        """(S + 1,) index of each shard's first cell, and how many cells there are."""
+        """(S + 1,) index of each shard's first cell; the last entry is the number of cells."""
         return np.concatenate([[0], np.cumsum(self.counts, dtype=np.int64)])
 
     def shard_sha256(self, shard: int) -> bytes:
-        """SHA-256 of a shard's object, its name."""
+        """Return the SHA-256 of a shard's object, which is the object's name."""
         return bytes(self.hashes[shard].tobytes())
 
     def shards_near(self, bounds: Box) -> NDArray[np.intp]:
-        """Shards that may have cells touching a rectangle (min x, min y, max x, max y), metres, ascending.
+        """Return the shards that may have cells touching a rectangle, ascending.
 
-        A cell lies in the shard of its lower corner, so those below and left of the rectangle, too.
+        ``bounds`` is (min x, min y, max x, max y) in metres.  A cell belongs to the shard of its lower
+        corner, so the result includes shards below and left of the rectangle.
         """
         min_x, min_y, max_x, max_y = bounds
         slack = _ROUNDING * max(map(abs, (*bounds, *self.bounds)))
@@ -306,13 +307,13 @@ class Root:
 
 
 def pack_root(root: Root) -> bytes:
-    """Return what is in a root's frame."""
+    """Return the unpacked content of a root's frame."""
     fields = RootFields(format=FORMAT, min_reader=READER, **pack_fields(root, RootFields))
     return msgspec.msgpack.encode(fields)
 
 
 def map_version_of(unpacked: bytes) -> int:
-    """Return the map version of what is in a root's frame: its 16 hex digits are the first of the SHA-256."""
+    """Return the map version of a root's unpacked content: its 16 hex digits are the first of the SHA-256."""
     return int.from_bytes(sha256(unpacked).digest()[:8], "big")
 
 
@@ -322,7 +323,7 @@ def unpack_root(frame: bytes | memoryview, *, name: str = "root") -> Root:
     Raises
     ------
     MapDataError
-        If it is no sound root (cause ``damaged``), or one that needs a later reader (``newer``).
+        The object is not a valid root (cause ``damaged``), or needs a later reader (``newer``).
     """
     unpacked = unpack_frame(frame, MAX_ROOT_BYTES, name=name)
     wrong = Damage(name)
@@ -378,7 +379,7 @@ def check_shards(keys: NDArray[np.int32], sizes: NDArray[np.uint32], wrong: Dama
 
 
 def is_id_prefix(text: str) -> bool:
-    """Whether ids may begin with it: an absolute path that ends with ``/``."""
+    """Whether a text may be an id prefix: an absolute path that ends with ``/``."""
     return text.startswith("/") and text.endswith("/") and "\0" not in text
 
 
@@ -389,8 +390,8 @@ def is_id_prefix(text: str) -> bool:
 class LayerObjects:
     """The objects of one layer, a row for each cell of a shard.
 
-    ``sizes``, ``raws`` (N,) uint32, bytes of the object and of what is in it; ``hashes``, ``contents``
-    (N, 32) uint8, SHA-256 of both.
+    ``sizes`` and ``raws``, (N,) uint32, are the bytes of each object and of its unpacked content; ``hashes``
+    and ``contents``, (N, 32) uint8, are the SHA-256 of the two.
     """
 
     sizes: NDArray[np.uint32]
@@ -399,12 +400,12 @@ class LayerObjects:
     contents: NDArray[np.uint8]
 
     def objects(self) -> Iterator[tuple[bytes, int]]:
-        """Hash and size of each object."""
+        """Yield hash and size of each object."""
         hashes = self.hashes.tobytes()
         return ((hashes[32 * row : 32 * row + 32], size) for row, size in enumerate(self.sizes.tolist()))
 
     def name(self, row: int) -> ObjectName:
-        """Return the object of a cell."""
+        """Return the name of a cell's object."""
         return ObjectName(
             self.hashes[row].tobytes(),
             int(self.sizes[row]),
@@ -420,7 +421,7 @@ class Shard:
     Attributes
     ----------
     names
-        What follows the map's `id_prefix` in the id of each cell, UTF-8.
+        The rest of each cell's id after the map's `id_prefix`, UTF-8.
     boxes
         (N, 4) float64, ``min_x, min_y, max_x, max_y``, metres, map frame.
     z
@@ -450,7 +451,7 @@ class Shard:
         return min_x, min_y, max_x, max_y
 
     def stamp(self, row: int) -> bytes:
-        """Stamp of a cell, see `shmmap.segment.version.Stamp`: 24 bytes of its points' content digest."""
+        """Return a cell's stamp: the first 24 bytes of its points' content digest."""
         return self.layers[POINTS].contents[row, :STAMP_BYTES].tobytes()
 
     def version(self, row: int, id_prefix: str) -> int:
@@ -458,7 +459,7 @@ class Shard:
         return cell_version(self.id(row, id_prefix), self.stamp(row), self.box(row))
 
     def identity(self, row: int, root: Root) -> CellIdentity:
-        """Return what a cell's objects lack, see `shmmap.origin.remote.published_object.write_segment`."""
+        """Return a cell's identity for `shmmap.origin.remote.published_object.write_segment`."""
         return CellIdentity(self.id(row, root.id_prefix), self.box(row), root.frame_id, self.stamp(row))
 
 
@@ -470,9 +471,9 @@ def published_layer_version(cell: int, layer: str, builder_version: int, content
     cell
         Version of the cell.
     layer, builder_version
-        Its spec, and the version of what has built it.
+        Spec of the layer, and version of the builder that built it.
     content
-        Its content digest, 32 bytes.
+        Content digest of the layer's object, 32 bytes.
     """
     spec = layer.encode()
     return xxh3_64_intdigest(
@@ -481,7 +482,7 @@ def published_layer_version(cell: int, layer: str, builder_version: int, content
 
 
 def pack_shard(shard: Shard) -> bytes:
-    """Return what is in a shard's frame."""
+    """Return the unpacked content of a shard's frame."""
     return msgspec.msgpack.encode(
         ShardFields(
             names=b"\0".join(shard.names),
@@ -502,7 +503,7 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int) -> Shard:
     Raises
     ------
     MapDataError
-        If it is not that object, or no sound shard of this root (cause ``damaged``).
+        The frame does not match the root's hash, or is not a valid shard of this root (cause ``damaged``).
     """
     name = f"shard {root.keys[number].tolist()}"
     wrong = Damage(name)
@@ -542,20 +543,20 @@ def unpack_shard(frame: bytes | memoryview, root: Root, number: int) -> Shard:
         raws = layer.raws.astype(np.int64)
         if (raws < _SMALLEST_OBJECT_BYTES).any() or (raws > MAX_OBJECT_BYTES).any():
             raise wrong("the size of an object is out of range")
-        # zstd's bound of what incompressible data becomes
+        # zstd's upper bound of the compressed size
         if (layer.sizes == 0).any() or (layer.sizes > raws + (raws >> 8) + 4096).any():
             raise wrong("the size of an object is out of range")
     return shard
 
 
 def shard_keys(boxes: NDArray[np.float64], shard_m: float) -> NDArray[np.float64]:
-    """(N, 2) row and column, whole numbers, of the shard that each cell lies in: that of its lower corner."""
+    """Return (N, 2) row and column of each cell's shard, whole numbers: the shard of its lower corner."""
     keys: NDArray[np.float64] = np.floor(boxes[:, 1::-1] / shard_m)
     return keys
 
 
 def is_relative_path(name: bytes) -> bool:
-    """Whether it names a file below a directory, without leaving it, in UTF-8."""
+    """Whether a name is a UTF-8 path that stays below its directory."""
     try:
         name.decode()
     except UnicodeDecodeError:

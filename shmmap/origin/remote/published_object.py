@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A layer of a cell as it is published: a segment without its identity, its columns as planes of bytes.
+"""A published layer of a cell: a segment without its identity, with columns split into planes of bytes.
 
-What names the cell (id, box, frame, source) is left out: so the same points give the same object wherever
-and whenever they are published.  A reader puts it back.  ``ORIGIN.md`` is the byte-exact document.
+The cell's identity (id, box, frame, source) is left out, so the same points give the same object wherever
+and whenever they are published.  A reader adds the identity.  ``ORIGIN.md`` specifies the format byte by
+byte.
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ __all__ = [
 POINTS: Final = "points"
 """Spec of the layer that each published map has."""
 MAX_OBJECT_BYTES: Final = 1 << 30
-"""Most bytes of an unpacked object: both forms of it are in a loader's memory."""
+"""Size limit of an unpacked object, as a loader holds it packed and unpacked in memory."""
 STAMP_BYTES: Final = 24
-"""A cell's stamp: the first bytes of its points' content digest."""
+"""Size of a cell's stamp, which is the first bytes of its points' content digest."""
 
 FLAGS_AT: Final = 208
 PLANES: Final = 1
@@ -75,22 +76,22 @@ _FLAGS: Final = struct.Struct("<I")
 _MM_ORIGIN: Final = struct.Struct("<3d")
 _COUNTS: Final = np.dtype("<u2")
 _XYZ: Final = np.dtype("<f4")
-_BLOCK_ROWS: Final = 1 << 14  # at a time: what is read and written stays in the cache
+_BLOCK_ROWS: Final = 1 << 14  # rows at a time, few enough to stay in the processor's cache
 
 
 class ObjectName(NamedTuple):
-    """What a published map says of an object.
+    """Name of an object: hashes and sizes of its packed and unpacked form.
 
     Attributes
     ----------
     sha256
-        Of the frame; the object is ``blobs/sha256/`` and its 64 hex digits.
+        SHA-256 of the frame; the object's path is ``blobs/sha256/`` and its 64 hex digits.
     size
         Bytes of the frame.
     raw
-        Bytes of what is in it.
+        Bytes of the unpacked content.
     content
-        SHA-256 of what is in it, the *content digest*.
+        SHA-256 of the unpacked content, the *content digest*.
     """
 
     sha256: bytes
@@ -100,20 +101,20 @@ class ObjectName(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Where it lies, from the map's URL."""
+        """Path of the object, relative to the map's URL."""
         return blob_path(self.sha256)
 
 
 def blob_path(digest: bytes) -> str:
-    """Return where the object of this SHA-256 lies, from the map's URL."""
+    """Return the path of the object with this SHA-256, relative to the map's URL."""
     return f"blobs/sha256/{digest.hex()}"
 
 
 @dataclass(frozen=True, slots=True)
 class CellIdentity:
-    """What an object lacks, and the segment made of it has: ``box`` in metres.
+    """Identity of a cell, which a segment contains and an object does not; ``box`` in metres.
 
-    ``stamp`` is the cell's, whatever the layer: 24 bytes.
+    ``stamp``, 24 bytes, is the cell's stamp for every layer.
     """
 
     cell_id: str
@@ -126,17 +127,17 @@ class CellIdentity:
 
 
 def bare_object(segment: memoryview, *, millimetres: bool = False) -> bytearray:
-    """Return the unpacked object of a prepared segment, publish block empty.
+    """Return the unpacked object of a prepared segment whose publish block is empty.
 
     Parameters
     ----------
     millimetres
-        Points are rounded, see `shmmap.origin.remote.published_object`; those that cannot be stay exact.
+        Round the points, see `to_millimetres`; points that cannot be rounded stay exact.
 
     Raises
     ------
     SegmentCorrupt
-        If it is no whole segment.
+        The segment is incomplete.
     """
     header = unpack_header(segment, len(segment))
     header_bytes = header_size(len(header.columns), "", header.layer, "")
@@ -160,7 +161,7 @@ def bare_object(segment: memoryview, *, millimetres: bool = False) -> bytearray:
             end = begin + _BLOCK_ROWS
             for plane in range(
                 len(planes)
-            ):  # one at a time is up to three times as fast as a transposed copy
+            ):  # plane by plane is up to three times as fast as a transposed copy
                 planes[plane, begin:end] = rows[begin:end, plane]
     return unpacked
 
@@ -172,7 +173,7 @@ def pack_object(unpacked: bytes | bytearray, content: bytes) -> tuple[ObjectName
 
 
 def _moved(header: SegmentHeader, shift: int) -> SegmentHeader:
-    """Make the header longer by ``shift`` bytes: the columns move."""
+    """Return the header lengthened by ``shift`` bytes, which moves the columns."""
     return msgspec.structs.replace(
         header,
         header_bytes=header.header_bytes + shift,
@@ -193,7 +194,7 @@ def _flagged(page: bytes, flags: int, mm_origin: bytes) -> bytearray:
 
 
 def _plane_count(column: Column) -> int:
-    """Bytes of what counts as one row of a column, which is also the number of planes it is split into."""
+    """Return the bytes per row of a column, which is also its number of planes."""
     itemsize = column.dtype.itemsize
     if len(column.shape) == 2 and 0 < column.shape[1] <= MAX_PLANED_COMPONENTS:
         return itemsize * column.shape[1]
@@ -201,13 +202,13 @@ def _plane_count(column: Column) -> int:
 
 
 def _rows(segment: memoryview, column: Column) -> NDArray[np.uint8]:
-    """Return the bytes of a column, (rows, bytes of one)."""
+    """Return the bytes of a column, (rows, bytes per row)."""
     count = _plane_count(column)
     return np.frombuffer(segment, np.uint8, column.nbytes, column.offset).reshape(-1, count)
 
 
 def _rounded_points(segment: memoryview, header: SegmentHeader) -> MillimetrePoints | None:
-    """Points in millimetres; None if the segment has none, or they stay exact."""
+    """Return a segment's points in millimetres; None if it has no points, or they stay exact."""
     for column in header.columns:
         if (column.name, column.dtype, column.shape) == (XYZ, _XYZ, (header.rows, 3)) and header.rows:
             return to_millimetres(np.frombuffer(segment, _XYZ, 3 * header.rows, column.offset).reshape(-1, 3))
@@ -217,7 +218,7 @@ def _rounded_points(segment: memoryview, header: SegmentHeader) -> MillimetrePoi
 def _in_millimetres(
     bare: SegmentHeader, arrays: list[NDArray[np.uint8]], rounded: MillimetrePoints
 ) -> tuple[SegmentHeader, list[NDArray[np.uint8]]]:
-    """Return header and rows of points in millimetres: what the checksums are of is what a reader makes."""
+    """Return header and rows with points in millimetres; checksums are those of the decoded columns."""
     xyz = rounded.xyz
     columns, ordered = [], []
     for column, rows in zip(bare.columns, arrays, strict=True):
@@ -243,7 +244,7 @@ def _in_millimetres(
 
 
 def _placed(columns: Sequence[Column], header_bytes: int) -> tuple[tuple[Column, ...], int]:
-    """Place columns one after the other, each 64-byte aligned; returns them and the total bytes."""
+    """Place columns one after the other, 64-byte aligned; return them and the total bytes."""
     placed, offset = [], header_bytes
     for column in columns:
         placed.append(msgspec.structs.replace(column, offset=offset))
@@ -255,17 +256,17 @@ def _placed(columns: Sequence[Column], header_bytes: int) -> tuple[tuple[Column,
 
 
 def unpack_object(frame: bytes | memoryview, name: ObjectName, *, verified: bool = False) -> bytes:
-    """Verify an object against its name and return what is in its frame.
+    """Verify an object against its name and return the unpacked content.
 
     Parameters
     ----------
     verified
-        Its hash was compared already.
+        The hash was already verified.
 
     Raises
     ------
     MapDataError
-        If its hash or a size is another one (cause ``damaged``); before that nothing is unpacked.
+        The hash or a size does not match (cause ``damaged``).  Nothing is unpacked before the hash matches.
     """
     path = name.path
     if len(frame) != name.size:
@@ -284,16 +285,16 @@ def write_segment(
     name: str = "",
     reserve: Callable[[int], None] | None = None,
 ) -> SegmentHeader:
-    """Write an unpacked object into an empty file as a segment of today's layout, header last.
+    """Write an unpacked object into an empty file as a segment of the current layout, header last.
 
     Parameters
     ----------
     fd
-        Empty file, open for writing; after an error its contents mean nothing.
+        Empty file, open for writing; after an error its content is undefined.
     layer
-        Spec of the layer that it has to be.
+        Spec of the layer that the object must have.
     name
-        Of the object, for messages.
+        Name of the object, for messages.
     reserve
         Called with the segment's size in bytes before anything is written; it refuses by raising.
 
@@ -304,7 +305,7 @@ def write_segment(
     Raises
     ------
     MapDataError
-        If it is no such object (cause ``damaged``), or one of a later version (``newer``).
+        The data is not an object of this layer (cause ``damaged``), or of a later version (``newer``).
     OSError
         ENOSPC if the file system is full.
     """
@@ -369,7 +370,7 @@ def read_bare_header(
 
 
 def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray[Any]:
-    """Return a column of an unpacked object as it will be in memory, shape as its header says."""
+    """Return a decoded column of an unpacked object, in the shape that its header gives."""
     mm_origin = _mm_origin(unpacked)
     dtype = column.dtype if mm_origin is None else _decoded(column).dtype
     if not column.nbytes:
@@ -379,13 +380,13 @@ def rows_of(unpacked: bytes | bytearray | memoryview, column: Column) -> NDArray
 
 
 def _mm_origin(unpacked: bytes | bytearray | memoryview) -> NDArray[np.float64] | None:
-    """Return the origin from which points in millimetres count; None if points are exact."""
+    """Return the origin of points in millimetres; None if points are exact."""
     (flags,) = _FLAGS.unpack_from(unpacked, FLAGS_AT)
     return np.array(_MM_ORIGIN.unpack_from(unpacked, MM_ORIGIN_AT)) if flags & MILLIMETRES else None
 
 
 def _decoded(column: Column) -> Column:
-    """Describe a column of an object in millimetres as it will be in memory."""
+    """Return the description that a column of an object in millimetres has once decoded."""
     if column.name != XYZ:
         return column
     return msgspec.structs.replace(column, dtype=_XYZ, nbytes=2 * column.nbytes)
@@ -394,7 +395,7 @@ def _decoded(column: Column) -> Column:
 def _decoded_blocks(
     unpacked: bytes | bytearray | memoryview, column: Column, mm_origin: NDArray[np.float64] | None
 ) -> Iterator[NDArray[Any]]:
-    """Yield the rows of a column as they will be in memory, block by block; valid until the next block."""
+    """Yield the decoded rows of a column, block by block; each is valid until the next block."""
     if not column.nbytes:
         return
     for rows in _row_blocks(unpacked, column):
@@ -405,7 +406,7 @@ def _decoded_blocks(
 
 
 def _row_blocks(unpacked: bytes | bytearray | memoryview, column: Column) -> Iterator[NDArray[np.uint8]]:
-    """Yield the rows of a column, (n, bytes of a row), block by block; each is valid until the next."""
+    """Yield the rows of a column, (n, bytes per row), block by block; each is valid until the next block."""
     count = _plane_count(column)
     planes = np.frombuffer(unpacked, np.uint8, column.nbytes, column.offset).reshape(count, -1)
     buffer = np.empty((min(_BLOCK_ROWS, planes.shape[1]), count), np.uint8)
@@ -423,16 +424,16 @@ MAX_COUNT: Final = 0xFFFF
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MillimetrePoints:
-    """Points of one cell.
+    """Points of one cell, rounded to millimetres.
 
     Attributes
     ----------
     origin
         (3,) float64, metres, in the frame of the points.
     counts
-        (N, 3) uint16, in Morton order.
+        (N, 3) uint16, millimetres from the origin, in Morton order.
     order
-        (N,) int64: the row that each of these was.
+        (N,) int64, the original row of each point.
     """
 
     origin: NDArray[np.float64]
@@ -441,7 +442,7 @@ class MillimetrePoints:
 
     @property
     def xyz(self) -> NDArray[np.float32]:
-        """(N, 3) float32, metres: what a reader makes of them."""
+        """Return the decoded points, (N, 3) float32, metres."""
         return from_millimetres(self.counts, self.origin)
 
 
@@ -455,7 +456,7 @@ def to_millimetres(xyz: NDArray[Any]) -> MillimetrePoints | None:
 
     Returns
     -------
-    None where they have to stay as they are: they are no float32, none, not all finite, or more than 65.535 m
+    The points; None if they must stay exact: not float32, no points, not all finite, or more than 65.535 m
     apart along an axis.
     """
     if xyz.dtype != np.float32 or xyz.ndim != 2 or xyz.shape[1] != 3 or not len(xyz):
@@ -479,7 +480,7 @@ def to_millimetres(xyz: NDArray[Any]) -> MillimetrePoints | None:
 
 
 def from_millimetres(counts: NDArray[np.uint16], origin: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return (N, 3) float32 metres of (N, 3) counts of millimetres from an origin (3,)."""
+    """Return points, (N, 3) float32 in metres, from counts of millimetres (N, 3) and their origin (3,)."""
     xyz = np.empty(counts.shape, np.float32)
     for axis in range(3):
         xyz[:, axis] = counts[:, axis] * STEP_M + origin[axis]
@@ -488,7 +489,7 @@ def from_millimetres(counts: NDArray[np.uint16], origin: NDArray[np.float64]) ->
 
 @cache
 def _spread() -> tuple[NDArray[np.uint64], ...]:
-    """For each axis, the bits of each number of 16 bits where the key has them: every third bit."""
+    """Return a table for each axis that spreads the bits of a 16-bit number to every third bit of a key."""
     spread = np.arange(MAX_COUNT + 1, dtype=np.uint64)
     for shift, mask in ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249)):
         spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
@@ -496,7 +497,7 @@ def _spread() -> tuple[NDArray[np.uint64], ...]:
 
 
 class LayerSource(NamedTuple):
-    """The object of a layer, as in `ObjectName`, and the version of what has built it."""
+    """The object of a layer, as in `ObjectName`, and the version of the builder that built it."""
 
     sha256: bytes
     size: int
@@ -506,7 +507,7 @@ class LayerSource(NamedTuple):
 
     @property
     def name(self) -> ObjectName:
-        """The object."""
+        """Name of the object."""
         return ObjectName(*self[:4])
 
 
@@ -514,16 +515,16 @@ _DECODER = msgspec.msgpack.Decoder(dict[str, LayerSource])
 
 
 def pack_source(cell_id: str, layers: Mapping[str, LayerSource]) -> Source:
-    """Return the source of a cell: its published layers by spec."""
+    """Return the source of a cell, which encodes its published layers by spec."""
     return Source(cell_id, msgspec.msgpack.encode(layers))
 
 
 @lru_cache(maxsize=256)
 def unpack_source(source: Source) -> Mapping[str, LayerSource]:
-    """Return the published layers of a cell."""
+    """Return the published layers of a cell by spec."""
     return _DECODER.decode(source.words)
 
 
 def stamp_of(source: Source) -> Stamp:
-    """Return the stamp of a cell: the first bytes of its points' content digest."""
+    """Return a cell's stamp: the first 24 bytes of its points' content digest."""
     return unpack_source(source)[POINTS].content[:STAMP_BYTES]

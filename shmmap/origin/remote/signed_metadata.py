@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The signed metadata of a published map: it names the current version, and only its keys can write it.
+"""The signed metadata of a published map, which names the current version.
 
-It is TUF's (The Update Framework), read and written with python-tuf, whose rules are those of its
-specification; what is of this map is in ORIGIN.md.  Importing this module takes a third of a second and
-35 MB: a daemon leaves it to a process apart, `shmmap.origin.remote.verify_apart`.
+The metadata follows TUF (The Update Framework) and is read and written with python-tuf; ORIGIN.md has the
+rules that TUF leaves open.  Importing this module takes a third of a second and 35 MB, so a daemon uses it
+only in a separate process, `shmmap.origin.remote.verify_apart`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _Role = TypeVar("_Role", Root, Timestamp, Snapshot, Targets)
 
 
 class SignedState(NamedTuple):
-    """What is signed at a store: each role's metadata, and the tag of the timestamp."""
+    """Signed state of a store: each role's metadata, and the tag of the timestamp."""
 
     timestamp: Metadata[Timestamp]
     tag: Tag
@@ -59,17 +59,17 @@ class SignedState(NamedTuple):
 
     @property
     def current(self) -> Current:
-        """The version that is signed."""
+        """The version that the signed metadata names."""
         return current_of(self.targets.signed.targets.get(TARGET))
 
 
 def metadata_path(role: str, number: int) -> str:
-    """Return where the metadata of a role lies that has this number."""
+    """Return the path of a role's metadata with this number."""
     return f"{number}.{role}.json"
 
 
 def refused(url: str, cause: str, why: str, hint: str = "") -> MapDataError:
-    """Return the error that refuses what a store offers; ``cause`` is one of the names above."""
+    """Return the error that refuses a store's signed metadata; ``cause`` is one of the names above."""
     named = cause.replace("_", " ")
     if not hint and cause == ALTERED:
         hint = "was it damaged, or changed on its way? `shmmap versions URL --trust ROOT.json` looks again"
@@ -77,17 +77,17 @@ def refused(url: str, cause: str, why: str, hint: str = "") -> MapDataError:
 
 
 def target_of(current: Current) -> TargetFile:
-    """Return the one target: the root's object of a version."""
+    """Return TUF's only target: the root object of a version."""
     return TargetFile(current.bytes, {"sha256": current.root}, TARGET, {"custom": {_NUMBER: current.version}})
 
 
 def current_of(target: TargetFile | None) -> Current:
-    """Return the version that the target names.
+    """Return the version that a target names.
 
     Raises
     ------
     ValueError
-        It names none.
+        The target names no version.
     """
     if target is None:
         raise ValueError(f"there is no target {TARGET!r}")
@@ -107,12 +107,14 @@ def current_of(target: TargetFile | None) -> Current:
 
 
 def newest_root(store: Store, trusted: bytes) -> Metadata[Root]:
-    """Return the newest root of trust, each one signed by the keys of the one before; expiry is not judged.
+    """Return the newest root of trust; each root is signed by the keys of the previous one.
+
+    Expiry is not checked.
 
     Raises
     ------
     MapDataError
-        A root is damaged, or not signed as it has to be.
+        A root is damaged, or lacks a required signature.
     """
     root = _parse(Root, trusted, "the trusted root", None)
     for _ in range(_MAX_ROTATIONS):
@@ -131,14 +133,14 @@ def newest_root(store: Store, trusted: bytes) -> Metadata[Root]:
 
 
 def read_signed_state(store: Store, root: Metadata[Root]) -> SignedState | None:
-    """Return what is signed there, before the next is signed: signatures are verified, expiry is not judged.
+    """Return a store's signed state, which the next signature replaces; None if nothing is signed yet.
 
-    None: nothing is signed yet.
+    Signatures are verified; expiry is not checked.
 
     Raises
     ------
     MapDataError
-        Some of it is gone, damaged, or signed by other keys.
+        Some metadata is missing, damaged, or signed by other keys.
     """
     try:
         data, tag = store.get_tagged(TIMESTAMP, MAX_METADATA_BYTES)
@@ -158,7 +160,7 @@ def read_signed_state(store: Store, root: Metadata[Root]) -> SignedState | None:
 
 
 def is_foreign(store: Store, trusted: bytes) -> bool:
-    """Whether the root that a store has under the number of the trusted one is another one."""
+    """Whether a store's root with the trusted root's number differs from the trusted root."""
     root: Metadata[Root] = Metadata.from_bytes(trusted)
     try:
         found = store.get(metadata_path(Root.type, root.signed.version), MAX_METADATA_BYTES)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one slice of a run has made: shards of a published map to which layers were added.
+"""The result of one slice of a run: shards of a published map to which layers were added.
 
-A *run* adds layers to one version of a map.  Each of its slices is made by itself, anywhere and in any order;
-its result is its *part*.  The name of a run follows from the version's content, the layers and the number of
-slices: so programs that make slices of the same run need not know of each other.  ``ORIGIN.md`` is
-the byte-exact document.
+A *run* adds layers to one version of a map.  Each of its slices is made independently, on any machine and in
+any order; its result is its *part*.  The name of a run is derived from the version's content, the layers and
+the number of slices, so programs that make slices of the same run need not communicate.  ``ORIGIN.md``
+specifies the format byte by byte.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ __all__ = [
 
 PARTS: Final = "parts/"
 MAX_PART_BYTES: Final = 16 << 20
-"""Of the object, and of what is in it."""
+"""Size limit of a part's object, packed and unpacked."""
 MAX_SLICES: Final = 100_000
 FORMAT: Final = "shmmap slice"
 READER: Final = 1
@@ -60,7 +60,7 @@ _DIGEST_BYTES: Final = 32
 
 
 class RunName(NamedTuple):
-    """Name of a run: 16 hex digits, and how many slices it has."""
+    """Name of a run: 16 hex digits, and the number of slices."""
 
     digest: str
     slices: int
@@ -70,11 +70,11 @@ class RunName(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Where its parts lie, from the map's URL."""
+        """Folder of the run's parts, relative to the map's URL."""
         return f"{PARTS}{self}/"
 
     def part_path(self, number: int) -> str:
-        """Where the part of a slice lies; the first is 1."""
+        """Return the path of a slice's part; slices are numbered from 1."""
         return f"{self.path}{number}"
 
 
@@ -96,7 +96,7 @@ def run_of(content: bytes, layers: Iterable[str], slices: int) -> RunName:
 
 
 def read_run(text: str) -> RunName:
-    """Read the name of a run; `BadRequest` if it is not one."""
+    """Parse the name of a run; raise `BadRequest` if the text is not a run's name."""
     found = _RUN.fullmatch(text)
     if found is None or int(found[2]) > MAX_SLICES:
         raise BadRequest(
@@ -106,7 +106,7 @@ def read_run(text: str) -> RunName:
 
 
 def part_number(run: RunName, path: str) -> int | None:
-    """Return the slice whose part lies at a path; None: it is not a part of this run."""
+    """Return the number of the slice whose part is at ``path``; None if that is not a part of this run."""
     name = path.removeprefix(run.path)
     is_one = path.startswith(run.path) and re.fullmatch(r"[1-9]\d{0,5}", name) is not None
     return int(name) if is_one and int(name) <= run.slices else None
@@ -115,7 +115,7 @@ def part_number(run: RunName, path: str) -> int | None:
 def slice_of_shards(root: Root, slices: int) -> NDArray[np.int64]:
     """Return the slice of each shard of a root, (S,) int64, ascending; the first slice is 1.
 
-    Each slice has about as many cells as the others; one may have no shard.
+    All slices have about the same number of cells; a slice may have no shard.
     """
     found: NDArray[np.int64] = root.first_indices[:-1] * slices // root.cells + 1
     return found
@@ -138,37 +138,37 @@ class PartFields(msgspec.Struct, frozen=True):
 
 
 class _Head(msgspec.Struct, frozen=True):
-    """What says whether the rest can be read."""
+    """The fields that show whether the rest of a part can be read."""
 
     format: str
     min_reader: int
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _HEAD: Final = msgspec.msgpack.Decoder(_Head)
 _PART: Final = msgspec.msgpack.Decoder(PartFields)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """What a slice has made.
+    """The result of a slice.
 
     Attributes
     ----------
     version
-        Number of the version that it was made from.
+        Number of the version that the part was made from.
     root_content
         Content digest of that version's root, 32 bytes.
     slice, slices
-        Number of the slice, from 1, and how many there are.
+        Number of the slice, from 1, and number of slices.
     layers
         Builder version of each layer of the run, by spec.
     keys
         (S, 2) int32, row and column of each shard of the slice, ascending.
     counts, sizes
-        (S,) uint32, cells of each shard, bytes of its object with the layers of the run in it.
+        (S,) uint32, number of cells of each shard, and bytes of its object, which includes the run's layers.
     hashes
-        (S, 32) uint8, SHA-256 of that object, its name.
+        (S, 32) uint8, SHA-256 of each shard's object, its name.
     """
 
     version: int
@@ -183,7 +183,7 @@ class Part:
 
     @property
     def run(self) -> RunName:
-        """The run that it belongs to."""
+        """The run that the part belongs to."""
         return run_of(self.root_content, self.layers, self.slices)
 
 
@@ -199,14 +199,14 @@ def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: s
     Parameters
     ----------
     run, number
-        The run and the slice that it has to belong to, as its path says.
+        The run and the slice that the part's path names; the part must belong to both.
     name
-        Of the object, for messages.
+        Name of the object, for messages.
 
     Raises
     ------
     MapDataError
-        It is not a sound part of that slice (cause ``damaged``), or it needs a later reader (``newer``).
+        The object is not a valid part of that slice (cause ``damaged``), or needs a later reader (``newer``).
     """
     name = name or run.part_path(number)
     wrong = Damage(name)
@@ -239,14 +239,14 @@ def unpack_part(frame: bytes | memoryview, run: RunName, number: int, *, name: s
 
 
 def shards_of(root: Root, part: Part) -> NDArray[np.intp] | None:
-    """Return the numbers of a part's shards in a root, ascending; None if its slice has others there."""
+    """Return the numbers of a part's shards in a root, ascending; None if the slice has other shards."""
     numbers = np.flatnonzero(slice_of_shards(root, part.slices) == part.slice)
     same = np.array_equal(root.keys[numbers], part.keys) and np.array_equal(root.counts[numbers], part.counts)
     return numbers if same else None
 
 
 def with_parts(root: Root, parts: Sequence[Part]) -> Root:
-    """Return the root that has the shards of these parts, and the layers of their run.
+    """Return the root with the shards of these parts, and with the layers of their run added.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a published map lies: a directory, a bucket or a web server, behind one small set of operations.
+"""Interface to the storage of a published map: a directory, a bucket or a web server.
 
-Only what a published map needs: whole objects, named by paths, made once or replaced on a condition.
+It has only the operations that a published map needs.  Objects are read and written whole, named by paths,
+and either written once or replaced on a condition.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ WEB_SCHEMES: Final = ("https", "http")
 _SCHEMES: Final = ("file", *BUCKET_SCHEMES, *WEB_SCHEMES)
 
 Tag: TypeAlias = Mapping[str, Any]
-"""Names one state of an object; only the store that gave it knows what is in it."""
+"""Token for one state of an object, such as an ETag; opaque to all but the store that returned it."""
 
 
 class StoreRefused(Offline):
-    """The store answers, and refuses.
+    """The store answered with a refusal.
 
-    ``of_credentials``: because of the account or its credentials.  A store that does not let an account list
-    objects also answers so for an object that is absent.
+    ``of_credentials``: the reason is the account or its credentials.  If an account may not list objects, a
+    store also gives this reply for an object that does not exist.
     """
 
     def __init__(self, message: str, *, hint: str = "", of_credentials: bool = False) -> None:
@@ -58,7 +59,7 @@ class StoreRefused(Offline):
 
 
 class Listed(NamedTuple):
-    """An object: its path from the store's URL, its size in bytes, and when it was written (Unix time)."""
+    """An object: path relative to the store's URL, size in bytes, and time of writing (Unix time)."""
 
     path: str
     size: int
@@ -66,11 +67,11 @@ class Listed(NamedTuple):
 
 
 class ObjectReader(Protocol):
-    """Reads whole objects whose size is known; may be called in threads."""
+    """Reads whole objects whose size is known; thread-safe."""
 
     @property
     def url(self) -> str:
-        """Where it is, as a person would name it."""
+        """URL or path of the store, as users write it."""
 
     def get_exactly(self, path: str, nbytes: int) -> memoryview:
         """Return an object of exactly ``nbytes`` bytes.
@@ -78,24 +79,24 @@ class ObjectReader(Protocol):
         Raises
         ------
         Offline
-            Nothing answers in time, or the answer is a refusal.
+            The store does not answer in time, or refuses.
         MapMissing
-            There is none.
+            The object does not exist.
         MapDataError
-            It has more or fewer bytes.
+            The object has more or fewer bytes.
         """
 
 
 class Store(ObjectReader, Protocol):
-    """Objects below one URL.  All methods may be called in threads.
+    """Objects below one URL.  All methods are thread-safe.
 
-    Every method raises `Offline` where nothing answers in time or the answer is a refusal, and `CannotWrite`
-    where a directory's disk is full or not writable.  No message holds a credential.
+    Every method raises `Offline` if the store does not answer in time or refuses, and `CannotWrite` if a
+    directory's disk is full or not writable.  No message contains a credential.
     """
 
     @property
     def read_only(self) -> str:
-        """Why nothing can be written or listed there; empty if it can."""
+        """Why the store can neither be written nor listed; empty if it can."""
 
     def get(self, path: str, max_bytes: int) -> memoryview:
         """Return a whole object.
@@ -103,50 +104,50 @@ class Store(ObjectReader, Protocol):
         Raises
         ------
         MapMissing
-            There is none.
+            The object does not exist.
         MapDataError
-            It has more than ``max_bytes``; it is not read.
+            The object is larger than ``max_bytes``, so it is not read.
         """
 
     def get_tagged(self, path: str, max_bytes: int) -> tuple[memoryview, Tag]:
-        """Return a whole object, and the tag of this state of it."""
+        """Return a whole object, and the tag of its state."""
 
     def get_if_changed(self, path: str, max_bytes: int, tag: Tag) -> tuple[memoryview, Tag] | None:
-        """Return a whole object and its tag; None if it still is in the state that ``tag`` names."""
+        """Return a whole object and its tag; None if it is still in the state that ``tag`` names."""
 
     def head(self, path: str) -> Listed | None:
-        """Return an object's size and age; None if there is none."""
+        """Return an object's size and time of writing; None if it does not exist."""
 
     def list(self, prefix: str) -> Iterator[Listed]:
-        """All objects whose path begins with ``prefix``, which ends with ``/``; in no order."""
+        """Yield all objects whose path begins with ``prefix``, which ends with ``/``, in any order."""
 
     def put(self, path: str, data: bytes) -> None:
-        """Write an object that never changes, named by its content; what is there already is replaced."""
+        """Write an object that is named by its content; an existing object is overwritten."""
 
     def put_new(self, path: str, data: bytes) -> bool:
-        """Write an object that is not there yet; False if another one is, which stays."""
+        """Write an object if none exists at this path; return False if another one exists, which stays."""
 
     def put_if(self, path: str, data: bytes, tag: Tag) -> bool:
-        """Replace the state of an object that ``tag`` names; False if it has another one now."""
+        """Replace an object if it still is in the state that ``tag`` names; return False if it is not."""
 
     def delete(self, path: str) -> None:
-        """Remove an object; one that is not there is no error."""
+        """Remove an object; a missing object is not an error."""
 
 
 def refuse_read_only(store: Store) -> None:
-    """Raise `BadRequest` if nothing can be written there."""
+    """Raise `BadRequest` if the store is read-only."""
     if store.read_only:
         raise BadRequest(f"{store.url}: {store.read_only}")
 
 
 def put_over(store: Store, path: str, data: bytes, seen: Tag | None) -> bool:
-    """Replace an object if its tag still is ``seen`` (None: there was no object); False if it has changed."""
+    """Replace an object if its tag is still ``seen`` (None: no object); return False if it has changed."""
     return store.put_new(path, data) if seen is None else store.put_if(path, data, seen)
 
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """Time limits of requests, seconds: to connect, for the next bytes, and for all retries together."""
+    """Time limits of requests in seconds (connection, next bytes, all retries together), and retries."""
 
     connect_s: float
     read_s: float
@@ -155,7 +156,7 @@ class Timeouts:
 
 
 SERVING: Final = Timeouts(connect_s=1.0, read_s=2.0, retries=2, retry_s=2.5)
-"""For requests that clients wait for: a server that is silent, or falls silent, is asked once more."""
+"""For requests that clients wait for; a silent server is asked once more."""
 PROBE: Final = Timeouts(connect_s=1.0, read_s=1.0, retries=0, retry_s=1.0)
 """To find out whether a server is back."""
 LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0)
@@ -164,7 +165,7 @@ LONG_RUN: Final = Timeouts(connect_s=10.0, read_s=30.0, retries=8, retry_s=120.0
 
 @dataclass(frozen=True, slots=True)
 class StoreUrl:
-    """A URL that was read: ``path`` of a directory, or ``text`` without a final ``/``."""
+    """A parsed URL: ``path`` of a directory, or ``text`` without a final ``/``."""
 
     scheme: str
     text: str
@@ -173,22 +174,22 @@ class StoreUrl:
 
 
 def is_url(text: str) -> bool:
-    """Whether it is a URL, no path."""
+    """Whether a text is a URL, not a path."""
     return "://" in text
 
 
 def is_published(path: str) -> bool:
-    """Whether a map's path is that of a published one: a URL, or a directory with a file ``CURRENT``."""
+    """Whether a path names a published map: a URL, or a directory with a file ``CURRENT``."""
     return is_url(path) or os.path.isfile(os.path.join(path, "CURRENT"))
 
 
 def read_url(text: str) -> StoreUrl:
-    """Read where a map is published.
+    """Parse the URL or path of a published map.
 
     Raises
     ------
     BadRequest
-        If it is no URL of a known scheme and no path, or holds a password or a query.
+        The text is neither a URL of a known scheme nor a path, or contains a password or a query.
     """
     if not is_url(text):
         if not text:
@@ -220,21 +221,22 @@ def read_url(text: str) -> StoreUrl:
         raise BadRequest(f"{text} names no {'server' if scheme in WEB_SCHEMES else 'bucket'}")
     if any(part in (".", "..") for part in parts.path.split("/")) or not text.isprintable() or " " in text:
         raise BadRequest(f"{text!r} is no plain URL")
-    # the host of a bucket is its name: its case stays
+    # a bucket's name is in place of the host, so its case is kept
     return StoreUrl(scheme, f"{scheme}://{parts.netloc}{parts.path}".rstrip("/"), host=host)
 
 
 def may_be_plain(url: str, *, insecure_http: bool, trust: str | None) -> bool:
     """Whether a map may be read over plain ``http://`` from other machines.
 
-    It may if the user allows it, and from a web server if a root of trust is named: then all that is read is
-    verified.  Requests to a bucket carry credentials, which the signature of a map does not protect.
+    It may if the user allows it.  It also may from a web server if a root of trust is given, since then
+    everything read is verified.  Requests to a bucket contain credentials, which a map's signature does not
+    protect.
     """
     return insecure_http or bool(trust and is_url(url) and url.partition("://")[0].lower() in WEB_SCHEMES)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host is this machine."""
+    """Whether a host name or address is this machine's loopback."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

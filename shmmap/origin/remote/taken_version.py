@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which version of a published map was taken: it is served from then on, whatever the origin says later.
+"""Stores the accepted (*taken*) version of a published map, which is served until a newer one is taken.
 
-This is state, not cache: it says what may be taken next, and it holds the root, so that a vehicle starts
-without a link.  Each instance, URL and root of trust has a file ``DIRECTORY/origins/<name>.taken``, the name
-being the first 32 hex digits of the SHA-256 of the MessagePack array [instance, URL, root of trust]::
+This is state, not cache: it decides which versions may be taken next, and contains the root, so that a
+vehicle can start offline.  Each instance, URL and root of trust has a file
+``DIRECTORY/origins/<name>.taken``, the name being the first 32 hex digits of the SHA-256 of the MessagePack
+array [instance, URL, root of trust]::
 
     0   8   "SHMTAKEN"
     8   4   u32 version of this format, little-endian: 1
@@ -43,17 +44,18 @@ class TakenVersion(msgspec.Struct, frozen=True):
     Attributes
     ----------
     instance, url, trust
-        Of the daemon; of the store (`Store.url`); SHA-256 of the trusted root in hex, empty without one.
+        Name of the daemon's instance; URL of the store (`Store.url`); SHA-256 of the trusted root in hex,
+        empty without a root of trust.
     version
-        Its number.
+        Number of the version.
     root
-        The root's object, as it was fetched.
+        Object of the version's root, as fetched.
     taken_s
-        When it was taken, Unix time.
+        Time at which the version was taken, Unix time.
     signed_s
-        When the metadata that was last verified was signed, Unix time; 0: none was.
+        Time at which the last verified metadata was signed, Unix time; 0: none was verified.
     expires_s
-        When its signature expires, Unix time; 0: it is not signed.
+        Expiry of the signature, Unix time; 0: the version is not signed.
     """
 
     instance: str
@@ -67,26 +69,26 @@ class TakenVersion(msgspec.Struct, frozen=True):
 
     @property
     def current(self) -> Current:
-        """What ``CURRENT`` said of it."""
+        """Content of ``CURRENT`` for this version."""
         return Current(self.version, sha256(self.root).hexdigest(), len(self.root))
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _DECODER: Final = msgspec.msgpack.Decoder(TakenVersion)
 
 
 class TakenVersionFile:
-    """Where the taken version of one instance, URL and root of trust is kept.
+    """File that keeps the taken version of one instance, URL and root of trust.
 
     Parameters
     ----------
     directory
-        State directory of the instance; made when the first version is taken.
+        State directory of the instance; created when the first version is taken.
 
     Attributes
     ----------
     problem
-        Why `load` returned nothing although something was taken, for ``health``; else empty.
+        Why `load` returned None although a version had been taken, for ``health``; else empty.
     """
 
     def __init__(self, directory: str, instance: str, url: str, trust: str = "") -> None:
@@ -96,9 +98,9 @@ class TakenVersionFile:
         self.problem = ""
 
     def load(self) -> TakenVersion | None:
-        """Return what was taken, which is what a start serves; None if nothing was, or it cannot be read.
+        """Return the taken version, which a starting daemon serves; None if there is none that can be read.
 
-        A file that is damaged, or of a later format, is kept beside under another name: `problem` says which.
+        A file that is damaged, or of a later format, is renamed and kept; `problem` gives its new name.
         """
         self.problem = ""
         try:
@@ -118,14 +120,14 @@ class TakenVersionFile:
             return None
 
     def save(self, taken: TakenVersion) -> None:
-        """Keep what was taken, on the disk when this returns.
+        """Write the taken version; it is flushed to the disk when this returns.
 
-        A process killed meanwhile leaves the one before, or this one.
+        If the process is killed meanwhile, the file contains either the previous version or this one.
 
         Raises
         ------
         CannotWrite
-            It cannot be written; the one before stays.
+            The file cannot be written; the previous version stays.
         """
         body = _HEAD.pack(_MAGIC, _FORMAT) + msgspec.msgpack.encode(taken)
         with writing_errors(self.path):
@@ -139,7 +141,7 @@ class TakenVersionFile:
             step("taken.named")
 
     def _unpack(self, data: bytes) -> TakenVersion:
-        """Read the file; ValueError says what is wrong with it."""
+        """Decode the file; raise ValueError with the reason if it is malformed."""
         if len(data) > _MAX_BYTES:
             raise ValueError("it is too large")
         if len(data) < _HEAD.size + _HASH_BYTES or data[:8] != _MAGIC:
@@ -159,7 +161,7 @@ class TakenVersionFile:
         return taken
 
     def _remove_interim(self) -> None:
-        """Remove what a killed process left half written."""
+        """Remove half-written files of killed processes."""
         directory, name = os.path.split(self.path)
         for left in os.listdir(directory):
             if left.startswith(f".{name}.") and left.endswith(".tmp"):
@@ -177,14 +179,14 @@ class TakenVersionFile:
 
 
 class Judgement(NamedTuple):
-    """Whether an offered version is taken.
+    """Decision whether an offered version is taken.
 
     Attributes
     ----------
     is_taken
-        It is: its root is fetched, saved, and then served.
+        Whether the version is to be fetched, saved, and then served.
     problem, hint
-        What is wrong with the offer, for ``health``, and what to do about it; empty if nothing is.
+        Problem with the offer, for ``health``, and its remedy; empty if there is no problem.
     cause
         Short name of the problem: ``older`` or ``altered``.
     """
@@ -196,14 +198,14 @@ class Judgement(NamedTuple):
 
 
 def judge_offer(taken: TakenVersion | None, offered: Current, *, accept: int = 0) -> Judgement:
-    """Judge the version that an origin offers; what was taken is served meanwhile, whatever comes out.
+    """Decide whether the version that an origin offers is taken; until it is, the old version is served.
 
-    The first one is taken, then those with a greater number.  The same one is no news.
+    The first version is taken, then every version with a greater number.  The same version changes nothing.
 
     Parameters
     ----------
     accept
-        The number that a person accepts although it is lower; 0: none.
+        A lower number that the user accepts; 0: none.
     """
     if taken is None or offered.version > taken.version:
         return Judgement(True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verifying in a process of its own which version of a signed map is current.
+"""Verifies in a separate process which version of a signed map is current.
 
-python-tuf takes a third of a second and 35 MB to import: a daemon that runs for weeks has neither to spare.
+Importing python-tuf takes a third of a second and 35 MB, which a daemon should not spend in its own process.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _NO_ROOT: Final = "it is the ROOT.json that `publish --sign` makes"
 
 
 class VerifySettings(msgspec.Struct, frozen=True):
-    """What to verify, and how.
+    """Settings of a verification.
 
     Attributes
     ----------
     url
-        Of the store, as `Store.url` says it.
+        URL of the store, as in `Store.url`.
     trust
         Path of the trusted root.
     state_dir
-        Where the newest metadata seen is kept: older metadata is refused from then on.
+        Directory that keeps the newest metadata seen; older metadata is then refused.
     is_serving
         Use the short time limits of a daemon.
     """
@@ -56,17 +56,17 @@ class VerifySettings(msgspec.Struct, frozen=True):
 
 
 class Verified(msgspec.Struct, frozen=True):
-    """A version that was verified.
+    """A verified version.
 
     Attributes
     ----------
     version, root, bytes
-        As ``CURRENT`` says them.
+        As in ``CURRENT``.
     trust
         SHA-256 of the trusted root, in hex.
     signed_s, expires_s
-        When its timestamp was signed, 0 where that is not said, and when the first of its metadata runs out;
-        Unix time.
+        Time at which the timestamp was signed (0: unknown), and first expiry of any of the metadata; Unix
+        time.
     """
 
     version: int
@@ -78,18 +78,18 @@ class Verified(msgspec.Struct, frozen=True):
 
     @property
     def current(self) -> Current:
-        """What ``CURRENT`` would say."""
+        """Content of ``CURRENT`` for this version."""
         return Current(self.version, self.root, self.bytes)
 
 
 class VerifyReply(msgspec.Struct):
-    """What the process says: the version, or an error."""
+    """Reply of the process: the version, or an error."""
 
     verified: Verified | None = None
     error: Outcome = msgspec.field(default_factory=Outcome)
 
 
-# made here, once: msgspec ends the process if threads are the first to decode a type at the same time
+# created at import: msgspec crashes the process if two threads decode a type for the first time at once
 _REPLY: Final = msgspec.json.Decoder(VerifyReply)
 _JSON: Final = msgspec.json.Decoder()
 
@@ -100,7 +100,7 @@ def read_trusted_root(path: str) -> bytes:
     Raises
     ------
     ConfigError
-        It cannot be read, or is not a root of trust.
+        The file cannot be read, or is not a root of trust.
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as file:
@@ -132,26 +132,26 @@ def memory_directory(state_dir: str, url: str, trusted: bytes) -> str:
 
 
 def verify_apart(settings: VerifySettings, *, timeout_s: float = _TIMEOUT_S) -> Verified:
-    """Return the version that is signed.
+    """Return the signed version.
 
     Parameters
     ----------
     timeout_s
-        How long the process may take; then it is killed.
+        Time after which the process is killed, seconds.
 
     Raises
     ------
     MapDataError
-        What is offered is refused; ``cause`` is ``unsigned``, ``older``, ``expired``, ``altered`` or
+        The signed version is refused; ``cause`` is ``unsigned``, ``older``, ``expired``, ``altered`` or
         ``foreign_root``.
     ConfigError
         The trusted root cannot be read, or is not a root of trust.
     PackageMissing
-        Without python-tuf.
+        The package python-tuf is missing.
     Offline
         The store does not answer.
     CannotWrite
-        What was seen cannot be kept.
+        The newest metadata cannot be kept.
     ShmmapError
         The process cannot be started, takes too long, or was killed.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verifies which version of a signed map is current, as TUF's client does; a program of its own.
+"""Program that verifies which version of a signed map is current, with TUF's client.
 
 ``python -m shmmap.origin.remote.verify_version CHANNEL_FD PARENT_PID SETTINGS`` answers with one packet, see
 `shmmap.origin.remote.verify_apart`.
@@ -43,22 +43,22 @@ if TYPE_CHECKING:
 
 __all__ = ["verify_version"]
 
-_URL = "map:///"  # the updater's names are URLs; what follows is a path at the store
+_URL = "map:///"  # the updater names objects by URL; the rest of the URL is a path at the store
 _ROLES: Final = ("timestamp", "snapshot", "targets", "root")
 _NICE: Final = 5
 
 
 class _Asked(NamedTuple):
-    """Errors of the store, and the newest metadata that it returned, by role."""
+    """Record of a store's errors, and of the newest metadata that it returned, by role."""
 
     failed: list[ShmmapError]
     found: dict[str, bytes]
 
 
 def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = "") -> Verified:
-    """Return the version that is signed; errors are those of `shmmap.origin.remote.verify_apart`.
+    """Return the signed version; errors are those of `shmmap.origin.remote.verify_apart`.
 
-    Expiry is judged by the later of this machine's clock and the time at which the timestamp was signed.
+    Expiry is compared with this machine's clock or the signing time of the timestamp, whichever is later.
     """
     from tuf.api.exceptions import DownloadError, RepositoryError
 
@@ -81,7 +81,7 @@ def verify_version(store: Store, trusted: bytes, state_dir: str, trust: str = ""
                 raise refused(store.url, ALTERED, f"targets: {error}") from None
             signed_s, expires = _times(memory)
     role = min(expires, key=lambda role: expires[role])
-    if expires[role].timestamp() <= signed_s:  # by this machine's clock it is still valid
+    if expires[role].timestamp() <= signed_s:  # still valid by this machine's clock, which is behind
         raise _expired(
             store, role, expires[role], f"the timestamp was signed on {format_utc(signed_s)}, and "
         )
@@ -113,7 +113,7 @@ def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Upd
             except ShmmapError as error:
                 is_refused = isinstance(error, StoreRefused) and error.of_credentials
                 if is_refused and path.endswith(f".{_ROLES[-1]}.json"):
-                    raise DownloadHTTPError(path, 403) from None  # the store may say so of an absent object
+                    raise DownloadHTTPError(path, 403) from None  # some stores send it for a missing object
                 asked.failed.append(error)
                 raise
             asked.found[path.removesuffix(".json").rpartition(".")[2]] = data
@@ -132,7 +132,7 @@ def _updater(store: Store, trusted: bytes, memory: str, trust: str) -> tuple[Upd
 
 
 def _named(store: Store, trusted: bytes, error: Exception, asked: _Asked, memory: str) -> ShmmapError:
-    """Return the refusal, by name, for what TUF's client raised."""
+    """Translate an error of TUF's client into the error that names the cause."""
     from tuf.api import exceptions
 
     from shmmap.origin.remote.signed_metadata import (
@@ -200,7 +200,7 @@ def _expires(data: bytes) -> datetime:
 
 
 def _times(memory: str) -> tuple[float, dict[str, datetime]]:
-    """When the timestamp was signed, and when the metadata of each role expires."""
+    """Return when the timestamp was signed, and when the metadata of each role expires."""
     from tuf.api.metadata import Metadata
 
     found: dict[str, Any] = {
@@ -215,14 +215,14 @@ def _times(memory: str) -> tuple[float, dict[str, datetime]]:
 
 
 def _remove_interim(memory: str) -> None:
-    """Remove files that TUF's client had half written when it was killed."""
+    """Remove half-written files of a killed TUF client."""
     for name in os.listdir(memory):
         if name.startswith(tempfile.gettempprefix()):
             os.unlink(os.path.join(memory, name))
 
 
 def main() -> int:
-    """Verify, and answer."""
+    """Verify the current version and send the reply."""
     die_with(int(sys.argv[2]))
     settings = msgspec.json.decode(sys.argv[3], type=VerifySettings)
     if settings.is_serving:

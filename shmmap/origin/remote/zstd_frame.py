@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One zstd frame: each object of a published map is one, with the size of what is in it at its start."""
+"""Packs and unpacks zstd frames: each object of a published map is one frame that begins with its size."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ with needed_packages("a published map", together=FOR_REMOTE):
 
 __all__ = ["DAMAGED", "pack_frame", "unpack_frame"]
 
-LEVEL: Final = 3  # 1 is twice as fast and leaves 1.6 % more
+LEVEL: Final = 3  # level 1 is twice as fast, and its frames are 1.6 % larger
 DAMAGED: Final = "damaged"
-"""`MapDataError.cause` of bytes that are not what was published."""
+"""`MapDataError.cause` of objects that differ from the published ones."""
 
 
 def pack_frame(data: bytes | bytearray | memoryview) -> bytes:
-    """Return a frame; its bytes depend on the release of zstd, what is in it does not."""
+    """Pack data into a frame, whose bytes depend on the release of zstd."""
     return zstandard.ZstdCompressor(level=LEVEL, write_content_size=True).compress(data)
 
 
 def unpack_frame(frame: bytes | memoryview, max_bytes: int, *, name: str, exact: bool = False) -> bytes:
-    """Return what is in a frame.
+    """Return the unpacked content of a frame.
 
     Parameters
     ----------
     max_bytes
-        Limit of what is unpacked and of the memory for it: the frame says its size beforehand.
+        Limit of the unpacked size, checked before memory is allocated.
     name
-        Of the object, for messages.
+        Name of the object, for messages.
     exact
-        It has to be ``max_bytes``, no less.
+        Require exactly ``max_bytes`` bytes.
 
     Raises
     ------
     MapDataError
-        If it is no whole frame or has more bytes (cause ``damaged``).
+        The frame is incomplete or its content has another size (cause ``damaged``).
     """
     try:
         nbytes = zstandard.frame_content_size(frame)
